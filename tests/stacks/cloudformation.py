@@ -1,6 +1,6 @@
-"""What CloudFormation knows of a resource: its name, and what may not be changed of it.
+"""CloudFormation's schemas: a resource's names and its properties that cannot be changed in place.
 
-From the resources' own schemas, which come with cfn-lint.
+The schemas come with cfn-lint.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import Any
 
 from cfnlint.schema.manager import PROVIDER_SCHEMA_MANAGER
 
-# Not made by a service, but by a function of the stack or by nobody.
+# Not made by a service, but by a function of the stack, or not made at all.
 _NO_SCHEMA = ("Custom::", "AWS::CDK::")
-# Of which there may be one only, although the identifier is AWS' own.
+# Only one may exist, although AWS chooses the identifier.
 _ONE_OF = {
     "AWS::Lambda::EventSourceMapping": ("/properties/FunctionName", "/properties/EventSourceArn"),
     "AWS::SNS::Subscription": ("/properties/TopicArn", "/properties/Protocol", "/properties/Endpoint"),
@@ -29,7 +29,7 @@ def has_schema(resource: dict[str, Any]) -> bool:
 
 
 def values(resource: dict[str, Any], path: str) -> list[Any]:
-    """What stands at a path of a schema, ``/properties/Tags/*/Key``; nothing where nothing stands."""
+    """The values at a schema's path, ``/properties/Tags/*/Key``; empty if the path does not exist."""
     found = [resource.get("Properties", {})]
     for step in path.split("/")[2:]:
         if step == "*":
@@ -40,8 +40,8 @@ def values(resource: dict[str, Any], path: str) -> list[Any]:
 
 
 def names(resource: dict[str, Any]) -> dict[str, Any]:
-    """Path to value of the physical names that the template gives: what the identifier is, or the name
-    that AWS makes an identifier of (a queue's address, a topic's ARN)."""
+    """Path to value of the physical names that the template gives: the identifier itself, or the name
+    from which AWS makes the identifier (a queue's address, a topic's ARN)."""
     kind = resource["Type"]
     named = f"{kind.split('::')[-1]}Name"
     own = list(schema(kind)["primaryIdentifier"])
@@ -58,7 +58,7 @@ def _keys(value: Any) -> set[str]:
 
 
 def identity(resource: dict[str, Any]) -> str | None:
-    """Type and name of what has a name of ours, by which there can be one only."""
+    """Type and name of a resource with a name of ours, which must be unique."""
     if not has_schema(resource):
         return None
     kind = resource["Type"]
@@ -66,8 +66,8 @@ def identity(resource: dict[str, Any]) -> str | None:
     return f"{kind} {given}" if given else None
 
 
-def given_once_for_all(resource: dict[str, Any]) -> dict[str, list[Any]]:
-    """Path to values of what replaces the resource when it changes, or replaces it under a condition."""
+def create_only(resource: dict[str, Any]) -> dict[str, list[Any]]:
+    """Path to values of the properties whose change replaces the resource, always or conditionally."""
     if not has_schema(resource):
         return {}
     known = schema(resource["Type"])
@@ -80,5 +80,5 @@ def given_once_for_all(resource: dict[str, Any]) -> dict[str, list[Any]]:
 
 
 def is_replaced(old: dict[str, Any], new: dict[str, Any]) -> bool:
-    """Whether a property changes that is given once for all."""
-    return old["Type"] != new["Type"] or given_once_for_all(old) != given_once_for_all(new)
+    """Whether a create-only property changes."""
+    return old["Type"] != new["Type"] or create_only(old) != create_only(new)

@@ -25,7 +25,7 @@ def alarms(synthesized: Synthesized) -> dict[str, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Deployment:
-    """The app with some settings: its folder, and a template by each stack's name."""
+    """The app with some settings: its folder, and the templates by stack name."""
 
     folder: Path
     templates: dict[str, dict[str, Any]]

@@ -1,4 +1,4 @@
-"""What moto's CloudFormation does not do of our templates: one list, which shrinks with moto."""
+"""The parts of our templates that moto's CloudFormation does not support."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 REGION, ACCOUNT = "eu-west-1", "123456789012"
 
-# Types that moto passes over with a warning, and why that loses nothing or what reads them instead. When moto
-# learns one, take it off: the tests say so.
+# Types that moto skips with a warning, and why this loses nothing or which test reads them instead. When moto
+# supports one, a test fails: remove the type here.
 UNKNOWN = {
     "AWS::Budgets::Budget": "moto keeps budgets, but makes none of a template",
     "AWS::CloudFront::Distribution": "moto knows it by CloudFront's API alone",
@@ -30,8 +30,8 @@ UNKNOWN = {
 
 
 def without_gaps(template: Mapping[str, Any]) -> dict[str, Any]:
-    """The template as moto can make it: a literal where it refers to a resource that will not be there, and
-    keys without tags, which moto reads as KMS' own API spells them."""
+    """The template in a form that moto supports: literals instead of references to missing resources, and
+    keys without tags, because moto expects the spelling of KMS' own API."""
     absent = {logical_id for logical_id, r in template["Resources"].items() if r["Type"] in UNKNOWN}
 
     def replaced(value: Any) -> Any:
@@ -52,7 +52,7 @@ def without_gaps(template: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def passed_over(formation: Any, stack: str, template: Mapping[str, Any]) -> set[str]:
-    """The types of the resources that moto did not make of a stack."""
+    """The types of a stack's resources that moto did not make."""
     made = {
         resource["LogicalResourceId"]
         for page in formation.get_paginator("list_stack_resources").paginate(StackName=stack)
@@ -66,7 +66,7 @@ def passed_over(formation: Any, stack: str, template: Mapping[str, Any]) -> set[
 
 
 def unknown(templates: Mapping[str, Mapping[str, Any]]) -> set[str]:
-    """Of what moto does not know, what is in these templates."""
+    """The resource types in these templates that moto does not support."""
     return {
         one["Type"] for template in templates.values() for one in template["Resources"].values()
     } & UNKNOWN.keys()

@@ -1,4 +1,4 @@
-"""What every role of the stacks may do: each action on each resource, and who may take the role."""
+"""The permissions of every role of the stacks: each action on each resource, and who may assume it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stacks.checks.invariants import EVERY_RESOURCE
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
 GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
-# Of what provisioning does, these have no resource type, or a certificate's before it is made.
+# These actions of provisioning have no resource type, or only a certificate that does not exist yet.
 ANY_PROVISIONING = {action[4:] for role, action in EVERY_RESOURCE if role == "ProvisioningRole"}
 PROVISIONING = (
     {(f"iot:{action}", resource) for action in ("CreateThing", "UpdateThing") for resource in (THINGS, KIND)}
@@ -40,7 +40,7 @@ PROVISIONING = (
     | {(f"iot:{action}", f"{IOT}:policy/iort-robot") for action in ("GetPolicy", "ListTargetsForPolicy")}
     | {(f"iot:{action}", "*") for action in ANY_PROVISIONING}
 )
-# AWS' managed policy for whoever registers things, version 3 of 2020-10-05, which allows all of it on "*":
+# AWS' managed policy for registering things, version 3 of 2020-10-05, which allows all of it on "*":
 # "AWS managed policies", AWSIoTThingsRegistration.
 THINGS_REGISTRATION = {
     *("AddThingToBillingGroup", "AddThingToThingGroup", "AttachPolicy", "AttachPrincipalPolicy"),
@@ -52,7 +52,7 @@ THINGS_REGISTRATION = {
     *("RemoveThingFromBillingGroup", "RemoveThingFromThingGroup", "UpdateCertificate", "UpdateThing"),
     "UpdateThingGroupsForThing",
 }
-# What our role lacks of it, and why that can be.
+# The actions that our role lacks, with the reason.
 NOT_REGISTERED = {
     "AddThingToBillingGroup": "the template names no billing group",
     "CreateCertificateFromCsr": "a robot asks for it itself, by MQTT; this is for tasks of many things",
@@ -62,22 +62,22 @@ NOT_REGISTERED = {
     "RemoveThingFromBillingGroup": "the template names no billing group",
 }
 
-# What the checks of the audit read: certificates and policies, whoever's they are.
+# Permissions of the audit's checks: all certificates and policies.
 AUDIT_READS = {action for role, action in EVERY_RESOURCE if role == "AuditRole"}
 LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
 
 LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
 REJECT = ("sqs:SendMessage", "Rejected.Arn")
-# What the CDK gives whoever may send to a queue as a destination.
+# The CDK's permissions for a sender to a queue as a destination.
 DESTINATION = {REJECT, ("sqs:GetQueueAttributes", "Rejected.Arn"), ("sqs:GetQueueUrl", "Rejected.Arn")}
-# Who reads batches and writes seconds.
+# Permissions of a function that reads batches and writes seconds.
 SUMMARIZES = {
     ("dynamodb:Query", "Batches.Arn"),
     ("dynamodb:BatchWriteItem", "Summary.Arn"),
     ("dynamodb:GetItem", "Robots.Arn"),
     ("dynamodb:UpdateItem", "Robots.Arn"),
 }
-# Of every role, each action on each resource, and who may take the role.
+# For every role: each action on each resource, and who may assume it.
 ROLES = {
     "LiveRole": (
         "lambda.amazonaws.com",
@@ -189,7 +189,7 @@ ROLES = {
     "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
-# Of the functions that keep something in a robot's row: which attributes.
+# The attributes of a robot's row that each function may change.
 KEEPS = {
     "AlertRole": ("alert_*",),
     "PresenceRole": PRESENCE,

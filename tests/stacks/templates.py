@@ -1,4 +1,4 @@
-"""Templates as text that can be compared: intrinsic functions written out, hashes taken off."""
+"""Templates as comparable text: intrinsic functions written out, hashes removed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HASH = re.compile(r"[0-9A-F]{8}$")
 
 
 def name(logical_id: str) -> str:
-    """A logical id without the hash that CDK ends it with."""
+    """A logical id without the CDK's hash at its end."""
     return _HASH.sub("", logical_id)
 
 
@@ -25,7 +25,7 @@ def qualified(synthesized: Synthesized, kind: str) -> Iterator[tuple[str, str, s
 
 
 class Reader:
-    """Reads values of a synthesized app; an import is read as what the other stack exports."""
+    """Reads values of a synthesized app; an import is read as the other stack's export."""
 
     def __init__(self, synthesized: Synthesized) -> None:
         self.exports = {

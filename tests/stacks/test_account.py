@@ -1,4 +1,4 @@
-"""What is set for the whole account: only by option, never on the embedded cloud, and after all the rest."""
+"""Account-wide settings are optional, not on the embedded cloud, and deployed after all other stacks."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def test_every_scheduled_check_is_enabled(synthesized, reader):
     assert reader.text(audit["RoleArn"]) == "AuditRole.Arn"
 
 
-def test_iot_logs_errors(synthesized, reader):
+def test_aws_iot_logs_errors(synthesized, reader):
     (log,) = synthesized.resources("AWS::IoT::Logging").values()
     assert log["DefaultLogLevel"] == "ERROR"
     assert reader.text(log["RoleArn"]) == "LogRole.Arn"
 
 
-def test_each_is_on_by_option():
-    """An account may have them configured, at which this stack would fail."""
+def test_each_account_wide_setting_is_optional():
+    """This stack would fail in an account that already has them configured."""
     assert kinds() == set()
     assert kinds(iot_log_level="error") == {"AWS::IoT::Logging"}
     assert kinds(device_defender=True) == KINDS - {"AWS::IoT::Logging"}
     assert not Settings().account_wide
-    # ministack knows neither.
+    # ministack supports neither.
     assert not Settings(embedded=True, device_defender=True, iot_log_level="error").account_wide
 
 
@@ -62,8 +62,8 @@ def built(tmp_path):
     return build_with
 
 
-def test_nothing_waits_for_it(built):
-    """It is deployed after all the others, so that where it fails, they are there."""
+def test_no_stack_depends_on_the_account_stack(built):
+    """It is deployed last, so that the other stacks exist if it fails."""
     found = {stack.stack_name: stack for stack in built(device_defender=True, site=True)}
     before = {
         name: {one.id for one in stack.dependencies if not one.id.endswith(".assets")}
@@ -73,18 +73,18 @@ def test_nothing_waits_for_it(built):
     assert not any("iort-account" in each for each in before.values())
 
 
-def test_the_embedded_cloud_has_none_of_it(built):
+def test_the_embedded_cloud_has_no_account_wide_settings(built):
     stacks = built(embedded=True, device_defender=True, iot_log_level="error")
     assert not KINDS & {one["Type"] for stack in stacks for one in stack.template["Resources"].values()}
 
 
 @pytest.mark.parametrize(("given", "level"), [("off", ""), ("debug", "debug")])
-def test_the_level_of_the_context(tmp_path, given, level):
+def test_the_log_level_is_read_from_the_context(tmp_path, given, level):
     app = App(context={"iot_log_level": given, "layer": str(tmp_path)})
     assert Settings.from_context(app).iot_log_level == level
 
 
-def test_a_level_that_there_is_not(tmp_path):
+def test_an_unknown_log_level_is_refused(tmp_path):
     with pytest.raises(
         SettingsError, match=r"iot_log_level must be off, error, warn, info or debug, got 'loud'"
     ):

@@ -1,4 +1,4 @@
-"""What must not go wrong unseen has an alarm, and every alarm is explained."""
+"""Every failure that must be noticed has an alarm, and every alarm is documented."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_every_queue_function_and_table_has_an_alarm(synthesized, alarms):
             assert f"{name(logical_id)}{ending}" in alarms
 
 
-def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
+def test_every_loss_outside_the_quarantine_has_an_alarm(alarms):
     asked = {}
     for alarm, properties in alarms.items():
         if "Metrics" in properties:
@@ -43,8 +43,8 @@ def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
 
 
 def test_the_cost_model_counts_every_alarm(synthesized, alarms):
-    """Those by Metrics Insights apart, by what they analyse if everything had failed: a metric a rule, and of
-    Lambda's one a function, one a function with its qualifier, and one of all."""
+    """Alarms by Metrics Insights count by the metrics that they read after every failure: one a rule, and for
+    Lambda one a function, one a function with its qualifier, and one for all."""
     insights = [alarm["Metrics"][0]["Expression"] for alarm in alarms.values() if "Metrics" in alarm]
     assert Usage().alarms == len(alarms) - len(insights)
     of_lambda = 2 * len(synthesized.resources("AWS::Lambda::Function")) + 1
@@ -52,7 +52,7 @@ def test_the_cost_model_counts_every_alarm(synthesized, alarms):
     assert Usage().insights_metrics == sum(most)
 
 
-def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
+def test_every_alarm_notifies_the_topic_and_is_documented(alarms, reader):
     text = (ROOT / "docs" / "cloud.md").read_text()
     for alarm, properties in alarms.items():
         assert reader.texts(properties["AlarmActions"]) == ["Alarms"]
@@ -61,7 +61,7 @@ def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
         assert f"`{generic}`" in text or f"`...{generic}`" in text, f"docs/cloud.md says nothing of {alarm}"
 
 
-def test_the_thresholds_are_the_settings(production, synthesized):
+def test_the_thresholds_come_from_the_settings(production, synthesized):
     alarms = {
         a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
     }
@@ -74,8 +74,8 @@ def test_the_thresholds_are_the_settings(production, synthesized):
     assert float(alert["Environment"]["Variables"]["LOW_VOLTAGE_V"]) == limits.low_voltage_v
 
 
-def test_the_slowest_live_lane_can_set_its_alarms_off(alarms):
-    """Three minutes one after the other with a message each are more than one in a hundred seconds has."""
+def test_the_slowest_live_lane_can_set_off_its_alarms(alarms):
+    """A lane with one message in 100 s does not have a message in each of three successive minutes."""
     every_s = 1 / LIVE_MIN_RATE_HZ
     for name_ in ("PubNubFailed", "CarToLambdaMs"):
         alarm = alarms[name_]

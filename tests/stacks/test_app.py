@@ -1,4 +1,4 @@
-"""app.py as one runs it: no credentials, the same result twice, and a clear word for a mistake."""
+"""app.py as a process: no credentials, reproducible templates, and one clear line for a mistake."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from stacks.settings import ROOT, Settings, SettingsError
 
 
 def run(tmp_path, name, **context):
-    """Start app.py in an environment that has nothing of this machine's AWS."""
+    """Start app.py in an environment without this machine's AWS settings."""
     env = {
         "PATH": os.environ["PATH"],
         "HOME": str(tmp_path),
-        # As `make deploy` keeps it, or every run would unpack the CDK once more.
+        # The cache of `make deploy`; otherwise every run would unpack the CDK again.
         "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
         "CDK_OUTDIR": str(tmp_path / name),
         "CDK_CONTEXT_JSON": json.dumps({"layer": str(tmp_path / "layer"), **context}),
-        # Every attempt to look anything up goes to a port where nobody is.
+        # Every lookup goes to a port without a listener.
         "AWS_EC2_METADATA_DISABLED": "true",
         "HTTPS_PROXY": "http://127.0.0.1:9",
         "HTTP_PROXY": "http://127.0.0.1:9",
@@ -48,7 +48,7 @@ def layer(tmp_path):
     (tmp_path / "layer" / "python" / "nothing.py").touch()
 
 
-def test_it_runs_without_credentials_and_twice_gives_the_same(tmp_path, layer):
+def test_app_py_runs_without_credentials_and_is_reproducible(tmp_path, layer):
     for name in ("one", "two"):
         returncode, _, err = finished(run(tmp_path, name))
         assert returncode == 0, err
@@ -61,7 +61,7 @@ def test_it_runs_without_credentials_and_twice_gives_the_same(tmp_path, layer):
     assert not any(str(tmp_path).encode() in template for template in one.values())
 
 
-def test_a_wrong_value_is_one_line(tmp_path, layer):
+def test_a_wrong_value_gives_one_line(tmp_path, layer):
     returncode, _, err = finished(run(tmp_path, "out", retention_days="soon"))
     assert returncode == 1
     (line,) = [line for line in err.splitlines() if line.startswith("app.py")]
@@ -70,8 +70,8 @@ def test_a_wrong_value_is_one_line(tmp_path, layer):
     assert not list((tmp_path / "out").glob("*.template.json"))
 
 
-def test_a_python_without_the_cdk_is_one_line(tmp_path):
-    # -S: without any package that is installed.
+def test_a_python_without_the_cdk_gives_one_line(tmp_path):
+    # -S: without any installed package.
     command = [sys.executable, "-S", "-E", "-s", str(ROOT / "app.py")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
@@ -90,7 +90,7 @@ def settings(tmp_path, layer):
     return read
 
 
-def test_what_the_context_says(settings, tmp_path):
+def test_the_context_sets_the_settings(settings, tmp_path):
     assert settings() == Settings(layer=tmp_path / "layer")
     # The CDK CLI gives every -c as text.
     given = settings(namespace="lab2", retention_days="7", live_concurrency="0", embedded="true")
@@ -111,7 +111,7 @@ def test_what_the_context_says(settings, tmp_path):
     assert (given.stage, given.customer_key, given.budget_usd) == ("prod", True, 50)
     assert (given.alarm_email, given.low_voltage_v) == ("lab@example.org", 13.2)
     assert given.tags == {"team": "lab", "cost-centre": "7"} == settings(tags=dict(given.tags)).tags
-    # cdk.json's numbers arrive as JavaScript's.
+    # cdk.json's numbers arrive as JavaScript numbers.
     assert settings(retention_days=7.0, embedded=True) == settings(retention_days="7", embedded="true")
 
 
@@ -147,7 +147,7 @@ def test_what_the_context_says(settings, tmp_path):
         ({"layer": "build/nowhere"}, ["build/nowhere", "make layer"]),
     ],
 )
-def test_a_wrong_value_names_the_key_what_was_found_and_what_is_allowed(settings, context, words):
+def test_the_error_of_a_wrong_value_names_key_value_and_allowed_values(settings, context, words):
     with pytest.raises(SettingsError) as caught:
         settings(**context)
     text = str(caught.value)

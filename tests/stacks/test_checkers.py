@@ -1,4 +1,4 @@
-"""The independent checkers: that they see what is wrong, and that no excuse outlives what it was for."""
+"""The independent checkers find faults, and a stale acknowledgement is an error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def check_stacks():
     return module
 
 
-def test_what_is_acknowledged_of_one_resource_is_there_in_some_stage(synthesized, production):
+def test_every_acknowledged_resource_exists_in_some_stage(synthesized, production):
     there = synthesized.acknowledged | production.acknowledged
     for path in single(Settings(alarm_email="lab@example.org")):
         if path.startswith("site/"):
@@ -27,7 +27,7 @@ def test_what_is_acknowledged_of_one_resource_is_there_in_some_stage(synthesized
         assert any(one.startswith(path) for one in there), f"acknowledged.py: {path} is not there"
 
 
-def test_nag_and_lint_find_what_nobody_acknowledged(check_stacks, tmp_path):
+def test_nag_and_lint_find_an_unacknowledged_fault(check_stacks, tmp_path):
     from aws_cdk import App, Stack, Validations
     from aws_cdk import aws_sqs as sqs
     from cdk_nag import AwsSolutionsChecks, ServerlessChecks
@@ -44,8 +44,8 @@ def test_nag_and_lint_find_what_nobody_acknowledged(check_stacks, tmp_path):
     assert not any(one.acknowledged for one in found)
 
 
-def test_what_nobody_finds_any_more_is_stale_by_name(check_stacks, tmp_path):
-    """One acknowledgement of each checker is needed, another of the same rule is not."""
+def test_an_unneeded_acknowledgement_is_reported_by_name(check_stacks, tmp_path):
+    """Each checker needs one acknowledgement; another one of the same rule is stale."""
     from aws_cdk import Acknowledgment, App, Stack, Validations
     from aws_cdk import aws_iam as iam
     from aws_cdk import aws_sqs as sqs
@@ -84,7 +84,7 @@ def test_what_nobody_finds_any_more_is_stale_by_name(check_stacks, tmp_path):
     assert "CKV_AWS_27 on bad/Lone" in gone()
 
 
-def test_a_template_of_several_folders_is_read_once_and_what_differs_too(check_stacks, tmp_path):
+def test_equal_templates_are_checked_once_and_different_ones_each(check_stacks, tmp_path):
     for folder, queue in (("a", {}), ("b", {}), ("c", {"DelaySeconds": "soon"})):
         (tmp_path / folder).mkdir()
         resource = {"Type": "AWS::SQS::Queue", "Properties": queue}

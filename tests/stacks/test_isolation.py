@@ -1,4 +1,4 @@
-"""The isolation table against the synthesized policies, by an evaluator of our own."""
+"""The synthesized policies keep the isolation table, by our own evaluator."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def policies(synthesized: Any, reader: Any) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def test_the_table_is_large_and_says_nothing_twice():
+def test_the_isolation_table_is_large_and_has_no_duplicates():
     assert len(ROWS) == len({row[:3] for row in ROWS}) >= 60
     assert {row.who for row in ROWS if row.allowed} == {row.who for row in ROWS if not row.allowed}
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.who}-{row.does}-{row.what}")
-def test_the_policies_say_what_the_table_says(policies, row):
+def test_the_policies_agree_with_the_isolation_table(policies, row):
     kind = {CONNECT: "client", SUBSCRIBE: "topicfilter"}.get(row.does, "topic")
     variables = {}
     if row.who != CLAIM and (row.does != CONNECT or row.what == A):
-        # Attached is a certificate to the thing that has the client's id, or else to none.
+        # A certificate is attached to the thing with the client's id, or to no thing.
         variables = {
             "iot:Connection.Thing.ThingName": A,
             "iot:Connection.Thing.IsAttached": "true",
@@ -49,21 +49,21 @@ def test_the_policies_say_what_the_table_says(policies, row):
     policy = claim_name() if row.who == CLAIM else fleet_name()
     arn = f"{ACCOUNT}:{kind}/{row.what}"
     assert allows(policies[policy], f"iot:{row.does}", arn, variables) == row.allowed
-    # Of a certificate that is attached to no thing, and of another account's or region's topics: never.
+    # Refused without an attached thing, and for the topics of another account or region.
     if row.who != CLAIM:
         assert not allows(policies[policy], f"iot:{row.does}", arn, {}) or not _is_of_a_thing(row)
     assert not allows(policies[policy], f"iot:{row.does}", arn.replace("eu-west-1", "eu-west-2"), variables)
 
 
 def _is_of_a_thing(row: Row) -> bool:
-    """Every word to the fleet is heard by every robot; who is none cannot connect."""
+    """Every robot hears every fleet message; a client that is no robot cannot connect."""
     return not row.what.startswith(f"{FLEET}/")
 
 
 @pytest.mark.parametrize(
     "action", ["RetainPublish", "UpdateThingShadow", "GetThingShadow", "StartNextPendingJobExecution"]
 )
-def test_a_robot_may_do_nothing_else(policies, action):
+def test_a_robot_may_do_no_other_action(policies, action):
     for statements in policies.values():
         for kind in ("topic", "thing", "client"):
             variables = {"iot:Connection.Thing.ThingName": A, "iot:Connection.Thing.IsAttached": "true"}
@@ -106,7 +106,7 @@ def test_every_role_on_every_resource_is_declared_or_refused(synthesized, reader
         for action, arn in wanted:
             declared = any(action == a and fnmatch.fnmatchcase(arn, r) for a, r in ROLES[role][1])
             refused += not declared
-            # Nothing in these policies is a variable of the request's.
+            # These policies contain no variables of the request.
             if allows(_plain(granted), action, arn.replace("${", "{")) != declared:
                 wrong.append((role, action, arn, declared))
     assert not wrong

@@ -1,4 +1,4 @@
-"""What AWS has room for: of a stack, and of a name, with the longest namespace that the contract allows."""
+"""AWS' limits of stacks and names are kept, also with the longest namespace."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from iort_contract.topics import check_namespace
 from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
-# "CloudFormation quotas". The CDK hands every template over by S3: in a request there is room for 51,200.
+# "CloudFormation quotas". The CDK passes every template through S3; a request may hold only 51,200 bytes.
 TEMPLATE_BYTES = 1_000_000
 SECTIONS = {"Resources": 500, "Outputs": 200, "Parameters": 200, "Mappings": 200}
 LOGICAL_ID, EXPORT_NAME, STACK_NAME = 255, 255, r"[A-Za-z][A-Za-z0-9-]{0,127}"
 # "IAM and AWS STS quotas": the policies within a role, white space not counted.
 ROLE_POLICIES_CHARACTERS = 10_240
 
-# The names that the schemas say too little of: Type and path to what the service's own API says.
+# Names with incomplete schemas: type and path to the rules of the service's own API.
 NAMES = {
     # PutDashboard
     ("AWS::CloudWatch::Dashboard", "/properties/DashboardName"): r"[A-Za-z0-9_-]{1,255}",
@@ -50,7 +50,7 @@ NAMES = {
 
 
 def too_much(stack: str, template: dict[str, Any]) -> Iterator[str]:
-    """What CloudFormation or IAM has no room for in a template."""
+    """The parts of a template that exceed a limit of CloudFormation or IAM."""
     if not re.fullmatch(STACK_NAME, stack):
         yield f"{stack}: not a stack's name"
     if (size := len(json.dumps(template, indent=1).encode())) > TEMPLATE_BYTES:
@@ -74,14 +74,14 @@ def too_much(stack: str, template: dict[str, Any]) -> Iterator[str]:
 
 
 def misnamed(template: dict[str, Any]) -> Iterator[str]:
-    """The physical names that AWS does not take, and those that nothing is known of."""
+    """The physical names that are invalid at AWS, and those without known rules."""
     for logical_id, one in template["Resources"].items():
         if not has_schema(one):
             continue
         for path, value in names(one).items():
             where = f"{one['Type']} {logical_id} {path}"
             if not isinstance(value, str):
-                # A reference to what has a name itself.
+                # A reference to a resource that has a name itself.
                 if value.keys() - {"Ref", "Fn::GetAtt", "Fn::ImportValue"}:
                     yield f"{where}: a name is made of {value}"
                 continue
@@ -107,18 +107,18 @@ def _at(known: dict[str, Any], path: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", VARIATIONS)
-def test_every_stack_has_room(deployment, name):
+def test_every_stack_is_within_the_limits(deployment, name):
     for stack, template in deployment(**VARIATIONS[name]).templates.items():
         assert list(too_much(stack, template)) == []
 
 
 @pytest.mark.parametrize("name", ["everything", "longest names"])
-def test_every_name_is_one_that_aws_takes(deployment, name):
+def test_every_name_is_valid_at_aws(deployment, name):
     templates = deployment(**VARIATIONS[name]).templates
     for template in templates.values():
         assert list(misnamed(template)) == []
     given = {path for t in templates.values() for one in t["Resources"].values() for path in named(one)}
-    # Of 36 characters that a provisioning template's name may have, the longest has 22.
+    # A provisioning template's name may have 36 characters; our longest has 22.
     assert "/properties/TemplateName" in given
 
 
@@ -159,7 +159,7 @@ def resource(kind, **properties):
         (resource("SQS::Queue", QueueName={"Ref": "Other"}), []),
     ],
 )
-def test_a_name_that_does_not_fit_is_found(template, found):
+def test_an_invalid_name_is_found(template, found):
     assert len(texts := list(misnamed(template))) == len(found)
     assert all(part in text for part, text in zip(found, texts, strict=True))
 
@@ -178,5 +178,5 @@ def test_a_name_that_does_not_fit_is_found(template, found):
         ("s", resource("IAM::Policy", Roles=["r"], PolicyDocument={"Statement": ["x" * 10_240]}), 1),
     ],
 )
-def test_what_does_not_fit_is_found(stack, template, found):
+def test_a_stack_over_a_limit_is_found(stack, template, found):
     assert len(list(too_much(stack, template))) == found

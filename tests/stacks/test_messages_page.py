@@ -1,4 +1,4 @@
-"""docs/messages.md names the topics of the contract, and what the policies allow."""
+"""docs/messages.md names the contract's topics and the permissions of the policies."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ACTIONS = {"publishes": [("Publish", "topic")], "hears": [("Subscribe", "topicfi
 
 
 def told(title):
-    """The topics of a table, filled in, and what the robot does with them."""
+    """The filled-in topics of a table, with the robot's actions on them."""
     found = {}
     for row in rows(section(title).split("subscribe to both answers")[-1]):
         (topic,) = named(row[0])
@@ -60,13 +60,13 @@ def allowed(document, topic, does):
 
 
 def statements(document):
-    """With the ARNs as in one account; the stack leaves them open."""
+    """The statements with the ARNs of one account; the stack leaves them open."""
     for statement in document["Statement"]:
         names = [re.search(r"(topic|topicfilter|client)/.*", arn)[0] for arn in statement["Resource"]]
         yield {**statement, "Resource": [f"arn:aws:iot:eu-west-1:1:{name}" for name in names]}
 
 
-def test_a_robot_may_do_what_the_table_says():
+def test_a_robot_has_the_permissions_of_the_table():
     document, topics = robot_policy(Stack(), namespace="iort"), told("## Topics")
     for topic, does in topics.items():
         for what in does:
@@ -99,7 +99,7 @@ def test_the_table_has_every_topic_of_the_contract():
     assert topics.keys() - ours == set(answers)
 
 
-def test_a_claim_may_do_what_the_table_says_and_no_more():
+def test_a_claim_has_exactly_the_permissions_of_the_table():
     document, topics = claim_policy(Stack(), namespace="iort"), told("## Provisioning")
     assert len(topics) == 6
     for topic, (does,) in topics.items():

@@ -1,6 +1,6 @@
-"""A second opinion on the templates: the CDK deploys them into moto's server, which others wrote.
+"""A second opinion on the templates: the CDK deploys them into moto's server, an independent emulator.
 
-What moto does not do of them is in moto_gaps.py.
+moto_gaps.py lists the parts that moto does not support.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from local.deployment import CommandLine
 from stacks.checks.variations import VARIATIONS
 from tests.stacks.moto_gaps import ACCOUNT, REGION, UNKNOWN, passed_over, unknown, without_gaps
 
-# Dev with the defaults, and prod with all that can be asked for: its own key, mail, budget, site, robot
+# Dev with the defaults, and prod with every option: its own key, mail, budget, site, robot
 # metrics, the account's audit and log, the old table.
 DEPLOYED = ("default", "everything")
 
 
 @pytest.fixture(scope="module")
 def server():
-    """moto's server. It takes a bucket's name for a path, as the CDK has it, of localhost alone."""
+    """moto's server. It accepts the CDK's bucket names in paths only on localhost."""
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     yield f"http://localhost:{server.get_host_and_port()[1]}"
@@ -36,7 +36,7 @@ def server():
 
 @pytest.fixture
 def cloud(server):
-    """An empty account in it."""
+    """An empty account in moto's server."""
     without_proxy("localhost")
     urllib.request.urlopen(urllib.request.Request(f"{server}/moto-api/reset", method="POST")).close()
     # The CDK keeps the account of an access key in the user's home: no other emulator's key.
@@ -76,14 +76,14 @@ def _resources(made, kind):
     }
 
 
-def test_every_gap_of_moto_is_met_by_some_template(deployment):
+def test_every_gap_of_moto_occurs_in_some_template(deployment):
     met = {kind for name in DEPLOYED for kind in unknown(deployment(**VARIATIONS[name]).templates)}
     assert met == UNKNOWN.keys()
     assert all(UNKNOWN.values())
 
 
 def test_moto_still_misreads_a_keys_tags():
-    """When it does not, `without_gaps` need not take them off."""
+    """If this fails, `without_gaps` no longer needs to remove the tags."""
     key = {"Type": "AWS::KMS::Key", "Properties": {"KeyPolicy": {}, "Tags": [{"Key": "a", "Value": "b"}]}}
     create = {"StackName": "s", "TemplateBody": json.dumps({"Resources": {"Key": key}})}
     with mock_aws(), pytest.raises(KeyError, match="TagKey"):
@@ -91,7 +91,7 @@ def test_moto_still_misreads_a_keys_tags():
 
 
 def _assert_queues_are_encrypted_with(cloud: Cloud, stack: str, key: str) -> None:
-    """Of tables, moto passes the key over."""
+    """moto ignores a table's key."""
     resource = cloud.client("cloudformation").describe_stack_resource(StackName=stack, LogicalResourceId=key)
     number = resource["StackResourceDetail"]["PhysicalResourceId"]
     (arn,) = (one["KeyArn"] for one in cloud.client("kms").list_keys()["Keys"] if one["KeyId"] == number)
@@ -102,8 +102,8 @@ def _assert_queues_are_encrypted_with(cloud: Cloud, stack: str, key: str) -> Non
 
 
 @pytest.mark.parametrize("name", DEPLOYED)
-def test_topic_rules_are_what_the_api_takes(cloud, deployment, name):
-    """CloudFormation hands a rule on to IoT's own API, of which botocore knows every shape."""
+def test_iots_api_accepts_the_topic_rules(cloud, deployment, name):
+    """CloudFormation passes a rule to IoT's own API, and botocore validates every shape."""
     iot = cloud.client("iot")
     rules = _resources(deployment(**VARIATIONS[name]), "AWS::IoT::TopicRule")
     for properties in rules.values():

@@ -1,4 +1,4 @@
-"""Who may do what: every IAM statement, by role. A grant that tests/stacks/roles.py does not list fails."""
+"""Every IAM statement, by role. A grant that tests/stacks/roles.py does not list is an error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.stacks.roles import (
 from tests.stacks.templates import qualified
 
 
-def test_every_role_may_do_exactly_this(synthesized, reader):
+def test_every_role_has_exactly_its_listed_permissions(synthesized, reader):
     granted = {role: set() for role, *_ in qualified(synthesized, "AWS::IAM::Role")}
     conditional = set()
     for _, stack, _, policy in qualified(synthesized, "AWS::IAM::Policy"):
@@ -44,12 +44,12 @@ def test_every_role_may_do_exactly_this(synthesized, reader):
             for action in reader.texts(statement["Action"]):
                 granted[role] |= {(action, resource) for resource in reader.texts(statement["Resource"])}
     assert granted == {role: actions for role, (_, actions) in ROLES.items()}
-    # Whoever else changes a row of the registry decides who may join.
+    # Any other writer of the registry's rows could decide which robots may join.
     others = {role for role, actions in granted.items() if ("dynamodb:UpdateItem", "Robots.Arn") in actions}
     assert conditional == KEEPS.keys() == others - {"AdmitRole"}
 
 
-def test_provisioning_may_do_what_aws_managed_policy_says_but_for_what_has_a_reason():
+def test_provisioning_has_awss_managed_permissions_with_listed_exceptions():
     granted = {action.split(":")[1] for action, _ in PROVISIONING}
     template = json.dumps(provisioning_template("iort"))
     assert "BillingGroup" not in template
@@ -59,14 +59,14 @@ def test_provisioning_may_do_what_aws_managed_policy_says_but_for_what_has_a_rea
     assert all(NOT_REGISTERED.values())
 
 
-def test_no_function_that_keeps_a_robots_row_can_open_its_name():
+def test_a_function_that_changes_a_robots_row_cannot_open_its_name():
     for names in KEEPS.values():
         for name in (*ADMISSION, "speed_to_erpm_gain", "vehicle"):
             assert not any(fnmatch.fnmatchcase(name, pattern) for pattern in names), name
 
 
 class Recorder:
-    """A DynamoDB client that only notes which attributes it was asked for."""
+    """A fake DynamoDB client that records the requested attributes."""
 
     class exceptions:
         class ConditionalCheckFailedException(Exception):
@@ -82,7 +82,7 @@ class Recorder:
         self.attributes |= asked["Key"].keys() | {names.get(word, word) for word in words}
 
 
-def test_each_function_changes_what_it_may_and_may_change_what_it_does():
+def test_each_function_changes_exactly_its_allowed_attributes():
     upload, alert, presence = Recorder(), Recorder(), Recorder()
     UploadQuota(upload, table="robots", bytes_a_day=9).take("car", 1, 0)
     notices = Notices(alert, "robots")
@@ -99,7 +99,7 @@ def test_each_function_changes_what_it_may_and_may_change_what_it_does():
     assert all(fnmatch.fnmatchcase(name, "alert_*") for name in alert.attributes - {"robot"})
 
 
-def test_every_role_is_for_one_service_of_this_account(synthesized, reader):
+def test_every_role_can_be_assumed_by_one_service_of_this_account(synthesized, reader):
     for role, _, _, properties in qualified(synthesized, "AWS::IAM::Role"):
         (statement,) = properties["AssumeRolePolicyDocument"]["Statement"]
         service, _ = ROLES[role]
@@ -112,7 +112,7 @@ def test_every_role_is_for_one_service_of_this_account(synthesized, reader):
         assert properties.keys() <= {"AssumeRolePolicyDocument", "Tags"}, "no managed or inline policies"
 
 
-def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
+def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
     wild = set()
     for role, (_, actions) in ROLES.items():
         for action, resource in actions:
@@ -122,21 +122,21 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
             else:
                 # A wildcard within an ARN stands for the robot's name, in the bucket for its keys, in a log
                 # for its streams.
-                # Things and certificates have no names before they are provisioned; the hook reads of a
-                # certificate whether it came through.
+                # Things and certificates have no names before they are provisioned; the hook reads
+                # whether a certificate was registered.
                 known = r":topic/pong/iort/\*/|:thing/\*/agent$|/(robots|results)/\*$|:AWSIotLogsV2:\*$"
                 named = re.sub(known, "", resource)
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
                 of_the_hook = (role, action, named) == ("AdmitRole", "iot:DescribeCertificate", CERTIFICATES)
                 assert "*" not in named or of_provisioning or of_the_hook
     assert wild == EVERY_RESOURCE
-    # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.
+    # Only roles' and robots' policies grant; no managed policy does.
     kinds = {r["Type"] for t in synthesized.templates.values() for r in t["Resources"].values()}
     assert {k for k in kinds if k.startswith("AWS::IAM::")} == {"AWS::IAM::Role", "AWS::IAM::Policy"}
     assert {k for k in kinds if k.endswith("Permission")} == {"AWS::Lambda::Permission"}
 
 
-def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
+def test_a_function_may_be_called_only_by_its_rule_or_template(synthesized, reader):
     called = set()
     for stack in synthesized.templates:
         for permission in synthesized.resources("AWS::Lambda::Permission", stack).values():
@@ -145,7 +145,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
             assert permission["SourceAccount"] == {"Ref": "AWS::AccountId"}
             source, function = permission["SourceArn"], reader.text(permission["FunctionName"])
             if "Fn::GetAtt" in source:
-                # Rule and function may have one name; this is the rule.
+                # A rule and a function may share a name; this is the rule.
                 rule = synthesized.templates[stack]["Resources"][source["Fn::GetAtt"][0]]
                 assert rule["Type"] == "AWS::IoT::TopicRule"
             called.add((reader.text(source), function))
@@ -161,7 +161,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
     }
 
 
-def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
+def test_queues_are_encrypted_and_require_tls(synthesized, reader):
     queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
     assert queues.keys() == {"Rejected", "Last", "PutOff"}
     for properties in queues.values():
@@ -181,7 +181,7 @@ def test_no_template_holds_a_password_an_account_or_a_path_of_this_machine(synth
     text = json.dumps(dict(synthesized.templates))
     from stacks.settings import ROOT
 
-    # A retention in seconds or a queue's name has no twelve digits; an account id has.
+    # An account id has twelve digits; a retention in seconds or a queue's name does not.
     assert not re.search(r"(?<![0-9a-f])\d{12}(?![0-9a-f])", text)
     assert str(ROOT) not in text
     assert str(synthesized.folder) not in text

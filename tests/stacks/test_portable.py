@@ -1,4 +1,4 @@
-"""Synth refuses what the embedded cloud would drop, and its lists are what the embedded cloud has."""
+"""Synth refuses rules that the embedded cloud would drop; its lists match the embedded cloud."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GOOD = {
 }
 
 
-# --- what is refused --------------------------------------------------------------------------------
+# --- refused rules ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -35,11 +35,11 @@ GOOD = {
         ("SELECT a FROM 'a' WHERE b IN (1, 2) AND (a > 1) OR (b)", set()),
     ],
 )
-def test_the_functions_that_sql_calls(sql, called):
+def test_the_functions_in_sql_are_found(sql, called):
     assert sql_functions(sql) == called
 
 
-def test_our_own_rules_have_no_problem():
+def test_our_own_rules_are_accepted():
     for rule in RULES.values():
         assert rule_problems({**GOOD, "sql": rule.statement()}) == []
     assert (
@@ -71,7 +71,7 @@ def test_our_own_rules_have_no_problem():
         ),
     ],
 )
-def test_a_problem_is_named(change, problem):
+def test_a_problem_of_a_rule_is_named(change, problem):
     assert rule_problems({**GOOD, **change}) == [problem]
 
 
@@ -106,7 +106,7 @@ REASONS = (
 
 
 def test_synth_marks_the_rule_with_the_reason(refused):
-    # What the CLI reads; the assembly's own list of messages has a type that jsii does not know.
+    # The CLI reads this file; the assembly's own list of messages has a type that jsii does not know.
     metadata = json.loads((Path(refused.directory) / "bad.metadata.json").read_text())
     errors = {
         f"{path}: {entry['data']}"
@@ -144,8 +144,8 @@ def test_cdk_synth_fails_with_the_reason(refused, tmp_path):
 
 @pytest.fixture(scope="module")
 def embedded():
-    """What the pinned ministack has once its gaps are closed, asked in a process of its own, which
-    importing it changes."""
+    """The features of the pinned ministack with its gaps closed, read in a separate process, because
+    the import changes it."""
     program = """
 import json
 from local import gaps, patched
@@ -170,15 +170,15 @@ print(json.dumps({
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_the_actions_are_those_that_the_emulator_runs(embedded):
+def test_the_listed_actions_are_those_of_the_emulator(embedded):
     assert set(embedded["actions"]) == RULE_ACTIONS
 
 
-def test_the_sql_functions_are_those_that_the_emulator_evaluates(embedded):
+def test_the_listed_sql_functions_are_those_of_the_emulator(embedded):
     assert set(embedded["functions"]) == SQL_FUNCTIONS
 
 
-def test_the_republish_topics_allowed_are_those_that_are_expanded(embedded):
+def test_a_republish_topic_is_accepted_only_if_the_emulator_expands_it(embedded):
     for topic, action in embedded["expanded"].items():
         expanded = action["republish"]["topic"]
         payload = {"sql": "SELECT * FROM 'a'", "actions": [{"republish": {"topic": topic}}]}

@@ -1,4 +1,4 @@
-"""What the preflight knows of the stacks is what the stacks are."""
+"""The preflight knows all stacks and names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.stacks.test_flips import identity
 from verify.preflight.account import BOOTSTRAP, BOOTSTRAP_PARAMETER
 from verify.preflight.deployed import STACKS
 
-# Kinds that have a name of ours, and that the preflight asks for by it.
+# Kinds with a name of ours; the preflight asks for the name.
 ASKED = {
     "AWS::IoT::Policy",
     "AWS::IoT::ProvisioningTemplate",
@@ -16,11 +16,11 @@ ASKED = {
     "AWS::IoT::ThingType",
     "AWS::IoT::TopicRule",
     "AWS::CloudWatch::Dashboard",
-    # An account's one each, by items of their own.
+    # One in each account, with separate items.
     "AWS::IoT::AccountAuditConfiguration",
     "AWS::IoT::Logging",
 }
-# Those that go with their stack, whatever the stage, and that nothing but our stack makes.
+# Deleted with their stack in every stage, and made only by our stack.
 NOT_ASKED = {
     "AWS::CloudWatch::Alarm",
     "AWS::IAM::Policy",
@@ -31,11 +31,11 @@ NOT_ASKED = {
 }
 
 
-def test_it_asks_for_every_stack(synthesized):
+def test_the_preflight_asks_for_every_stack(synthesized):
     assert {*synthesized.templates, "site"} == set(STACKS)
 
 
-def test_it_asks_for_every_name_that_is_part_of_the_design(synthesized, production):
+def test_the_preflight_asks_for_every_fixed_name(synthesized, production):
     named = {
         resource["Type"]
         for templates in (synthesized.templates, production.templates)
@@ -46,7 +46,7 @@ def test_it_asks_for_every_name_that_is_part_of_the_design(synthesized, producti
     assert named == ASKED | NOT_ASKED
 
 
-def test_the_bootstrap_stack_is_as_new_as_the_templates_need(synthesized):
+def test_the_required_bootstrap_version_is_that_of_the_templates(synthesized):
     artifacts = json.loads((synthesized.folder / "manifest.json").read_text())["artifacts"].values()
     stacks = [one["properties"] for one in artifacts if one["type"] == "aws:cloudformation:stack"]
     assert {one["requiresBootstrapStackVersion"] for one in stacks} == {BOOTSTRAP}

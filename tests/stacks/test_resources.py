@@ -1,4 +1,4 @@
-"""What the stacks promise beyond permissions: rules, tables, functions, logs."""
+"""The properties of the stacks' rules, tables, functions and logs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_rules_are_the_contracts(rules):
         assert " or " not in payload["Sql"].lower()
 
 
-def test_every_rule_has_one_action_and_it_is_this(rules, reader):
+def test_every_rule_has_exactly_its_one_action(rules, reader):
     actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
     assert all(len(each) == 1 for each in actions.values())
     record, live, pong, echo, upload, presence, version, *alerts = (actions[rule][0] for rule in RULES)
@@ -56,7 +56,7 @@ def test_every_rule_has_one_action_and_it_is_this(rules, reader):
 
 
 def test_every_rule_has_an_error_action_that_keeps_the_message(synthesized, reader):
-    """Every rule there is, of whichever stack: whoever adds one adds its error action."""
+    """Every rule of every stack; a new rule needs an error action."""
     payloads = {}
     for logical_id, rule in synthesized.resources("AWS::IoT::TopicRule").items():
         payloads[name(logical_id)] = rule["TopicRulePayload"]
@@ -74,8 +74,8 @@ def test_every_rule_has_an_error_action_that_keeps_the_message(synthesized, read
                 assert reader.text(settings.get("RoleArn", sqs["RoleArn"])) == f"{rule}Role.Arn"
 
 
-def test_a_rule_is_made_after_its_roles_policy(synthesized):
-    """IoT Core tries the role when the rule is made."""
+def test_a_rule_is_created_after_its_roles_policy(synthesized):
+    """IoT Core tests the role when it creates the rule."""
     resources = synthesized.templates["ingest"]["Resources"]
     for logical_id, resource in resources.items():
         if resource["Type"] == "AWS::IoT::TopicRule":
@@ -116,7 +116,7 @@ def test_the_tables_keys_are_the_contracts(synthesized):
 # --- functions --------------------------------------------------------------------------------------
 
 
-def test_lambda_1_is_reserved_for_where_the_account_may_have_it(synthesized, production):
+def test_lambda_1_has_reserved_concurrency_only_in_prod(synthesized, production):
     def reserved(app):
         functions = app.resources("AWS::Lambda::Function", "processing").values()
         found = {f["Handler"]: f.get("ReservedConcurrentExecutions") for f in functions}
@@ -126,7 +126,7 @@ def test_lambda_1_is_reserved_for_where_the_account_may_have_it(synthesized, pro
     assert reserved(production) == {"functions.live.handler": 5}
 
 
-def test_functions_run_on_one_runtime_with_a_log_each_that_ends(synthesized, functions, reader):
+def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized, functions, reader):
     logs = {name(k): v for k, v in synthesized.resources("AWS::Logs::LogGroup").items()}
     assert logs.keys() == {f"{noun}Log" for noun in functions}
     assert {v["RetentionInDays"] for v in logs.values()} == {30}
@@ -137,7 +137,7 @@ def test_functions_run_on_one_runtime_with_a_log_each_that_ends(synthesized, fun
         assert function["Timeout"] <= 60
 
 
-def test_a_live_message_or_a_ping_is_not_tried_again(synthesized, reader):
+def test_live_messages_and_pings_are_not_retried(synthesized, reader):
     configs = synthesized.resources("AWS::Lambda::EventInvokeConfig").values()
     assert {reader.text(c["FunctionName"]): c["MaximumRetryAttempts"] for c in configs} == {
         "Live": 0,
@@ -157,7 +157,7 @@ def mappings(synthesized, reader):
     return {reader.text(mapping["EventSourceArn"]): mapping for mapping in found}
 
 
-def test_the_chain_of_what_fails_ends(synthesized, reader):
+def test_the_chain_of_dead_letter_queues_ends(synthesized, reader):
     """rejected -> the quarantine's function -> after five attempts the last queue, which feeds nothing."""
     mapping = mappings(synthesized, reader)["Rejected.Arn"]
     assert reader.text(mapping["FunctionName"]) == "Quarantine"
@@ -168,16 +168,16 @@ def test_the_chain_of_what_fails_ends(synthesized, reader):
     assert (reader.text(redrive["deadLetterTargetArn"]), redrive["maxReceiveCount"]) == ("Last.Arn", 5)
     assert "RedrivePolicy" not in queues["Last"]
     assert "Last.Arn" not in mappings(synthesized, reader)
-    # What fails in the quarantine's own function goes nowhere but back into its queue.
+    # A failure in the quarantine's own function returns the message to its queue.
     configs = synthesized.resources("AWS::Lambda::EventInvokeConfig").values()
     assert "Quarantine" not in {reader.text(config["FunctionName"]) for config in configs}
     assert queues["Rejected"]["VisibilityTimeout"] >= 6 * 10
 
 
-def test_what_is_put_off_is_tried_again_and_then_quarantined(synthesized, reader):
+def test_deferred_batches_are_retried_and_then_quarantined(synthesized, reader):
     mapping = mappings(synthesized, reader)["PutOff.Arn"]
     assert reader.text(mapping["FunctionName"]) == "Later"
-    # A message has what one robot may take of an invocation; more of them would wait for each other.
+    # One message holds one robot's share of an invocation; several messages would delay one another.
     assert (mapping["BatchSize"], mapping["ScalingConfig"]) == (1, {"MaximumConcurrency": 2})
     queues = {name(k): v for k, v in synthesized.resources("AWS::SQS::Queue").items()}
     redrive = queues["PutOff"]["RedrivePolicy"]
@@ -194,15 +194,15 @@ def test_the_stream_never_blocks_for_good(synthesized, reader):
     assert mapping["MaximumRetryAttempts"] == 5
     # More, and two batches of one robot could be summarised at once: docs/processing.md.
     assert mapping["ParallelizationFactor"] == 1
-    # The cost model knows it.
+    # The cost model uses this value.
     assert (mapping["MaximumBatchingWindowInSeconds"], mapping["BatchSize"]) == (WINDOW_S, RECORDS_A_CALL)
     assert mapping["MaximumRecordAgeInSeconds"] == 6 * 3600
     assert reader.text(mapping["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
-    # From the beginning: what was stored before the first deployment of the mapping is summarised too.
+    # From the beginning, so that batches stored before the mapping's first deployment are summarised.
     assert mapping["StartingPosition"] == "TRIM_HORIZON"
 
 
-def test_every_resource_that_can_be_is_tagged_with_the_project(synthesized):
+def test_every_taggable_resource_is_tagged_with_the_project(synthesized):
     for template in synthesized.templates.values():
         for resource in template["Resources"].values():
             tags = resource.get("Properties", {}).get("Tags")
@@ -210,8 +210,8 @@ def test_every_resource_that_can_be_is_tagged_with_the_project(synthesized):
                 assert {"Key": "project", "Value": "iort"} in tags
 
 
-def test_two_stages_share_an_account(tmp_path_factory, synthesized):
-    """Every name that is not CloudFormation's own has the namespace in it."""
+def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
+    """Every name that CloudFormation does not generate contains the namespace."""
     from aws_cdk import App
 
     from app import build
@@ -248,7 +248,7 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
         RESULTS_PREFIX,
         1,
     )
-    # Without a setting, what robots have uploaded is kept for good.
+    # Without the setting, uploaded files are kept.
     assert rules["rare"]["Prefix"] == FILES_PREFIX
     assert "ExpirationInDays" not in rules["rare"]
     (policy,) = synthesized.resources("AWS::S3::BucketPolicy").values()
@@ -264,7 +264,7 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
 @pytest.mark.parametrize(
     ("days", "kept"), [(7, {"old": 7}), (30, {"old": 30}), (365, {"rare": None, "old": 365})]
 )
-def test_files_expire_when_the_setting_says_so(tmp_path, days, kept):
+def test_files_expire_after_the_configured_days(tmp_path, days, kept):
     from aws_cdk import App
 
     from stacks.settings import Settings

@@ -1,4 +1,4 @@
-"""What a robot and a claim may do: every IoT statement, and what IoT Core makes of them."""
+"""The IoT permissions of a robot and a claim: every statement, and its evaluation by IoT Core's rules."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ ROBOT_POLICY = [
     {"Effect": "Allow", "Action": "iot:Receive", "Resource": [f"{IOT}:topic/{t}" for t in LISTEN]},
 ]
 
-# Provisioning with this fleet's template, and hearing what becomes of it.
+# Provisioning with this fleet's template, and receiving the result.
 ASKED = ("$aws/certificates/create-from-csr/json", "$aws/provisioning-templates/iort-robot/provision/json")
 ANSWERED = [f"{topic}/{answer}" for topic in ASKED for answer in ("accepted", "rejected")]
 CLAIM_POLICY = [
@@ -83,14 +83,14 @@ def robot_policy(iot_policies):
     return iot_policies[fleet_name()]
 
 
-def test_the_iot_policies_statement_by_statement(iot_policies):
+def test_the_iot_policies_have_exactly_these_statements(iot_policies):
     assert iot_policies == {
         fleet_name(): ROBOT_POLICY,
         claim_name(): CLAIM_POLICY,
     }
 
 
-def test_the_policies_fit_whatever_the_namespace_and_the_region():
+def test_the_policies_are_within_the_size_limit_in_any_namespace_and_region():
     """ "Policy document size" of AWS IoT Core's quotas: 2048 characters, white space not counted."""
     stack, longest = Stack(), "n" * 16
     real = {"AWS::Partition": "aws-us-gov", "AWS::Region": "ap-southeast-2", "AWS::AccountId": "0" * 12}
@@ -128,7 +128,7 @@ def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy)
 
 
 def allows(policy, action, kind, topic, thing="car"):
-    """IoT Core's rule: * and ? are wildcards in the policy, + and # are characters like any other."""
+    """IoT Core's rule: * and ? are wildcards in a policy, + and # are plain characters."""
     for statement in policy:
         if statement["Action"] != f"iot:{action}":
             continue
@@ -139,7 +139,7 @@ def allows(policy, action, kind, topic, thing="car"):
     return False
 
 
-def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(robot_policy):
+def test_a_robot_may_publish_on_the_agents_topics_under_its_own_name_only(robot_policy):
     own = [
         record_topic("car", "vesc"),
         live_topic("car", "vesc"),
@@ -155,7 +155,7 @@ def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(r
         assert not allows(robot_policy, "Publish", "topic", topic.replace("iort", "lab2"))
 
 
-def test_a_robot_may_not_publish_what_is_for_others_to_say(robot_policy):
+def test_a_robot_may_not_publish_on_the_topics_of_others(robot_policy):
     for topic in (
         build_topic(CMD, "car", "stop"),
         build_topic(PONG, "car", "rule"),
@@ -208,7 +208,7 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         assert not allows(robot_policy, "Receive", "topic", topic), topic
 
 
-def test_a_robot_connects_as_its_thing_and_nobody_else(robot_policy):
+def test_a_robot_connects_only_as_its_own_thing(robot_policy):
     assert allows(robot_policy, "Connect", "client", "car")
     assert not allows(robot_policy, "Connect", "client", "car2")
     assert not allows(robot_policy, "Connect", "client", "car/2")

@@ -1,4 +1,4 @@
-"""The page on the web: nobody reads the bucket but CloudFront, and the browser is told what to allow."""
+"""The page on the web: only CloudFront reads the bucket, and responses have security headers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def of(site: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     return [each["Properties"] for each in site["Resources"].values() if each["Type"] == kind]
 
 
-def test_it_needs_neither_an_asset_nor_a_function(site):
+def test_the_site_has_neither_assets_nor_functions(site):
     assert {each["Type"] for each in site["Resources"].values()} == {
         "AWS::S3::Bucket",
         "AWS::S3::BucketPolicy",
@@ -36,7 +36,7 @@ def test_it_needs_neither_an_asset_nor_a_function(site):
     }
 
 
-def test_the_bucket_is_private_and_read_by_this_distribution_alone(site):
+def test_only_this_distribution_reads_the_private_bucket(site):
     (bucket,) = of(site, "AWS::S3::Bucket")
     assert all(bucket["PublicAccessBlockConfiguration"].values())
     (policy,) = of(site, "AWS::S3::BucketPolicy")
@@ -50,7 +50,7 @@ def test_the_bucket_is_private_and_read_by_this_distribution_alone(site):
     assert {"Ref": distribution} in allowed[0]["Condition"]["StringEquals"]["AWS:SourceArn"]["Fn::Join"][1]
 
 
-def test_it_speaks_tls_and_sends_what_the_pages_own_server_sends(site):
+def test_the_site_uses_tls_and_the_headers_of_the_pages_own_server(site):
     (distribution,) = of(site, "AWS::CloudFront::Distribution")
     behaviour = distribution["DistributionConfig"]["DefaultCacheBehavior"]
     assert behaviour["ViewerProtocolPolicy"] == "redirect-to-https"
@@ -68,5 +68,5 @@ def test_it_speaks_tls_and_sends_what_the_pages_own_server_sends(site):
     }
 
 
-def test_it_is_left_out_unless_asked_for(synthesized):
+def test_the_site_is_optional(synthesized):
     assert "site" not in synthesized.templates

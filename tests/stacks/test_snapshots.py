@@ -20,6 +20,6 @@ def test_the_stacks_are_these(synthesized):
 def test_template(request, snapshot, stack, stage):
     templates = request.getfixturevalue(stage).templates
     template = {k: v for k, v in templates[stack].items() if k not in ("Parameters", "Rules")}
-    # What the code and the layer hold is other tests' business; so is which CDK numbered the layer.
+    # Other tests hold the content of the code and the layer, and the CDK's number of the layer.
     masked = _ASSET.sub("<asset>", json.dumps(template))
     assert json.loads(masked) == snapshot

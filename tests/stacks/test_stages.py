@@ -1,4 +1,4 @@
-"""What the stages dev and prod do to everything that holds data, and what a key of one's own encrypts."""
+"""The stages dev and prod: the deletion of data, and encryption with a customer key."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from tests.stacks.templates import Reader, name
 
-# What loses data when it goes: kept by prod, removed by dev.
+# Resources with data: prod retains them, dev deletes them.
 HOLDS_DATA = {
     "AWS::DynamoDB::Table",
     "AWS::KMS::Key",
@@ -27,7 +27,7 @@ def holding_data(app):
     ]
 
 
-def test_dev_goes_with_its_stacks(synthesized):
+def test_dev_deletes_data_with_its_stacks(synthesized):
     for resource in holding_data(synthesized):
         assert (resource["DeletionPolicy"], resource["UpdateReplacePolicy"]) == ("Delete", "Delete"), resource
     for table in synthesized.resources("AWS::DynamoDB::Table").values():
@@ -37,7 +37,7 @@ def test_dev_goes_with_its_stacks(synthesized):
     assert not synthesized.resources("AWS::Budgets::Budget")
 
 
-def test_prod_stays(production):
+def test_prod_retains_data(production):
     for resource in holding_data(production):
         assert (resource["DeletionPolicy"], resource["UpdateReplacePolicy"]) == ("Retain", "Retain"), resource
     for table in production.resources("AWS::DynamoDB::Table").values():
@@ -59,9 +59,9 @@ def test_the_stages_have_the_same_resources_but_for_key_and_budget(synthesized, 
     assert not resources(synthesized) - resources(production)
 
 
-# --- a key of one's own -----------------------------------------------------------------------------
+# --- the customer key -------------------------------------------------------------------------------
 
-# Where a template names the key that a resource is encrypted with.
+# The path of a resource's encryption key in its properties.
 KEY_OF = {
     "AWS::DynamoDB::Table": ("SSESpecification", "KMSMasterKeyId"),
     "AWS::Logs::LogGroup": ("KmsKeyId",),
@@ -78,7 +78,7 @@ KEY_OF = {
 
 
 @pytest.mark.parametrize("kind", KEY_OF)
-def test_the_key_encrypts_everything_that_is_kept(production, kind):
+def test_the_customer_key_encrypts_all_stored_data(production, kind):
     reader = Reader(production)
     for properties in production.resources(kind).values():
         value = properties
@@ -87,7 +87,7 @@ def test_the_key_encrypts_everything_that_is_kept(production, kind):
         assert reader.text(value) == "Key.Arn"
 
 
-def test_the_key_is_for_this_account_through_these_services_only(production):
+def test_the_customer_key_can_be_used_only_by_this_account_and_these_services(production):
     (key,) = production.resources("AWS::KMS::Key").values()
     assert key["EnableKeyRotation"]
     reader = Reader(production)
@@ -97,7 +97,7 @@ def test_the_key_is_for_this_account_through_these_services_only(production):
         )
         if statement.get("Condition") is None:
             if statement.get("Sid") == "Alarms":
-                # AWS' example for alarms has no condition, and an alarm that tells nobody fails in silence.
+                # AWS' example for alarms has no condition; an alarm without access would fail silently.
                 assert statement == {
                     "Sid": "Alarms",
                     "Effect": "Allow",
@@ -125,7 +125,7 @@ def test_the_key_is_for_this_account_through_these_services_only(production):
 # --- tags and budget --------------------------------------------------------------------------------
 
 
-def test_every_resource_that_can_be_tagged_carries_the_tags(production):
+def test_every_taggable_resource_has_the_configured_tags(production):
     for template in production.templates.values():
         for logical_id, resource in template["Resources"].items():
             tags = resource.get("Properties", {}).get("Tags")
@@ -136,7 +136,7 @@ def test_every_resource_that_can_be_tagged_carries_the_tags(production):
     assert json.dumps(production.templates).count('"team"') > 20
 
 
-def test_the_budget_tells_the_address(production):
+def test_the_budget_notifies_the_address(production):
     (budget,) = production.resources("AWS::Budgets::Budget").values()
     assert budget["Budget"]["BudgetLimit"] == {"Amount": 50, "Unit": "USD"}
     assert budget["Budget"]["TimeUnit"] == "MONTHLY"

@@ -1,6 +1,6 @@
-"""A deployment from before batches had ids is updated in one `cdk deploy`, and keeps its telemetry.
+"""A deployment of version 1, before batches had ids, is updated in one `cdk deploy` and keeps its telemetry.
 
-version1.json holds what such a deployment has, by stage: every export of its stacks, and the table.
+version1.json has that deployment's exports and its table, by stage.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def stage(request):
 
 @pytest.fixture(scope="module")
 def updated(stage, deployment):
-    """Every stack's template for such a deployment, with the setting or without."""
+    """Every stack's template for that deployment, with and without the setting."""
     prod = {"stage": "prod", "customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
     given = prod if stage == "prod" else {}
     return {True: deployment(**given, old_telemetry=True).templates, False: deployment(**given).templates}
@@ -41,44 +41,44 @@ def old_tables(templates):
     return {name: table for name, table in tables if name.startswith("Telemetry")}
 
 
-def test_no_export_that_a_stack_may_still_import_goes_or_changes(updated, stage):
+def test_every_old_export_stays_unchanged(updated, stage):
     before, after = BEFORE[stage]["exports"], exports(updated[True])
     assert len(before) > 30
     assert {name: after.get(name) for name in before} == before
 
 
-def test_without_the_setting_cloudformation_refuses_the_update(updated, stage):
-    """What goes is what the record rule and Lambda 2 of the deployment import."""
+def test_an_update_without_the_setting_removes_imported_exports(updated, stage):
+    """CloudFormation refuses this: the old record rule and Lambda 2 import the removed exports."""
     gone = BEFORE[stage]["exports"].keys() - exports(updated[False])
     assert len(gone) == 3
     assert all(name.startswith("iort-storage:") and "Telemetry" in name for name in gone)
     assert not old_tables(updated[False])
 
 
-def test_the_old_table_is_neither_changed_nor_replaced_and_stays_in_every_stage(updated, stage):
+def test_the_old_table_stays_unchanged_in_every_stage(updated, stage):
     before = BEFORE[stage]["telemetry"]
     (table,) = old_tables(updated[True]).values()
     assert table["Properties"] == before["Properties"]
     assert (table["DeletionPolicy"], table["UpdateReplacePolicy"]) == ("Retain", "Retain")
 
 
-def test_no_stack_imports_anything_of_the_old_table(updated):
-    """Nothing reads or writes it, and the setting can be taken away again."""
+def test_no_stack_imports_the_old_table(updated):
+    """No function reads or writes it, so the setting can be removed later."""
     for name, template in updated[True].items():
         imported = json.dumps(template["Resources"])
         assert "iort-storage:ExportsOutput" in imported or name in ("iort-storage", "iort-account"), name
         assert "Telemetry" not in "".join(re.findall(r"iort-storage:(\w+)", imported)), name
 
 
-def test_both_tables_are_put_out_by_name(updated):
+def test_both_tables_are_outputs(updated):
     outputs = updated[True]["iort-storage"]["Outputs"]
     (old,) = old_tables(updated[True])
     assert outputs["OldTelemetryTable"]["Value"] == {"Ref": old}
     assert outputs["TelemetryTable"]["Value"] != {"Ref": old}
 
 
-# "AWS::IoT::ThingType ThingTypeProperties": of both, "Update requires: Replacement", which the schema does
-# not say; and CloudFormation cannot make a second one of a name.
+# "AWS::IoT::ThingType ThingTypeProperties": both have "Update requires: Replacement", which the schema does
+# not say; and CloudFormation cannot create a second type of the same name.
 THING_TYPE = {
     "ThingTypeDescription": "A robot that runs the iort agent",
     "SearchableAttributes": ["vehicle"],

@@ -69,7 +69,7 @@ def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, fun
     packaged = {
         str(path.relative_to(asset)): path.read_bytes() for path in asset.rglob("*") if path.is_file()
     }
-    # Side by side, as they are imported.
+    # The packages stand side by side, as they are imported.
     expected = dict.fromkeys(FUNCTIONS, ROOT) | dict.fromkeys(CONTRACT, ROOT / "contract")
     assert packaged == {
         str(path.relative_to(home)): path.read_bytes()
@@ -80,7 +80,7 @@ def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, fun
 
 @pytest.fixture(scope="module")
 def runtime(tmp_path_factory):
-    """What Lambda's Python has beside the asset: boto3, and nothing else of this environment."""
+    """Lambda's Python beside the asset: only boto3 from this environment."""
     folder = tmp_path_factory.mktemp("runtime")
     for package in RUNTIME_PACKAGES:
         spec = importlib.util.find_spec(package)
@@ -151,14 +151,14 @@ def source(module):
 
 
 def modules_of(node):
-    """What an import from functions/ loads: the module that it names, or the modules out of a package."""
+    """The modules that an import from functions/ loads: the named module, or a package's modules."""
     if (ROOT / f"{node.module.replace('.', '/')}.py").is_file():
         return [node.module]
     return [f"{node.module}.{alias.name}" for alias in node.names]
 
 
 def imported(module):
-    """The modules of functions/ that one of them loads, itself included."""
+    """A module of functions/ and all modules of functions/ that it loads."""
     found, todo = set(), [module]
     while todo:
         one = todo.pop()
@@ -175,7 +175,7 @@ def imported(module):
 
 
 def environments_read(module):
-    """The classes by which a function reads its environment. Nothing reads it otherwise, but for one variable
+    """The classes with which a function reads its environment. The only other read is one variable
     that Lambda itself sets."""
     read = {environments.Environment}
     for one in imported(module):
@@ -190,14 +190,14 @@ def environments_read(module):
 
 
 @pytest.mark.parametrize("function", HANDLERS)
-def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, reader, function):
+def test_a_function_reads_exactly_its_variables(functions, reader, function):
     properties = functions[function]
     given = {key: reader.text(value) for key, value in properties["Environment"]["Variables"].items()}
     read = environments_read(properties["Handler"].rpartition(".")[0])
     assert {name for one in read for name in one.read(given).variables()} == given.keys()
 
 
-def test_what_the_variables_say_is_what_the_functions_expect(functions, reader):
+def test_the_variables_have_the_values_that_the_functions_expect(functions, reader):
     def given(function, kind):
         variables = functions[function]["Environment"]["Variables"]
         return kind.read({key: reader.text(value) for key, value in variables.items()})
@@ -221,7 +221,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader):
     )
 
 
-def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, functions):
+def test_functions_log_their_own_lines_and_lambdas_errors(synthesized, functions):
     for made in functions.values():
         logging = made["LoggingConfig"]
         assert (logging["LogFormat"], logging["SystemLogLevel"]) == ("JSON", "WARN")
@@ -229,7 +229,7 @@ def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, 
         assert logging["ApplicationLogLevel"] == "INFO"
 
 
-def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
+def test_lambdas_own_lines_are_logged_on_request(tmp_path):
     app = App(context={"function_logs": "all", "layer": str(tmp_path)})
     stack = PlatformStack(app, "x", Settings.from_context(app))
     function(stack, "Echo", environments.Environment("iort"))
@@ -262,13 +262,13 @@ def filters(synthesized):
     return found
 
 
-def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters):
+def test_every_topic_of_the_agent_matches_exactly_its_rule(filters):
     for ruled, lane, straight in (
         ("record", RECORD, record_topic("car", "vesc")),
         ("live", LIVE, live_topic("car", "vesc")),
     ):
         rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", straight).groups()
-        # Basic Ingest leaves the rest of the topic to the rule it names, which filters it like any other.
+        # Basic Ingest passes the rest of the topic to the named rule, which filters it as usual.
         assert rule == rule_name(ruled)
         assert topic == build_topic(lane, "car", "vesc")
     expected = {
@@ -294,7 +294,7 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         assert {rule for rule, topic_filter in filters.items() if matches(topic_filter, one)} == rules, one
 
 
-def test_the_pongs_topic_is_what_the_agent_expects(synthesized):
+def test_the_pongs_topic_is_the_agents(synthesized):
     topics = {
         rule["RuleName"]: action["Republish"]["Topic"]
         for rule in synthesized.resources("AWS::IoT::TopicRule").values()

@@ -39,7 +39,7 @@ def _section(*ratios):
     )
 
 
-def test_spread_of_repeats():
+def test_the_spread_has_percentiles_and_the_range_of_repeats():
     found = spread([[1.0, 2.0, 3.0], [5.0, 6.0, 7.0]])
     assert found is not None
     assert (found.n, found.p50, found.low, found.high) == (6, 4.0, 2.0, 6.0)
@@ -49,7 +49,7 @@ def test_spread_of_repeats():
     assert spread([[3.0]]) == spread([[3.0], []])
 
 
-def test_ratio_is_of_pairs_so_a_slow_minute_falls_out():
+def test_a_ratio_compares_pairs_so_that_a_slow_minute_cancels_out():
     assert ratio([[2.0], [20.0], [2.0]], [[1.0], [10.0], [1.0]]) == 2.0
     assert ratio([[2.0], []], [[1.0], [1.0]]) == 2.0
     assert ratio([[]], [[1.0]]) is None
@@ -66,11 +66,11 @@ def test_ratio_is_of_pairs_so_a_slow_minute_falls_out():
         (9, None, False, None),
     ],
 )
-def test_targets(value, target, at_least, reached):
+def test_a_ratio_reaches_its_target_or_not(value, target, at_least, reached):
     assert Ratio("r", value, target, at_least=at_least).reached is reached
 
 
-def test_markdown_has_tables_pictures_and_the_machine():
+def test_the_markdown_has_tables_pictures_and_the_machine():
     text = writer.markdown([_section(Ratio("r", 1.6, 1.5))], MACHINE, "embedded")
     assert "| r | 1.6 | at most 1.5 | **no** |" in text
     assert "| a\\|b | <script> |" in text
@@ -79,7 +79,7 @@ def test_markdown_has_tables_pictures_and_the_machine():
     assert "A processor" in text
 
 
-def test_written_report_is_whole_and_old_pictures_go(tmp_path):
+def test_a_written_report_is_complete_and_old_pictures_are_deleted(tmp_path):
     (tmp_path / "report-old.svg").write_text("<svg/>")
     writer.write(tmp_path, [_section(Ratio("r", 1, 2))], MACHINE, "embedded")
     assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -103,7 +103,7 @@ def _report(*ratios, cpu="A processor", key="query"):
     [
         (2.0, 2.9, None, {}, 0),
         (2.0, 3.1, None, {}, 1),
-        # Also where the target is far away.
+        # Also with a distant target.
         (1.0, 1.6, 9.0, {}, 1),
         (1.0, 1.6, 9.0, {"tolerance": 2}, 0),
         (30.0, 21.0, 20.0, {"at_least": True}, 0),
@@ -112,7 +112,7 @@ def _report(*ratios, cpu="A processor", key="query"):
         (0.0, 0.0, 0.0, {}, 0),
     ],
 )
-def test_guard_lets_a_figure_be_as_much_worse_as_it_says(was, now, target, more, worse):
+def test_the_guard_allows_a_figure_its_stated_tolerance(was, now, target, more, worse):
     old, new = (_report(Ratio("r", value, target, **more)) for value in (was, now))
     assert len(guard.regressions(new, old)) == worse
 
@@ -120,13 +120,13 @@ def test_guard_lets_a_figure_be_as_much_worse_as_it_says(was, now, target, more,
 @pytest.mark.parametrize(
     ("cpu", "now", "worse"), [("A processor", 1.6, 1), ("Other", 1.6, 0), ("Other", 9, 1)]
 )
-def test_guard_holds_a_time_to_its_target_on_another_machine(cpu, now, worse):
+def test_the_guard_compares_a_time_from_another_machine_with_its_target(cpu, now, worse):
     old = _report(Ratio("r", 1.0, 5.0, by_machine=True))
     new = _report(Ratio("r", now, 5.0, by_machine=True), cpu=cpu)
     assert len(guard.regressions(new, old)) == worse
 
 
-def test_guard_names_what_a_section_no_longer_gives_and_which_were_not_run():
+def test_the_guard_names_missing_figures_and_sections_that_were_not_run():
     old, new = _report(Ratio("a", 1, 1), Ratio("b", 1, 1)), _report(Ratio("a", 1, 1))
     assert guard.regressions(new, old) == ["b: no longer measured"]
     other = _report(Ratio("c", 1, 1), key="outage")
@@ -142,7 +142,7 @@ def test_guard_names_what_a_section_no_longer_gives_and_which_were_not_run():
         ({"sections": []}, 2, "has no figure of"),
     ],
 )
-def test_guard_says_what_it_did(tmp_path, capsys, change, status, said):
+def test_the_guard_reports_its_comparison(tmp_path, capsys, change, status, said):
     report = _report(Ratio("r", 1, 2))
     for name, content in (("old", report), ("new", {**report, **change})):
         (tmp_path / name).write_text(json.dumps(content))
@@ -152,13 +152,13 @@ def test_guard_says_what_it_did(tmp_path, capsys, change, status, said):
     assert said in "".join(capsys.readouterr())
 
 
-def test_guard_reads_the_report_that_is_kept():
+def test_the_guard_reads_the_kept_report():
     kept = json.loads(REPORT.read_text())
     assert len(guard.ratios(kept)) > 10
     assert guard.regressions(kept, kept) == []
 
 
-def test_report_that_is_kept_names_no_host_and_no_folder():
+def test_the_kept_report_names_no_host_and_no_folder():
     for path in REPORT.parent.iterdir():
         text = path.read_text()
         assert "/tmp/" not in text, path.name
@@ -166,7 +166,7 @@ def test_report_that_is_kept_names_no_host_and_no_folder():
         assert "/work/" not in text, path.name
 
 
-def test_plots_are_small_xml_and_the_same_every_time():
+def test_plots_are_small_and_reproducible_xml():
     curves = {"a": [1.0, 2.0, 3.0] * 500, "b": [2.0], "none": []}
     first, second = (plots.cdf(curves)("A & B") for _ in range(2))
     assert first == second

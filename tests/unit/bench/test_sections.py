@@ -1,4 +1,4 @@
-"""What the bench's sections make of what they measured."""
+"""The bench's sections evaluate their measurements."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from iort_contract.ros1.definition import parse
 from iort_contract.topics import BROKER, LAMBDA, RULE, live_topic, record_topic
 
 
-def test_report_lines_of_lambda_are_read():
+def test_lambdas_report_lines_are_read():
     line = "REPORT RequestId: 8f50\tDuration: 12.34 ms\tBilled Duration: 13 ms\tMemory Size: 256 MB\t"
     cold = line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t"
     tail = f"START RequestId: 8f50 Version: $LATEST\nREPORTED\nEND RequestId: 8f50\n{cold}\n"
@@ -42,14 +42,14 @@ def test_report_lines_of_lambda_are_read():
     assert invocations._INIT.search(line) is None
 
 
-def test_projection_is_the_share_of_a_processor_that_memory_buys():
+def test_the_projection_scales_with_the_cpu_share_of_the_memory_size():
     projected = utilisation._projected({"f": Measured([], [2.0, 2.0]), "none": Measured()})
     assert list(projected) == ["f"]
     assert projected["f"][-1] == 2.0, "at 1,769 MB there is one whole vCPU"
     assert projected["f"][0] == pytest.approx(2.0 * 1769 / 128)
 
 
-def test_functions_are_held_to_what_they_cost_beyond_an_empty_one():
+def test_functions_are_compared_with_their_targets_beyond_an_empty_function():
     many = f"Lambda 2, an event of {BATCHES} batches"
     found = {
         "Lambda 1 (live)": Measured([[1.0]], [2.0, 2.2, 2.1]),
@@ -66,7 +66,7 @@ def test_functions_are_held_to_what_they_cost_beyond_an_empty_one():
     assert all(ratio.reached for ratio in section.ratios if ratio.target is not None)
 
 
-def test_outage_tells_what_came_before_during_and_after():
+def test_the_outage_section_reports_before_during_and_after():
     second = 1_000_000
     live = [(t * second, 5.0) for t in range(8)] + [(70 * second + i * 100_000, 7.0) for i in range(20)]
     section = Section("outage", "")
@@ -90,7 +90,7 @@ def test_outage_tells_what_came_before_during_and_after():
     assert ["live samples of the outage that came late to the dashboard", "0"] in section.tables[0].rows
 
 
-def test_thesis_reader_follows_every_page():
+def test_the_thesis_reader_follows_every_page():
     pages = [{"Items": [1, 2], "LastEvaluatedKey": "k"}, {"Items": [3]}]
     asked = []
 
@@ -102,7 +102,7 @@ def test_thesis_reader_follows_every_page():
     assert asked == [{"Limit": 2}, {"Limit": 2, "ExclusiveStartKey": "k"}]
 
 
-def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
+def test_a_probe_that_raises_is_a_no_with_its_reason():
     def refuses(_):
         raise AbilityMissingError("nothing came")
 
@@ -117,7 +117,7 @@ def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
         assert abilities._answer(abilities.Probe("s", "a", "-", ask), None) == answer
 
 
-def test_what_the_thesis_says_stands_beside_each_ability():
+def test_each_ability_is_shown_beside_the_thesis_entry():
     entries = {
         f"{criterion}: {entry}"
         for table in thesis.TABLES
@@ -141,7 +141,7 @@ def test_the_thesis_tables_are_in_the_report_with_their_source():
     assert all(len(row) == len(one.criteria) for one in thesis.TABLES for row in one.rows.values())
 
 
-def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
+def test_round_trips_with_the_thesis_ping_are_shown_beside_its_figures():
     took_ms = {BROKER: 52.0, RULE: 53.0, LAMBDA: 58.0, RAW: 51.0}
     found = {
         f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in thesis_ping.RATES_HZ
@@ -164,7 +164,7 @@ def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
     assert values["car to subscriber with 25 ms each way / thesis' 300 ms"] == 0.2
 
 
-def test_a_query_stands_beside_the_thesis_query_at_the_same_place():
+def test_a_query_is_shown_beside_the_thesis_query_from_the_same_place():
     section = Section("query", "")
     ways = {name: query.Way([1.0], [0.5], [], query.POINTS) for name in query.THESIS_S}
     query.report(section, ways)
@@ -176,7 +176,7 @@ def test_a_query_stands_beside_the_thesis_query_at_the_same_place():
     assert hour.row(query.OURS_QUERY)[-1] == "-", "the thesis read no hour"
 
 
-def test_mixed_robot_has_the_types_that_its_definitions_say():
+def test_the_mixed_robots_topics_have_the_types_of_their_definitions():
     for topic in mixed_robot.topics().values():
         assert parse(topic.kind, topic.definition).kind == topic.kind
     by_name = mixed_robot.topics()
@@ -206,7 +206,7 @@ def batch(seq, n):
     )
 
 
-def test_mixed_robot_counts_a_batch_once_and_what_came_late():
+def test_the_mixed_robot_section_counts_each_batch_once_and_late_batches():
     tf, imu = record_topic("bench", "tf"), record_topic("bench", "imu")
     found = mixed_run(
         [
@@ -225,7 +225,7 @@ def test_mixed_robot_counts_a_batch_once_and_what_came_late():
     assert found.lost({"/tf": 90, "/imu": 40}) == 0
 
 
-def test_mixed_robot_is_held_to_what_it_lost_and_left_out():
+def test_the_mixed_robot_section_has_targets_for_lost_and_omitted_messages():
     sent = batch(0, 60)
     section = Section("mixed", "")
     mixed.report(section, mixed_run([(99.0, record_topic("bench", "tf"), sent)]))
@@ -240,7 +240,7 @@ def test_mixed_robot_is_held_to_what_it_lost_and_left_out():
     json.dumps(section.as_json())
 
 
-def test_fairness_is_held_to_twice_the_delay_of_a_car_alone():
+def test_the_fairness_target_is_twice_the_delay_of_a_car_alone():
     section = Section("fairness", "")
     found = {"nothing": [[10.0] * 80], "bad messages": [[19.0] * 80], "good messages": [[21.0] * 40]}
     fairness.report(section, found)
@@ -249,7 +249,7 @@ def test_fairness_is_held_to_twice_the_delay_of_a_car_alone():
     assert section.tables[0].rows[1][:2] == ["bad messages", "80"]
 
 
-def test_summaries_beside_worst_case_batches_are_held_to_twice_the_delay_of_a_car_alone():
+def test_the_target_of_summaries_beside_worst_case_batches_is_twice_the_delay_of_a_car_alone():
     section = Section("fairness", "")
     kinds = ("15 worst-case batches a second", "100 worst-case batches a second")
     delays = ([[2000.0] * 40], [[3000.0] * 40], [[5000.0] * 20])
@@ -259,7 +259,7 @@ def test_summaries_beside_worst_case_batches_are_held_to_twice_the_delay_of_a_ca
     assert section.tables[0].rows[2][:2] == [kinds[1], "20"]
 
 
-def test_every_section_of_the_documentation_is_one_that_runs():
+def test_the_documentation_lists_every_section():
     from bench import ROOT
 
     text = (ROOT / "docs" / "bench.md").read_text()

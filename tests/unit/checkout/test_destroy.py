@@ -1,4 +1,4 @@
-"""`make destroy` straight after the last robot went: AWS keeps the policy for up to five minutes."""
+"""`make destroy` right after the removal of the last robot: AWS keeps its policy for up to five minutes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OTHER = "iort-storage | 3 | 10:00:00 | DELETE_FAILED | AWS::S3::Bucket | Files (
 
 @pytest.fixture
 def cdk(tmp_path):
-    """A command that fails so often, saying so; its arguments of each time are in `calls`."""
+    """A fake command that fails this often with this text; `calls` has the arguments of each call."""
     calls = tmp_path / "calls"
 
     def command(failures, said):
@@ -33,7 +33,7 @@ def cdk(tmp_path):
     return command
 
 
-def test_it_tries_again_while_the_policy_stays_and_asks_once(cdk, capfd):
+def test_destroy_retries_while_the_policy_exists_and_asks_once(cdk, capfd):
     waited = []
     assert destroy.destroy(cdk(3, KEPT), waited.append) == 0
     assert waited == [destroy.AGAIN_S] * 3
@@ -43,7 +43,7 @@ def test_it_tries_again_while_the_policy_stays_and_asks_once(cdk, capfd):
     assert "again in 30 s, 12 times at most" in said
 
 
-def test_it_waits_longer_than_aws_says_and_not_for_ever(cdk):
+def test_destroy_gives_up_after_six_minutes(cdk):
     waited = []
     assert destroy.destroy(cdk(99, KEPT), waited.append) == 1
     assert sum(waited) == 360
@@ -51,7 +51,7 @@ def test_it_waits_longer_than_aws_says_and_not_for_ever(cdk):
 
 
 @pytest.mark.parametrize(("failures", "said", "status"), [(99, OTHER, 1), (0, "", 0)])
-def test_what_is_no_policy_ends_it_at_once(cdk, failures, said, status):
+def test_any_other_result_ends_destroy_at_once(cdk, failures, said, status):
     waited = []
     assert destroy.destroy(cdk(failures, said), waited.append) == status
     assert (waited, len(cdk.calls())) == ([], 1)

@@ -1,4 +1,4 @@
-"""What the three distributions declare: every import, and one version."""
+"""The three distributions declare every import and share one version."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PACKAGES = {
     "iort-agent": ROOT / "device" / "iort_agent",
     "iort-station": ROOT / "station" / "iort_station",
 }
-# They come with ROS, from no registry.
+# They come with ROS and are in no registry.
 ROS = {"genpy", "rosgraph", "roslib", "rospy"}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """The top-level modules that code imports when it runs; types alone are not needed then."""
+    """The top-level modules that code imports at run time, without imports only for types."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             for otherwise in node.orelse:
@@ -41,17 +41,17 @@ def needed(package: Path) -> set[str]:
     modules -= {*sys.stdlib_module_names, package.name, *ROS}
     ours = {path.name: name for name, path in PACKAGES.items()}
     known = packages_distributions()
-    # A module of the checkout that is never installed stands for itself, and nobody can declare it.
+    # A module of the checkout that is never installed is returned as it is; it cannot be declared.
     return {ours.get(name) or known.get(name, [name])[0].lower() for name in modules}
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_every_import_is_declared_and_every_declared_dependency_imported(name):
+def test_every_import_is_declared_and_every_dependency_is_imported(name):
     declared = {Requirement(text).name.lower() for text in requires(name) or ()}
     assert needed(PACKAGES[name]) == declared
 
 
-def test_an_import_inside_a_function_counts_and_one_for_types_does_not():
+def test_imports_in_functions_count_and_imports_for_types_do_not():
     code = (
         "if TYPE_CHECKING:\n    import one\ndef f():\n    import two.three\n    from four.five import six\n"
     )

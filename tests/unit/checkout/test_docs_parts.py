@@ -14,7 +14,7 @@ def test_every_part_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
     assert docs_parts.main(check=True) == 0, "".join(capsys.readouterr())
 
 
-def test_a_part_that_was_changed_by_hand_is_filled_again(
+def test_a_part_changed_by_hand_is_generated_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "README.md"

@@ -1,4 +1,4 @@
-"""docs/how-to-extend.md works: each way is followed in a copy of the checkout, with the page's own blocks."""
+"""docs/how-to-extend.md works: the page's own blocks are applied to a copy of the checkout."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Copy:
         file.write_text(text.replace(before, after))
 
     def run(self, *command: str) -> str:
-        """What a Python command prints, with the copy's packages."""
+        """The output of a Python command with the copy's packages."""
         path = [str(self.root / name) for name in ("", "contract", "device", "station")]
         environment = {
             **os.environ,
@@ -110,11 +110,11 @@ def copy(tmp_path: Path) -> Copy:
     return Copy(tmp_path / "checkout")
 
 
-def test_the_page_has_a_way_for_each_thing() -> None:
+def test_the_page_lists_each_of_its_sections() -> None:
     assert set(re.findall(r"^\| \[(.*?)\]", PAGE, re.MULTILINE)) == {name.lower() for name in SECTIONS}
 
 
-def test_a_field(copy: Copy) -> None:
+def test_the_way_to_add_a_field_works(copy: Copy) -> None:
     assert len(set(copy.follow("A field"))) == 1
     assert copy.show("unit('vesc', 'temp_battery_max')", "from iort_station.data.units import unit") == "degC"
     hottest = "from iort_contract.catalog.vesc import hottest_degc"
@@ -124,7 +124,7 @@ def test_a_field(copy: Copy) -> None:
     assert '"temp_battery"' in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
-def test_a_derived_field(copy: Copy) -> None:
+def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
     assert len(set(copy.follow("A derived field"))) == 1
     columns = "{'duty_cycle': [0.5, None], 'voltage_input': [12.0, 12.0], 'current_motor': [10, 10]}"
     batch = f"Batch('0badcafe', 0, [1_000_000, 1_020_000], {columns})"
@@ -168,7 +168,7 @@ def of_type(resources: dict[str, Any], kind: str, name: str) -> Any:
     return found["Properties"]
 
 
-def test_a_rule(copy: Copy) -> None:
+def test_the_way_to_add_a_rule_works(copy: Copy) -> None:
     assert len(set(copy.follow("A rule"))) == 3
     stacks = templates(copy)
     rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Horn")
@@ -188,7 +188,7 @@ def test_a_rule(copy: Copy) -> None:
     assert "| `horn` | counts who sounds the horn |" in (copy.root / "docs/processing.md").read_text()
 
 
-def test_a_function(copy: Copy) -> None:
+def test_the_way_to_add_a_function_works(copy: Copy) -> None:
     assert len(set(copy.follow("A function"))) == 3
     stacks = templates(copy)
     function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Count")
@@ -199,14 +199,14 @@ def test_a_function(copy: Copy) -> None:
     assert copy.show("callable(handler)", "from functions.count import handler") is True
 
 
-def test_a_verb(copy: Copy) -> None:
+def test_the_way_to_add_a_verb_works(copy: Copy) -> None:
     assert len(set(copy.follow("A verb"))) == 2
     iort = "from iort_station.cli.main import main; main()"
     assert "speed\terpm\n" in copy.run("-c", iort, "fields")
     assert "List the known fields of a stream" in copy.run("-c", iort, "--help")
 
 
-def test_a_source(copy: Copy, tmp_path: Path) -> None:
+def test_the_way_to_add_a_source_works(copy: Copy, tmp_path: Path) -> None:
     assert len(set(copy.follow("A source"))) == 2
     (section,) = (text for kind, text in BLOCK.findall(SECTIONS["A source"]) if kind == "yaml")
     for name in ("certificate.pem", "private.key"):

@@ -1,4 +1,4 @@
-"""Whoever silences a checker says why, on the line."""
+"""Every comment that silences a checker gives its reason on the same line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ REASONED = re.compile(
 
 
 def unreasoned(source):
-    """Line and text of every comment that silences a checker and does not say why."""
+    """Line and text of every comment that silences a checker without a reason."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT and IGNORE.search(token.string):
             ignore = token.string[IGNORE.search(token.string).start() :]
@@ -44,7 +44,7 @@ def unreasoned(source):
                 yield token.start[0], ignore
 
 
-def test_every_ignore_of_a_line_says_why():
+def test_every_ignore_of_a_line_has_a_reason():
     found = [
         f"{path.relative_to(ROOT)}:{line}: {ignore}"
         for path in SOURCES
@@ -71,7 +71,7 @@ def test_an_ignore_without_a_reason_is_found(comment):
     assert [line for line, _ in unreasoned(f"x = 1\ny = 2  # {comment}\n")] == [2]
 
 
-def test_of_a_file_or_folder_the_configuration_says_why():
+def test_every_ignore_of_a_file_or_folder_has_a_reason():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     table = text.split("[tool.ruff.lint.per-file-ignores]\n")[1].split("\n[")[0]
     rules = [line for line in table.splitlines() if re.search(r'"[A-Z]+\d*"', line)]

@@ -1,4 +1,4 @@
-"""The layer: what is in it follows from what it is for; its bytecode is the same from two builds."""
+"""The layer has the packages of its target, and two builds give the same bytecode."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 
 from scripts.layer import LAMBDA, LOCAL, build
 
-# What an unchecked-hash .pyc has in its second word: PEP 552.
+# The second word of an unchecked-hash .pyc: PEP 552.
 UNCHECKED_HASH = 0b01
 CODE = "import sys\n\nSETS = {'a', 'b', 'c'}\nanswer = lambda text: text in {'x', 'y', 'z'}\n"
 
 
 def wheel(folder, name):
-    """A package of one module, as a registry has it; gives its SHA-256."""
+    """Writes a wheel of one module and returns its SHA-256."""
     path = folder / f"{name}-1.0-py3-none-any.whl"
     info = f"{name}-1.0.dist-info"
     with zipfile.ZipFile(path, "w") as archive:
@@ -37,7 +37,7 @@ def wheel(folder, name):
 
 @pytest.fixture
 def requirements(tmp_path, monkeypatch):
-    """A locked file of packages that only Lambda's Python, its machine or this one has."""
+    """A lock file of packages for Lambda's Python, for its machine and for this one."""
     host = "{}.{}".format(*sys.version_info)
     markers = {
         "everywhere": "python_version >= '3'",
@@ -49,7 +49,7 @@ def requirements(tmp_path, monkeypatch):
     }
     wheels = tmp_path / "wheels"
     wheels.mkdir()
-    # No registry is asked.
+    # No registry is contacted.
     monkeypatch.setenv("UV_NO_INDEX", "1")
     monkeypatch.setenv("UV_FIND_LINKS", str(wheels))
     locked = tmp_path / "layer.txt"
@@ -63,7 +63,7 @@ def names(layer):
     return {path.name for path in (layer / "python").iterdir() if not path.name.endswith(".dist-info")}
 
 
-def test_markers_are_those_of_the_target(requirements, tmp_path):
+def test_markers_are_evaluated_for_the_target(requirements, tmp_path):
     build(tmp_path / "layer", requirements, LAMBDA, None)
     expected = {"everywhere", "lambda_python", "lambda_full", "lambda_machine"}
     if LAMBDA.python == LOCAL.python:
@@ -74,7 +74,7 @@ def test_markers_are_those_of_the_target(requirements, tmp_path):
     assert ("lambda_python" in names(tmp_path / "here")) == (LAMBDA.python == LOCAL.python)
 
 
-def test_a_file_that_is_not_the_locked_one_is_refused(requirements, tmp_path):
+def test_a_file_with_another_hash_than_the_locked_one_is_refused(requirements, tmp_path):
     other = "0" * 64
     requirements.write_text(
         re.sub("sha256:[0-9a-f]{64}", f"sha256:{other}", requirements.read_text(), count=1)
@@ -83,7 +83,7 @@ def test_a_file_that_is_not_the_locked_one_is_refused(requirements, tmp_path):
         build(tmp_path / "layer", requirements, LAMBDA, None)
 
 
-def test_bytecode_is_believed_and_the_same_from_two_builds(requirements, tmp_path):
+def test_bytecode_is_unchecked_and_reproducible(requirements, tmp_path):
     first, second = tmp_path / "layer", tmp_path / "elsewhere" / "deeper"
     build(first, requirements, LAMBDA, sys.executable)
     build(second, requirements, LAMBDA, sys.executable)
@@ -98,6 +98,6 @@ def test_bytecode_is_believed_and_the_same_from_two_builds(requirements, tmp_pat
         assert str(tmp_path).encode() not in files[path]
 
 
-def test_without_a_compiler_there_is_no_bytecode(requirements, tmp_path):
+def test_a_layer_without_a_compiler_has_no_bytecode(requirements, tmp_path):
     build(tmp_path / "layer", requirements, LAMBDA, None)
     assert not list((tmp_path / "layer").rglob("*.pyc"))

@@ -1,4 +1,4 @@
-"""The command's completion knows its verbs."""
+"""The shell completion knows the commands."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 
-def test_completion_knows_the_commands():
+def test_the_completion_knows_the_commands():
     iort = Path(sys.executable).parent / "iort"
     asked = {"_IORT_COMPLETE": "complete_bash", "COMP_WORDS": "iort qu", "COMP_CWORD": "1"}
     done = subprocess.run([iort], env=asked, capture_output=True, text=True, check=False, timeout=60)

@@ -1,4 +1,4 @@
-"""docs/messages.md has every limit of the contract, as it is, and every link of its own leads somewhere."""
+"""docs/messages.md has every limit of the contract with its value, and its internal links are valid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from iort_contract.ros1.message import MAX_LAYOUT
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
 
-# Limits that are written with their unit; all others are written as they are.
+# Limits that the page writes with a unit; all others are plain numbers.
 UNITS = {
     "MAX_MESSAGE_BYTES": (1024, "KiB"),
     "MAX_PUBNUB_BYTES": (1024, "KiB"),
@@ -36,7 +36,7 @@ UNITS = {
 MODULES = (limits, commands, files)
 
 
-def test_each_limit_is_told_as_it_is() -> None:
+def test_each_limit_has_its_value_on_the_page() -> None:
     table = {name: row for row in rows(section("### Of this project")) for name in named(row[2])}
     told = {
         "MAX_LAYOUT": MAX_LAYOUT,
@@ -54,14 +54,14 @@ def test_each_limit_is_told_as_it_is() -> None:
         assert table[name][1] in {f"{text} {unit}".strip() for text in (plain, grouped)}, name
 
 
-def test_no_limit_of_the_contract_is_left_out() -> None:
+def test_the_page_names_every_limit_of_the_contract() -> None:
     text = section("## Limits")
     every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
     every |= {name for of in MODULES for name in vars(of) if name.startswith("MAX_")}
     assert {name for name in every if f"`{name}`" not in text} == set()
 
 
-def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep_to() -> None:
+def test_the_brokers_limits_equal_those_of_the_agent_and_the_embedded_cloud() -> None:
     table = {row[0]: row[1:] for row in rows(section("### Of AWS IoT, and of the embedded cloud"))}
     told = {name: row[0] for name, row in table.items()}
     assert told["a message's payload"] == f"{iot._MAX_PAYLOAD_BYTES // 1024} KiB"
@@ -72,7 +72,7 @@ def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep
     assert f"below {rate_limiter.PUBLISHES_PER_S * rate_limiter.SHARE:g} publishes" in PAGE
 
 
-def test_every_heading_is_in_the_table_of_contents_and_every_link_leads_to_one() -> None:
+def test_the_table_of_contents_and_the_links_match_the_headings() -> None:
     headings = [line[3:] for line in PAGE.splitlines() if line.startswith("## ")]
     titles = {heading.lower().replace(" ", "-").replace("'", "") for heading in headings}
     assert titles == {link.split(")")[0] for link in PAGE.split("](#")[1:]}

@@ -41,7 +41,7 @@ def batch_of(columns: Mapping[str, Sequence[Any]], messages: Messages | None = N
 
 
 def made(offsets_ns: Sequence[int], frames: Sequence[bytes]) -> list[bytes]:
-    """Stamped messages of numbers, whose stamps are so many nanoseconds behind the samples' times."""
+    """Stamped numeric messages; each stamp is this many nanoseconds behind the sample's time."""
     made = []
     for i, (t_us, ns, frame) in enumerate(zip(TIMES_US, offsets_ns, frames, strict=True)):
         sec, nanosec = divmod(t_us * 1000 + ns, 10**9)
@@ -55,7 +55,7 @@ def body_of(batch: Batch) -> bytes:
     return inflate(envelope["samples"], envelope["codec"])
 
 
-def test_its_examples_are_bodies_of_batches() -> None:
+def test_the_pages_examples_are_valid_bodies_of_batches() -> None:
     times = [0, 20_000, 40_001]
     example = EXAMPLES["batch"]
     assert f"    {inflate(example['samples'], example['codec']).decode()}\n" in PAGE
@@ -75,7 +75,7 @@ def test_its_examples_are_bodies_of_batches() -> None:
     assert f"    {body.split(BREAK)[1].decode()}\n" in PAGE
 
 
-def test_its_dictionary_is_the_codecs() -> None:
+def test_the_pages_dictionary_is_the_codecs() -> None:
     (text,) = re.findall(r"<!-- dictionary -->\n```text\n(.*?)```", PAGE, re.DOTALL)
     assert text.replace("\n", "").encode() == DICTIONARY
 
@@ -83,7 +83,7 @@ def test_its_dictionary_is_the_codecs() -> None:
 @pytest.mark.parametrize(
     "values", [[1, 2.5, None], [7, 9, -1], ["x", True, 0.1], ["\u00e9", 2**64 - 1, -(2**63)]]
 )
-def test_what_its_writer_writes_is_a_batch(page: Mapping[str, Any], values: list[Any]) -> None:
+def test_the_pages_writer_writes_valid_batches(page: Mapping[str, Any], values: list[Any]) -> None:
     written = page["written"]("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
     assert decode_batch(written) == Batch("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
     assert page["opened"](json.loads(written))[1]["speed"] == values
@@ -97,7 +97,7 @@ def test_a_writer_may_leave_the_dictionary_out() -> None:
 
 
 @pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1], ["x", True, 0.1]])
-def test_its_reader_reads_columns(page: Mapping[str, Any], speeds: list[Any]) -> None:
+def test_the_pages_reader_reads_columns(page: Mapping[str, Any], speeds: list[Any]) -> None:
     batch = batch_of({"speed": speeds})
     assert page["opened"](batch) == (TIMES_US, {"speed": speeds}, b"")
 
@@ -106,7 +106,7 @@ def test_its_reader_reads_columns(page: Mapping[str, Any], speeds: list[Any]) ->
     ("offsets_ns", "frames"),
     [([0, 7, 999], [b"map"] * 3), ([-1, 5000, 0], [b"map", b"", b"odom"]), ([-17 * 10**17, 0, 0], [b""] * 3)],
 )
-def test_its_reader_makes_messages_of_numbers_again(
+def test_the_pages_reader_restores_numeric_messages(
     page: Mapping[str, Any], offsets_ns: list[int], frames: list[bytes]
 ) -> None:
     raw = made(offsets_ns, frames)
@@ -119,7 +119,7 @@ def test_its_reader_makes_messages_of_numbers_again(
 
 @pytest.mark.parametrize("kind", [TEXT, UNREADABLE])
 @pytest.mark.parametrize("texts", [[b"ab", b"cd", b"\xff"], [b"ab", b"cd", b"ef"], [b"", b"abc", b""]])
-def test_its_reader_reads_messages_as_they_were_published(
+def test_the_pages_reader_reads_messages_as_they_were_published(
     page: Mapping[str, Any], kind: RosType, texts: list[bytes]
 ) -> None:
     raw = [struct.pack("<I", len(text)) + text for text in texts]

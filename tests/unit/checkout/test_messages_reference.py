@@ -1,4 +1,4 @@
-"""docs/messages.md as a reference: each example and table of keys is the code's own."""
+"""The examples and tables of keys in docs/messages.md agree with the code."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def as_object(decode: Callable[[str], Any]) -> Callable[[dict[str, Any]], Any]:
     return lambda message: decode(json.dumps(message))
 
 
-# The example's name: what the code writes, what reads it, and what it then reads.
+# The example's name: the code's encoded message, its decoder, and the decoded value.
 WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
     "batch": (encode_batch(BATCH), as_object(decode_batch), BATCH),
     "live": (encode_live(LIVE), as_object(decode_live), LIVE),
@@ -127,27 +127,27 @@ SHADOW = ("desired", "reported")
 PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
 
 
-def test_each_example_is_held_to_the_code() -> None:
+def test_each_example_is_compared_with_the_code() -> None:
     assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *SHADOW, *PROVISIONING, "update"}
     assert PAGE.count("```json\n") == len(EXAMPLES)
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_an_example_is_what_the_code_writes_and_reads(name: str) -> None:
+def test_the_code_writes_and_reads_each_example(name: str) -> None:
     written, read, meant = WRITTEN[name]
     example, of_code = EXAMPLES[name], json.loads(written)
-    if name == "batch":  # another zlib packs as well in other bytes
+    if name == "batch":  # another version of zlib gives other bytes
         example, of_code = ({**one, "samples": None} for one in (example, of_code))
     assert example == of_code
     assert read(EXAMPLES[name]) == meant
 
 
-def test_the_live_update_is_what_the_function_sends() -> None:
+def test_the_function_sends_the_live_update_of_the_page() -> None:
     assert EXAMPLES["update"] == json.loads(UPDATE)
 
 
 @pytest.mark.parametrize("name", sorted(WRITTEN.keys() - {"ping"}))
-def test_the_table_has_each_key_and_says_which_are_needed(name: str) -> None:
+def test_the_table_has_each_key_and_marks_the_required_ones(name: str) -> None:
     _, read, _ = WRITTEN[name]
     needed = keys_after(name)
     assert paths(EXAMPLES[name]) <= needed.keys()
@@ -181,18 +181,18 @@ def with_value(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]
 
 
 def place(message: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
-    """The object that a path's last key is in, and that key."""
+    """The object that contains a path's last key, and that key."""
     *above, key = path.split(".")
     return (message[above[0]] if above else message), key
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_key_that_the_page_does_not_name_is_ignored(name: str) -> None:
+def test_an_unknown_key_is_ignored(name: str) -> None:
     _, read, meant = WRITTEN[name]
     assert read({**EXAMPLES[name], "unknown": [1]}) == meant
 
 
-# The message, the key, the last value that is allowed, the first that is not, and how the page says it.
+# The message, the key, the last allowed value, the first refused one, and the page's words.
 BOUNDS = [
     ("batch", "v", 2, 3, "2"),
     ("batch", "nonfinite", 25_600_000, 25_600_001, "25,600,000"),
@@ -219,7 +219,7 @@ BOUNDS = [
 
 
 @pytest.mark.parametrize(("name", "path", "good", "bad", "told"), BOUNDS)
-def test_a_bound_of_a_key_is_where_the_page_says(
+def test_the_bounds_of_a_key_are_those_of_the_page(
     name: str, path: str, good: Any, bad: Any, told: str
 ) -> None:
     assert told in keys_after(name)[path].what
@@ -229,7 +229,7 @@ def test_a_bound_of_a_key_is_where_the_page_says(
         read(with_value(EXAMPLES[name], path, bad))
 
 
-def test_boot_is_what_the_page_says() -> None:
+def test_the_form_of_boot_is_that_of_the_page() -> None:
     assert "8 to 32 of `0-9a-f`" in section("## What all messages share")
     for good, bad in (("0" * 8, "0" * 7), ("f" * 32, "f" * 33), ("a" * 8, "A" * 8)):
         assert decode_live(json.dumps({**EXAMPLES["live"], "boot": good})).boot == good
@@ -238,7 +238,9 @@ def test_boot_is_what_the_page_says() -> None:
 
 
 @pytest.mark.parametrize(("name", "sample"), SAMPLES.items())
-def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account | MessageType) -> None:
+def test_the_samples_of_a_robots_own_streams_equal_the_pages_examples(
+    name: str, sample: accounts.Account | MessageType
+) -> None:
     assert EXAMPLES[name] == sample.sample()
     read = message_type if name == "type" else accounts.account
     assert read(EXAMPLES[name]) == sample
@@ -247,7 +249,7 @@ def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account
         assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
 
 
-def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
+def test_the_agent_reads_and_writes_the_shadows_documents_of_the_page() -> None:
     base = RuntimeSettings(True, True, 10.0, 0, "info")
     settings, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
     assert rejected == {}
@@ -257,12 +259,12 @@ def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
     state = State(1, {}, reported)
     assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
     assert [refusal.name for refusal in state.rejections()] == ["live.rate_hz"]
-    wishes, said = section("## The shadow").split("<!-- example: reported -->")
-    assert {name for row in rows(wishes) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
-    assert {name for row in rows(said) for name in named(row[0])} == reported.keys()
+    desired, reported_keys = section("## The shadow").split("<!-- example: reported -->")
+    assert {name for row in rows(desired) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
+    assert {name for row in rows(reported_keys) for name in named(row[0])} == reported.keys()
 
 
-def test_the_messages_of_provisioning_are_those_of_aws_client() -> None:
+def test_the_messages_of_provisioning_equal_those_of_awss_client() -> None:
     found = {name: EXAMPLES[name] for name in PROVISIONING}
     csr = iotidentity.CreateCertificateFromCsrRequest(
         certificate_signing_request=found["csr"]["certificateSigningRequest"]
@@ -297,6 +299,6 @@ def camel(name: str) -> str:
         PUT_OFF_LAST_MS,
     ],
 )
-def test_what_the_cloud_writes_into_the_shadow_is_on_the_page(name: str) -> None:
+def test_the_page_names_each_key_that_the_cloud_writes_into_the_shadow(name: str) -> None:
     section = PAGE.split("\n## The shadow\n")[1].split("\n## ")[0]
     assert f"`{name}`" in section

@@ -1,4 +1,4 @@
-"""What is installed holds every package of its folder."""
+"""Each installed distribution contains every package of its folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page's code has from the contract; test_docs_parts.py holds that it is up to date."""
+"""The page's generated code has the contract's fields and formulas. test_docs_parts.py keeps it current."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_the_page_has_each_field_with_its_unit() -> None:
     assert faults["5"] == FAULTS[5]
 
 
-def test_a_formula_is_told_as_it_calculates() -> None:
+def test_a_formulas_text_calculates_the_same_value() -> None:
     values = {"speed": 9300.0, "speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 3.0}
     values |= {"voltage_input": 12.0, "current_input": -3.0}
     for entry in DERIVED.values():
@@ -29,7 +29,7 @@ def test_a_formula_is_told_as_it_calculates() -> None:
         assert eval(formula(entry), {}, arguments) == entry.formula(**arguments)  # our own entries
 
 
-def test_a_formulas_text_has_the_brackets_that_it_needs() -> None:
+def test_a_formulas_text_has_only_necessary_brackets() -> None:
     entry = Derived("x", "", "", lambda a, b, c: 2 * (a - (b - c)) / (a / b) + a * b * c - (1 - a))
     text = formula(entry)
     assert text == "2 * (a - (b - c)) / (a / b) + a * b * c - (1 - a)"

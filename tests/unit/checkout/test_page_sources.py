@@ -1,4 +1,4 @@
-"""The folders of the page's sources use each other as station/web/README.md says."""
+"""The folders of the page's sources import one another only as station/web/README.md allows."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def allowed() -> dict[str, set[str]]:
     }
 
 
-def test_every_folder_is_described_and_has_at_most_a_dozen_files():
+def test_every_folder_is_described_and_has_at_most_twelve_files():
     folders = [folder for folder in SOURCES.iterdir() if folder.is_dir()]
     assert {folder.name for folder in folders} == set(allowed())
     assert max(len(list(folder.iterdir())) for folder in [SOURCES, *folders]) <= 12
 
 
-def test_a_folder_uses_only_what_its_row_allows():
+def test_a_folder_uses_only_the_imports_of_its_row():
     rules = allowed()
     for path in SOURCES.glob("*/*.ts"):
         for imported in re.findall(r'from "(\.[^"]+)"', path.read_text()):

@@ -1,4 +1,4 @@
-"""The evaluator that the isolation table is held to: IAM's rules, each with an example."""
+"""The evaluator of IAM policies behind the isolation table: an example for each of IAM's rules."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def statement(effect="Allow", action="iot:Publish", resource=f"{TOPIC}a/*", **mo
         (None, None, True),
     ],
 )
-def test_conditions_on_attributes(names, returned, allowed):
+def test_conditions_on_attributes_are_evaluated(names, returned, allowed):
     condition = {
         "ForAllValues:StringLike": {"dynamodb:Attributes": ["alert_*", "robot"]},
         "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE"]},
@@ -47,7 +47,7 @@ def test_conditions_on_attributes(names, returned, allowed):
         ("a/*", "a", False),
         ("a/?", "a/b", True),
         ("a/?", "a/bc", False),
-        # MQTT's wildcards are characters like any other.
+        # MQTT's wildcards are plain characters.
         ("a/+", "a/b", False),
         ("a/+", "a/+", True),
         ("a/#", "a/b", False),
@@ -57,23 +57,23 @@ def test_conditions_on_attributes(names, returned, allowed):
         ("a/.*", "a/b", False),
     ],
 )
-def test_resources(resource, topic, allowed):
+def test_patterns_and_variables_in_resources_are_matched(resource, topic, allowed):
     assert allows([statement(resource=TOPIC + resource)], "iot:Publish", TOPIC + topic, ME) is allowed
 
 
-def test_a_variables_value_is_no_pattern():
+def test_a_variables_value_is_not_a_pattern():
     robots = [statement(resource=TOPIC + "a/${iot:Connection.Thing.ThingName}")]
     assert not allows(robots, "iot:Publish", f"{TOPIC}a/b", {"iot:Connection.Thing.ThingName": "*"})
 
 
-def test_actions_whatever_their_case_and_lists_of_both():
+def test_actions_ignore_case_and_may_be_lists():
     assert allows([statement(action="IOT:publish")], "iot:Publish", f"{TOPIC}a/b")
     assert allows([statement(action=["iot:Connect", "iot:Pub*"])], "iot:Publish", f"{TOPIC}a/b")
     assert not allows([statement(action="iot:Publish")], "iot:RetainPublish", f"{TOPIC}a/b")
     assert allows([statement(resource=["x", f"{TOPIC}a/*"])], "iot:Publish", f"{TOPIC}a/b")
 
 
-def test_a_denial_wins_wherever_it_stands():
+def test_a_denial_wins_in_any_order():
     deny = statement("Deny", resource=f"{TOPIC}a/b")
     for order in ([deny, statement()], [statement(), deny]):
         assert not allows(order, "iot:Publish", f"{TOPIC}a/b")
@@ -81,7 +81,7 @@ def test_a_denial_wins_wherever_it_stands():
     assert not allows([deny], "iot:Publish", f"{TOPIC}a/c"), "nothing is allowed that is not said"
 
 
-def test_conditions():
+def test_conditions_are_evaluated():
     attached = statement(Condition={"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}})
     assert allows([attached], "iot:Publish", f"{TOPIC}a/b", {"iot:Connection.Thing.IsAttached": "true"})
     for variables in ({}, {"iot:Connection.Thing.IsAttached": "false"}):
@@ -101,6 +101,6 @@ def test_conditions():
         {"Effect": "Perhaps"},
     ],
 )
-def test_what_it_does_not_know_it_does_not_judge(unknown):
+def test_an_unknown_element_raises_an_error(unknown):
     with pytest.raises(NotImplementedError):
         allows([{**statement(), **unknown}], "iot:Publish", f"{TOPIC}a/b")

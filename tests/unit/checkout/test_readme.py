@@ -9,7 +9,7 @@ from scripts.docs_parts import ROOT
 README = (ROOT / "README.md").read_text()
 
 
-def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
+def test_the_agent_knows_the_settings_of_car_yaml(tmp_path):
     from iort_agent.config import load_config
 
     text = next(block for block in re.findall(r"```yaml\n(.*?)```", README, re.DOTALL))
@@ -19,18 +19,18 @@ def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
     assert load_config(tmp_path / "car.yaml").robot == "car7"
 
 
-def test_every_make_target_it_names_is_there():
+def test_every_make_target_in_the_readme_exists():
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     named = set(re.findall(r"`make ([a-z-]+)|^make ([a-z-]+)", README, re.MULTILINE))
     assert {first or second for first, second in named} <= targets
 
 
-def test_every_file_it_links_to_is_there():
+def test_every_file_linked_in_the_readme_exists():
     for link in re.findall(r"\]\(([^)h#][^)#]*)(?:#[^)]*)?\)", README):
         assert (ROOT / link).exists(), link
 
 
-def test_every_decision_has_a_number_of_its_own():
+def test_every_decision_has_its_own_number():
     records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
     numbers = [int(path.name[:4]) for path in records]
     assert numbers == sorted(set(numbers))
@@ -38,7 +38,7 @@ def test_every_decision_has_a_number_of_its_own():
         assert path.read_text().startswith(f"# {number}. "), path.name
 
 
-def test_every_file_that_the_documentation_links_to_is_there():
+def test_every_file_linked_in_the_documentation_exists():
     for page in (ROOT / "docs").rglob("*.md"):
         for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
             assert (page.parent / link).exists(), f"{page.name}: {link}"

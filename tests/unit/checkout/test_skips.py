@@ -1,4 +1,4 @@
-"""REQUIRE_ALL=1 makes a skip a failure, and nothing else."""
+"""REQUIRE_ALL=1 makes a skip a failure and changes no other result."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ pytest.importorskip("there_is_no_such_module")
         ),
     ],
 )
-def test_a_skip_is_a_failure_where_everything_is_said_to_be_there(tmp_path, require, code, counts):
+def test_a_skip_is_a_failure_with_require_all(tmp_path, require, code, counts):
     for name, text in MODULES.items():
         (tmp_path / name).write_text(text)
     flags = ["-p", "tests.conftest", "-p", "no:cacheprovider", "--rootdir", tmp_path]
     if require == "1":
-        # An error of collection would end the run before the tests.
+        # An error during collection would end the run before the tests.
         flags.append("--continue-on-collection-errors")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *flags, tmp_path],

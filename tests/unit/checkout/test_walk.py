@@ -37,7 +37,7 @@ CONNECTION = {
 
 
 class Uplink:
-    """Takes every publish."""
+    """An uplink that accepts every publish."""
 
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes]] = []
@@ -57,7 +57,7 @@ class Uplink:
 
 @contextmanager
 def watched(walked: set[str], *, here: bool = True) -> Iterator[None]:
-    """Note our modules in which a function runs, in threads started within and, if ``here``, in this."""
+    """Record our modules in which a function runs, in new threads and, if ``here``, in this one."""
     files = set()
 
     def note(frame: FrameType, event: str, _argument: Any) -> None:
@@ -77,7 +77,7 @@ def watched(walked: set[str], *, here: bool = True) -> Iterator[None]:
 
 
 def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
-    """The batch that a robot publishes of one ROS message; making its parts is not on the walk."""
+    """The batch that a robot publishes for one ROS message; the set-up of the agent is not on the walk."""
     clock, uplink, stop = SystemClock(), Uplink(), threading.Event()
     spool = make_spool(QueueConfig(path=folder / "queue.db"), clock)
     lane = RecordLane(
@@ -91,7 +91,7 @@ def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
     encoder = BatchEncoder("speed", boot="0badcafe0badcafe", batch_s=1, spool=spool, clock=clock)
 
     def emit(stream: str, at_us: int, values: Any) -> None:
-        # The message's type goes out as a sample of its own.
+        # The message's type is published as its own sample.
         if stream == "speed":
             encoder.add(at_us, values)
 
@@ -111,7 +111,7 @@ def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
     return payload
 
 
-def test_the_walk_passes_the_modules_that_the_documentation_lists(tmp_path: Path) -> None:
+def test_the_walk_passes_the_documented_modules(tmp_path: Path) -> None:
     to_chart: set[str] = set()
     to_summary: set[str] = set()
     t_us, cloud = SystemClock().now_us(), cloud_of()

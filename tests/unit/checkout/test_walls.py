@@ -1,4 +1,4 @@
-"""import-linter refuses an import that the house does not allow: each wall is tried in a scratch copy."""
+"""import-linter refuses a forbidden import; each wall is tried in a scratch copy."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def lint(house: Path, *options: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_house_keeps_its_walls(house: Path) -> None:
+def test_the_imports_keep_all_walls(house: Path) -> None:
     result = lint(house)
     assert result.returncode == 0, result.stdout + result.stderr
 
@@ -96,7 +96,7 @@ def test_a_forbidden_import_breaks_its_wall(house: Path, contract: str, file: st
         ("contract", "contract/iort_contract"),
     ],
 )
-def test_a_new_room_needs_its_place(house: Path, contract: str, package: str) -> None:
+def test_a_new_module_must_be_listed_in_the_walls(house: Path, contract: str, package: str) -> None:
     room = house / package / "attic.py"
     room.touch()
     try:
@@ -107,7 +107,7 @@ def test_a_new_room_needs_its_place(house: Path, contract: str, package: str) ->
     assert "attic" in result.stdout
 
 
-def test_the_contract_needs_the_standard_library_alone() -> None:
+def test_the_contract_needs_only_the_standard_library() -> None:
     graph = grimp.build_graph("iort_contract", include_external_packages=True, cache_dir=None)
     outside = {
         (importer, imported)
@@ -119,10 +119,10 @@ def test_the_contract_needs_the_standard_library_alone() -> None:
 
 
 @pytest.mark.parametrize("contract", ["agent", "station", "contract"])
-def test_the_documentation_lists_the_rooms_as_the_walls_do(contract: str) -> None:
+def test_the_documentation_and_the_walls_list_the_same_rooms(contract: str) -> None:
     contracts = api.read_configuration(str(ROOT / "pyproject.toml"))["contracts_options"]
     (layers,) = (one["layers"] for one in contracts if one["id"] == contract)
-    # What is in parentheses need not be there.
+    # A layer in parentheses is optional.
     rows = [set(re.findall(r"(?<!\()\b\w+\b(?!\))", layer)) for layer in layers]
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     _, table = page.split(f"**{contract.capitalize()}**", 1)

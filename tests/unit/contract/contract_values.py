@@ -1,4 +1,4 @@
-"""What the contract's tests draw their messages from, and how they compare them."""
+"""Hypothesis strategies for the contract's messages, and strict comparison of the results."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ times = st.integers(-LIMIT_US, LIMIT_US)
 EDGES = [-0.0, 5e-324, -2.2e-308, 1e308, 2.0**53 - 1, 2.0**53, -(2.0**53), 1e15 + 0.5, 3.0, 1e-7]
 finite = st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from(EDGES)
 integers = st.integers(-(2**63), 2**64 - 1) | st.sampled_from([-(2**63), 2**63, 2**64 - 1, 2**53 + 1])
-# st.text leaves out the surrogates, which no Unicode text holds.
+# st.text leaves out surrogates: valid Unicode text has no surrogates.
 values = st.none() | st.booleans() | integers | finite | st.text(max_size=20)
 
 
 @st.composite
 def batches(draw, kinds=values):
-    # Of one time there may be several.
+    # Several samples may have the same time.
     offsets = draw(st.lists(st.integers(0, MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12))
     first = draw(st.integers(0, LIMIT_US - MAX_BATCH_SPAN_US) | st.just(0))
     n = 1 + len(offsets)
-    # Columns as recordings have them, of one kind, and of any mixture.
+    # Columns of one type, as in recordings, and columns of any mixture.
     column = st.one_of(
         st.lists(kinds, min_size=n, max_size=n),
         st.lists(finite, min_size=n, max_size=n),
@@ -43,14 +43,14 @@ def batches(draw, kinds=values):
 
 
 def same(one, other):
-    """Equal, and of the same kind: True is not 1; only a whole float becomes the integer it equals."""
+    """Equal and of the same type: True is not 1; only a whole float may become an integer."""
     if type(one) is float and type(other) is int:
         return one == other
     return type(one) is type(other) and one == other
 
 
 def strict(text):
-    """JSON as any other language reads it: without NaN and Infinity."""
+    """Parse standard JSON, without NaN and Infinity."""
 
     def refuse(name):
         raise AssertionError(f"{name} in {text[:100]!r}")
@@ -85,11 +85,11 @@ BAD_HEADERS = [
 
 
 def decode_or_refuse(decoder, message):
-    """Anything but `ContractError` fails; what is taken must be such as could have been written."""
+    """Decode, or raise `ContractError`; a decoded message must be one that the encoder accepts."""
     try:
         taken = decoder(message)
     except ContractError as error:
-        str(error).encode()  # it can be logged, whatever was in the message
+        str(error).encode()  # the error can be logged, whatever the message held
         return
     if isinstance(taken, Batch):
         assert decode_batch(encode_batch(taken)) == taken
@@ -102,5 +102,5 @@ json_values = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
     max_leaves=12,
 )
-# Levels of nesting that no parser of ours may follow to their end.
+# More levels of nesting than a parser can follow.
 DEEP = 100_000

@@ -1,4 +1,4 @@
-"""ROS 1 messages as their publishers write them: definitions, and bytes put together by hand."""
+"""ROS 1 messages as publishers write them: definitions, and bytes assembled by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random ROS 1 definitions and messages of them, for hypothesis; and what rosbags writes for a message."""
+"""Random ROS 1 definitions and messages for hypothesis, and their bytes as rosbags writes them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SECONDS = {TIME: st.integers(0, 2**31 - 1), DURATION: st.integers(-(2**31), 2**
 
 @st.composite
 def definitions(draw: Any) -> Definition:
-    """A message type with nested ones, with or without a header, of a name of its own."""
+    """A message type of a unique name with nested types, with or without a header."""
     number = next(_numbers)
     deep = draw(_fields([]))
     inner = draw(_fields(["Deep", "Header"]))
@@ -49,7 +49,7 @@ def _fields(draw: Any, nested: list[str]) -> str:
 
 
 def values(definition: Definition, field: Field | None = None) -> st.SearchStrategy[Any]:
-    """A message: times are objects of sec and nanosec, bytes lists of numbers."""
+    """A message's values: times are objects of sec and nanosec, bytes are lists of numbers."""
     field = field or Field("", definition.kind, None)
     if field.length is not None:
         one = values(definition, Field(field.name, field.kind, None))

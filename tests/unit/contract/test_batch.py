@@ -1,4 +1,4 @@
-"""The batch: what is written is read, to the bit, and what is not allowed is not written."""
+"""Batches are decoded bit for bit as they were encoded; the encoder refuses invalid batches."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_encoding_again_gives_the_same_message(batch):
 
 
 @pytest.mark.parametrize("n", [1, 2, 50, 1000])
-def test_batch_of_a_drive(n):
+def test_a_batch_of_a_drive_is_decoded_as_it_was_encoded(n):
     columns = {name: [i / 7 for i in range(n)] for name in VESC_FIELDS}
     batch = Batch(BOOT, 7, [i * 999 for i in range(n)], columns)
     assert decode_batch(encode_batch(batch)) == batch
@@ -84,7 +84,7 @@ def test_whole_floats_become_integers_on_the_wire():
     ]  # fmt: skip
 
 
-def test_the_envelope_names_what_it_holds():
+def test_the_envelope_names_its_content():
     batch = Batch(BOOT, 3, [1_000, 1_250, 1_900], {"speed": [1, 2.5, None]})
     envelope = json.loads(encode_batch(batch))
     assert {key: envelope[key] for key in envelope if key != "samples"} == {
@@ -96,7 +96,7 @@ def test_the_envelope_names_what_it_holds():
     assert json.loads(body_of(envelope)) == {"dt": [0, 250, 650], "fields": {"speed": [None, 1, 2.5, None]}}
 
 
-def test_nonfinite_is_said_only_where_there_is_any():
+def test_the_envelope_has_nonfinite_only_with_nonfinite_values():
     for count in (0, 3):
         envelope = json.loads(encode_batch(replace(GOOD, nonfinite=count)))
         assert envelope.get("nonfinite", 0) == count
@@ -104,7 +104,7 @@ def test_nonfinite_is_said_only_where_there_is_any():
         assert decode_batch({**envelope, "nonfinite": count}).nonfinite == count
 
 
-def test_samples_of_one_time_stay_as_many_and_as_they_came():
+def test_samples_with_equal_times_keep_their_number_and_order():
     batch = Batch(BOOT, 0, [5, 5, 5, 6], {"a": [3, 1, 2, 0]})
     assert decode_batch(encode_batch(batch)) == batch
 
@@ -123,14 +123,14 @@ def test_nonfinite_becomes_null_and_is_counted(batch):
     assert_same_batch(decode_batch(message), clean)
 
 
-def test_bits_of_a_float_survive():
+def test_a_float_keeps_all_its_bits():
     numbers = [struct.unpack("<d", struct.pack("<Q", bits))[0] for bits in (1, 2**52 - 1, 0x7FEFFFFFFFFFFFFF)]
     batch = Batch(BOOT, 0, [0, 1, 2], {"x": numbers})
     assert decode_batch(encode_batch(batch)).columns["x"] == numbers
 
 
 @given(batches())
-def test_halves_make_up_the_whole(batch):
+def test_two_halves_of_a_batch_hold_all_its_samples(batch):
     assume(len(batch.times_us) > 1)
     first, second = split_batch(batch)
     assert (first.seq, second.seq) == (batch.seq, batch.seq + 1)
@@ -190,20 +190,20 @@ BAD_VALUES = [
         ({"columns": {7: [1, 2]}}, "field name must be .*, got 7"),
     ],
 )
-def test_batch_refused(changed, named):
+def test_an_invalid_batch_is_refused(changed, named):
     with pytest.raises(ContractError, match=named):
         encode_batch(replace(GOOD, **changed))
 
 
 @pytest.mark.parametrize(("value", "named"), BAD_VALUES, ids=[f"value{i}" for i in range(len(BAD_VALUES))])
-def test_value_refused(value, named):
+def test_an_invalid_value_is_refused(value, named):
     with pytest.raises(ContractError, match=named):
         encode_batch(replace(GOOD, columns={"speed": [None, value]}))
     with pytest.raises(ContractError, match=named):
         encode_live(replace(GOOD_LIVE, sample={"speed": value}))
 
 
-def test_columns_too_large_to_be_read_are_not_written():
+def test_columns_too_large_for_the_decoder_are_not_encoded():
     n = 1_100
     batch = Batch(BOOT, 0, list(range(n)), {"text": ["x" * 4_000] * n})
     assert len(zlib.compress(b"x" * 4_000 * n)) < MAX_MESSAGE_BYTES, "it would fit in a message"

@@ -1,4 +1,4 @@
-"""The batch as a stranger wrote it: a body or an envelope that is wrong names what is wrong with it."""
+"""Batches that another program wrote: the error names the fault of the body or the envelope."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tests.unit.contract.contract_values import BOOT, DEEP, GOOD, GOOD_LIVE, dec
 
 
 def enveloped(body, **changed):
-    """A good envelope of two samples around any body, in the codec whose columns are their values alone;
+    """A valid envelope of two samples with any body, in the codec that stores plain values;
     tests/unit/contract/test_columns.py has the other."""
     packed = base64.b64encode(zlib.compress(body)).decode()
     return dict(json.loads(encode_batch(GOOD)), codec=PLAIN_CODEC, samples=packed, **changed)
 
 
 @given(st.binary(max_size=100) | json_values.map(lambda value: json.dumps(value).encode()))
-def test_any_body(body):
+def test_any_body_is_decoded_or_refused(body):
     decode_or_refuse(decode_batch, enveloped(body))
 
 
@@ -86,8 +86,8 @@ BODIES = [
 
 
 @pytest.mark.parametrize(("body", "named"), BODIES, ids=[f"body{i}" for i in range(len(BODIES))])
-def test_body_refused(body, named):
-    # Of time 1, so that a step of 4,300 nines makes a number too long for Python to print.
+def test_an_invalid_body_is_refused(body, named):
+    # The first time is 1, so that a step of 4,300 nines gives a number too long for Python to print.
     with pytest.raises(ContractError, match=named):
         decode_batch(enveloped(body, batch=f"{1:016}-{BOOT}-4"))
 
@@ -107,7 +107,7 @@ def test_the_last_of_duplicate_keys_counts():
     assert decode_batch(enveloped(body)).columns == {"a": [1, 2]}
 
 
-def test_body_of_the_greatest_size_is_read_and_no_larger():
+def test_a_body_up_to_the_size_limit_is_read():
     n = 8_388_608 // 4096
     times = {"dt": [0] + [1] * (n - 1)}
     room = MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
@@ -118,7 +118,7 @@ def test_body_of_the_greatest_size_is_read_and_no_larger():
         decode_batch(enveloped(body + b" ", n=n))
 
 
-def test_zip_bomb_is_not_inflated():
+def test_a_zip_bomb_is_not_inflated():
     message = json.dumps(enveloped(b" " * 64 * 1024 * 1024)).encode()
     assert len(message) < MAX_MESSAGE_BYTES
     tracemalloc.start()
@@ -146,7 +146,7 @@ PACKED = zlib.compress(b'{"dt":[0,5],"fields":{}}')
     ],
     ids=["empty", "cut", "more", "twice", "checksum", "gzip", "text"],
 )
-def test_packed_samples_refused(packed, named):
+def test_invalid_packed_samples_are_refused(packed, named):
     envelope = dict(enveloped(b""), samples=base64.b64encode(packed).decode())
     with pytest.raises(ContractError, match=named):
         decode_batch(envelope)
@@ -186,6 +186,6 @@ def test_samples_that_are_not_text_are_refused(samples):
         ({"nonfinite": None}, "nonfinite must be an integer, got None"),
     ],
 )
-def test_envelope_refused(changed, named):
+def test_an_invalid_envelope_is_refused(changed, named):
     with pytest.raises(ContractError, match=re.escape(named)):
         decode_batch(dict(json.loads(encode_batch(GOOD)), **changed))

@@ -1,4 +1,4 @@
-"""A batch's id: no two of a topic share one, and it sorts by time as a text."""
+"""Batch ids are unique within a topic, and as text they sort by time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ids = st.builds(BatchId, times, boots, seqs)
 
 
 @given(ids)
-def test_an_id_is_read_back(one):
+def test_an_id_is_parsed_as_it_was_written(one):
     assert batch_id(str(one)) == one
 
 
 @given(ids, ids)
-def test_an_earlier_batch_has_a_lesser_key(one, other):
+def test_an_earlier_batch_has_a_smaller_key(one, other):
     if one.t_us != other.t_us:
         assert (str(one) < str(other)) == (one.t_us < other.t_us)
     assert (str(one) == str(other)) == (one == other)
@@ -74,13 +74,13 @@ def test_both_ends_of_a_range_belong_to_it(at):
         "x" * 100_000,
     ],
 )
-def test_what_is_no_id_is_refused(text):
+def test_an_invalid_id_is_refused(text):
     with pytest.raises(ContractError, match="must be <16 digits of microseconds>-<run>-<number>"):
         batch_id(text)
 
 
-def test_batches_of_one_time_have_keys_of_their_own():
-    """Two publishers, or a recording that is played twice: the same time, another number or another run."""
+def test_batches_with_equal_times_have_different_keys():
+    """Two publishers, or a recording played twice, give batches of one time that differ in run or number."""
     same_time = [Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)]
     assert len({str(batch.id) for batch in same_time}) == len(same_time)
     assert {decode_batch(encode_batch(batch)).id for batch in same_time} == {b.id for b in same_time}

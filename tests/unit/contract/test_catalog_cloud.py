@@ -1,4 +1,4 @@
-"""Rules and metrics: what the cloud is told to listen to is what the robots say."""
+"""Rules and metrics: the cloud's rules select the topics on which the robots publish."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RULE_TOPICS = {
 
 @pytest.mark.parametrize("rule", RULE_TOPICS)
 @pytest.mark.parametrize("namespace", ["iort", "stage2"])
-def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
+def test_a_rule_selects_exactly_its_own_topics(rule, namespace):
     sql = RULES[rule].statement(namespace)
     [pattern] = re.findall(r"FROM '([^']*)'", sql)
     assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
@@ -46,12 +46,12 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
+def test_a_message_cannot_overwrite_a_key_that_the_cloud_adds(rule):
     sql = RULES[rule].statement()
     selected = re.sub(r"\bencode\(\*, 'base64'\)", "encode()", sql[len("SELECT ") : sql.index(" FROM ")])
     names = [part.rsplit(" AS ", 1)[-1] for part in selected.split(", ")]
     assert len(names) == len(set(names))
-    # The broker's own events alone are taken whole: no robot says anything in them, and nothing is added.
+    # Only the broker's own events are selected with *: robots do not write them, and the rule adds nothing.
     assert ("*" in selected) == (rule == "presence")
     assert names == ["*"] or "*" not in names
     assert (RECEIVED_MS in names) == (rule not in ("presence", "version"))
@@ -68,7 +68,7 @@ def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
             assert re.match(r"(timestamp|topic|floor)\(", part), part
 
 
-def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
+def test_the_record_rule_stores_all_keys_of_a_batch_and_a_pong_returns_all_keys_of_a_ping():
     batch = Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1, previous=())
     assert tuple(json.loads(encode_batch(batch))) == ENVELOPE
     assert tuple(json.loads(encode_ping(1, 1, "x"))) == PING_FIELDS
@@ -76,19 +76,19 @@ def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
     assert RULES["pong"].statement().startswith(f"SELECT {', '.join(PING_FIELDS)}, timestamp() AS ")
 
 
-def test_rule_names_are_allowed_by_aws():
+def test_aws_allows_the_rules_names():
     for namespace in ("iort", "a" * 16):
         for rule in RULES:
             assert re.fullmatch(r"[a-zA-Z0-9_]{1,128}", RULES[rule].physical_name(namespace))
 
 
-def test_a_statement_has_the_deployments_parameters():
+def test_a_statement_contains_the_deployments_parameters():
     stored = RULES["record"].statement("lab", retention_s=60)
     assert "+ 60 AS expires_s FROM 'dt/lab/+/+'" in stored
     assert RULES["battery"].statement(low_voltage_v=14).endswith("sample.voltage_input < 14")
     assert not [rule for rule in RULES.values() if "{" in rule.statement()]
 
 
-def test_every_metric_has_a_chart_that_is_drawn():
+def test_every_metrics_chart_is_drawn():
     drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES_CHART, metrics.LIVE_CHART}
     assert {metric.chart for metric in METRICS.values()} == drawn

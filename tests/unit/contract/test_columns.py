@@ -1,4 +1,4 @@
-"""The codec of the columns: what is written comes back to the bit, what cannot have been is refused."""
+"""The column codec restores every value bit for bit and refuses columns that no encoder writes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ odd = st.none() | st.booleans() | st.text(max_size=3)
 
 @st.composite
 def columns(draw):
-    """Of one kind, of two, and of any mixture."""
+    """Columns of one kind, of two kinds and of any mixture."""
     n = draw(st.integers(1, 30))
     places = draw(st.integers(0, 6))
     reading = st.integers(-(10**6), 10**6).map(lambda whole: whole / 10**places)
@@ -44,7 +44,7 @@ def columns(draw):
 
 
 def bits(values):
-    """What tells any two values apart: kind and content, of a float all 64 bits."""
+    """Type and content of each value; all 64 bits of a float."""
     return [(type(v), struct.pack("<d", v) if type(v) is float else v) for v in values]
 
 
@@ -57,7 +57,7 @@ def bits(values):
 @example([float(EDGE), 0.5])
 @example([EDGE - 1, 1 - EDGE])
 @example([0.1] * 9 + [0.125] + [0.1] * 9)
-def test_a_column_comes_back_to_the_bit(column):
+def test_a_column_is_restored_bit_for_bit(column):
     values, _ = wire_column("a", column)
     written = json.loads(json.dumps(packed(values)))
     assert bits(unpacked("a", written, len(values))) == bits(values)
@@ -66,7 +66,7 @@ def test_a_column_comes_back_to_the_bit(column):
 
 @settings(max_examples=50)
 @given(columns(), st.integers(0, 2**40))
-def test_a_batch_comes_back_the_same_as_by_the_codec_before(column, seq):
+def test_both_codecs_decode_to_the_same_batch(column, seq):
     n = len(column)
     batch = Batch(BOOT, seq, list(range(0, 20 * n, 20)), {"speed": column, "flag": [True] * n})
     envelope = json.loads(encode_batch(batch))
@@ -79,12 +79,12 @@ def test_a_batch_comes_back_the_same_as_by_the_codec_before(column, seq):
 
 
 def plain_message(envelope, body):
-    """The message that an agent before this codec sent."""
+    """The same message in the codec of older agents."""
     samples = base64.b64encode(zlib.compress(json.dumps(body, separators=(",", ":")).encode())).decode()
     return {**envelope, "codec": "columns+zlib+base64", "samples": samples}
 
 
-# Of the agent as it was before this codec, under the id that batches have since.
+# Written by an agent with the older codec, with today's form of the batch id.
 STORED = (
     b'{"v":2,"batch":"0000000000001000-0123abcd-7","n":3,"nonfinite":0,"codec":"columns+zlib+base64",'
     b'"samples":"eJyrVkopUbKKNtAxAiJT01gdpbTM1JyUYiWraqVEoIShjoGekU5eaU4OUCoJKKCUr6RTUlSaqpOWmFOcGltbCwBm'
@@ -93,13 +93,13 @@ STORED = (
 FROZEN = "71f73f6da111bb52e14b827789e70220e1689946c9378dbab0ed3390b2cf0b95"
 
 
-def test_what_was_stored_before_this_codec_is_read_for_ever():
+def test_a_batch_of_the_older_codec_is_still_read():
     assert decode_batch(STORED) == Batch(
         BOOT, 7, [1000, 1020, 1275], {"a": [1, 0.2, None], "b": ["o", True, False]}
     )
 
 
-def test_the_dictionary_is_that_with_which_stored_batches_were_compressed():
+def test_the_compression_dictionary_stays_the_same():
     assert hashlib.sha256(DICTIONARY).hexdigest() == FROZEN
     names = set(re.findall(r'"(\w+)":', DICTIONARY.decode()))
     assert {
@@ -122,12 +122,12 @@ def test_the_dictionary_is_that_with_which_stored_batches_were_compressed():
         ([5 / 3, 0.5], [None, 5 / 3, 0.5]),
     ],
 )
-def test_what_a_column_looks_like(column, expected):
+def test_a_column_is_encoded_as_documented(column, expected):
     assert bits(packed(column)) == bits(expected)
 
 
 def message_of(*fields, n=2):
-    """A message of this codec around columns as they are."""
+    """A message of this codec with the given encoded columns."""
     body = {"dt": [0] + [5] * (n - 1), "fields": {f"f{i}": column for i, column in enumerate(fields)}}
     deflater = zlib.compressobj(zdict=DICTIONARY)
     deflated = deflater.compress(json.dumps(body).encode()) + deflater.flush()
@@ -135,7 +135,7 @@ def message_of(*fields, n=2):
     return {**good, "samples": base64.b64encode(deflated).decode()}
 
 
-# Columns of two values, and what is wrong with them.
+# Encoded columns of two values, and the error that each must give.
 WRONG = [
     ([], "must have 2 values"),
     ([0, 1], "must have 2 values"),
@@ -167,20 +167,20 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("column", "named"), WRONG)
-def test_columns_that_nobody_writes_are_refused(column, named):
+def test_columns_that_no_encoder_writes_are_refused(column, named):
     message = message_of(column)
     with pytest.raises(ContractError, match=re.escape(named)):
         decode_batch(message)
 
 
-def test_a_sum_that_comes_back_through_64_bits_is_refused():
+def test_a_sum_that_overflows_64_bits_is_refused():
     with pytest.raises(ContractError, match="must fit in 53 bits"):
         decode_batch(message_of([0, 1, *[2**62] * 4, 1], n=6))
 
 
 @pytest.mark.parametrize("first", ["x" * 1_000_000, [1] * 10_000])
-def test_sums_of_what_is_no_number_are_not_made(first):
-    """Of a text and a hundred characters behind it, they would take a hundred times the memory."""
+def test_a_column_of_texts_or_lists_is_never_summed(first):
+    """Adding 100 characters to a long text one by one would take 100 times its memory."""
     message = message_of([0, first, *[first[:1]] * 99], n=100)
     tracemalloc.start()
     try:
@@ -191,8 +191,8 @@ def test_sums_of_what_is_no_number_are_not_made(first):
         tracemalloc.stop()
 
 
-def test_columns_take_no_more_memory_than_before():
-    """Steps of one character make a value each, so half the text is allowed."""
+def test_columns_are_bounded_by_their_inflated_size():
+    """A step of one character becomes a whole value, so the limit is half the text's."""
     with pytest.raises(ContractError, match="inflate to at most 4194304 bytes"):
         decode_batch(message_of(*[[1] * 50_001] * 45, n=50_000))
     batch = Batch(BOOT, 0, list(range(1_100)), {"a": ["x" * 4096] * 1_100})
@@ -200,7 +200,7 @@ def test_columns_take_no_more_memory_than_before():
         encode_batch(batch)
 
 
-def test_the_dictionary_is_needed():
+def test_a_batch_cannot_be_read_without_the_dictionary():
     envelope = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
     with pytest.raises(ContractError, match="must be base64 of zlib"):
         decode_batch({**envelope, "codec": PLAIN_CODEC})

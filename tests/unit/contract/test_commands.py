@@ -1,4 +1,4 @@
-"""Commands and fleet messages: what is written is read, and what is not allowed is not written."""
+"""Commands and fleet messages are decoded as they were encoded; invalid ones are not encoded."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TIMES = st.integers(0, 2**53 - 1)
     st.text("0123456789abcdef", min_size=8, max_size=32), st.tuples(TIMES, TIMES), st.integers(0, 2**53),
     st.tuples(st.integers(1, 60_000), st.none() | st.integers(1, 10_000)), MESSAGES,
 )  # fmt: skip
-def test_a_command_there_and_back(
+def test_a_command_is_decoded_as_it_was_encoded(
     session: str, times: tuple[int, int], seq: int, holds: tuple[int, int | None], message: Any
 ) -> None:
     command = Command(session, min(times), seq, max(times), holds[0], message, holds[1])
@@ -45,7 +45,7 @@ def test_a_command_there_and_back(
 
 
 @given(st.integers(0, 2**53), TIMES, MESSAGES)
-def test_a_fleet_message_there_and_back(seq: int, sent: int, message: Any) -> None:
+def test_a_fleet_message_is_decoded_as_it_was_encoded(seq: int, sent: int, message: Any) -> None:
     heard = FleetMessage("0badcafe", seq, sent, message)
     assert decode_fleet(encode_fleet(heard)) == heard
 
@@ -59,7 +59,7 @@ def test_a_fleet_message_there_and_back(seq: int, sent: int, message: Any) -> No
         {"message": {"a": "x" * 200_000}}, {"message": {"a": {1, 2}}},
     ],
 )  # fmt: skip
-def test_a_command_that_is_not_allowed(change: dict[str, Any]) -> None:
+def test_an_invalid_command_is_refused(change: dict[str, Any]) -> None:
     good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
     with pytest.raises(ContractError):
         encode_command(replace(good, **change))
@@ -69,7 +69,7 @@ ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.tex
 
 
 @given(st.dictionaries(st.sampled_from(KEYS), ANYTHING) | st.binary(max_size=40))
-def test_anything_else_is_refused_with_the_contracts_error(content: Any) -> None:
+def test_any_other_input_raises_the_contracts_error(content: Any) -> None:
     payload = content if isinstance(content, bytes) else json.dumps(content).encode()
     for read in (decode_command, decode_fleet):
         with pytest.raises(ContractError):

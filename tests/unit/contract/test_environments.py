@@ -1,4 +1,4 @@
-"""What the stacks write into a function's environment is what the function reads."""
+"""Functions read their environment as the stacks write it."""
 
 from __future__ import annotations
 

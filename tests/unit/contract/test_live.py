@@ -1,4 +1,4 @@
-"""The live lane's sample: what is written is read, and as the rule and Lambda 1 hand it over."""
+"""Live samples are decoded as they were encoded, also after the rule and Lambda 1 passed them on."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_live_round_trip(live):
 
 
 def handed_over(message):
-    """As the live rule gives it to Lambda 1, and Lambda 1 takes it."""
+    """The message as the live rule passes it to Lambda 1 and Lambda 1 decodes it."""
     event = rule_event(message, "live/iort/car/vesc", 1_700_000_000_000)
     return event_message(json.loads(json.dumps(event)))
 
 
 @pytest.mark.parametrize("event", [{}, {MESSAGE_BASE64: 7}, {MESSAGE_BASE64: "a%"}])
-def test_an_event_of_another_kind_holds_no_live_message(event):
+def test_an_event_of_another_kind_is_refused(event):
     with pytest.raises(ContractError, match=MESSAGE_BASE64):
         event_message(event)
 
@@ -86,7 +86,7 @@ def test_live_nonfinite_becomes_null_and_is_counted(sample):
         ({"sample": {"speed": math.nan}, "nonfinite": MOST_NONFINITE}, "nonfinite"),
     ],
 )
-def test_live_refused(changed, named):
+def test_an_invalid_live_sample_is_refused(changed, named):
     with pytest.raises(ContractError, match=named):
         encode_live(replace(GOOD_LIVE, **changed))
 
@@ -105,7 +105,7 @@ def test_live_update_carries_every_hop():
     assert len(json.dumps(largest)) * 3 < MAX_PUBNUB_BYTES
 
 
-def test_a_live_update_comes_as_it_was_sent():
+def test_a_live_update_is_decoded_as_it_was_encoded():
     live = LiveSample("0123abcd", 3, 5_000, 6_000, {"speed": 1.5, "name": None}, offset_us=-7)
     sent = json.loads(json.dumps(live_update("car", "vesc", live, 8, 9_000)))
     assert decode_live_update(sent) == ("car", "vesc", live, 8, 9_000)

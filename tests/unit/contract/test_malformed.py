@@ -1,4 +1,4 @@
-"""Whatever arrives, every decoder takes it or raises the contract's one error, and takes nothing else."""
+"""Every decoder accepts a valid message and raises `ContractError` for any other input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DECODERS = [decode_batch, decode_live, decode_pong]
 decoders = st.sampled_from(DECODERS)
 
 
-# What boto3 and Python can put into a mapping that JSON cannot.
+# Values of boto3 and Python that JSON does not have.
 python_values = json_values | st.decimals() | st.binary(max_size=8) | st.sets(st.integers(), max_size=2)
 awkward = st.sampled_from(
     [
@@ -55,29 +55,29 @@ def envelopes():
 
 
 @given(decoders, st.binary(max_size=200))
-def test_any_bytes(decoder, message):
+def test_any_bytes_are_decoded_or_refused(decoder, message):
     decode_or_refuse(decoder, message)
 
 
 @given(decoders, st.text(st.characters(), max_size=200))
-def test_any_text(decoder, message):
+def test_any_text_is_decoded_or_refused(decoder, message):
     decode_or_refuse(decoder, message)
 
 
 @given(decoders, json_values)
-def test_any_json(decoder, value):
+def test_any_json_is_decoded_or_refused(decoder, value):
     decode_or_refuse(decoder, json.dumps(value))
     decode_or_refuse(decoder, json.dumps(value).encode("utf-16"))
 
 
 @given(st.sampled_from(DECODERS[:2]), st.dictionaries(st.text(max_size=4), python_values, max_size=4))
-def test_any_item(decoder, item):
+def test_any_table_item_is_decoded_or_refused(decoder, item):
     decode_or_refuse(decoder, item)
 
 
 @settings(max_examples=300)
 @given(st.data(), python_values | awkward)
-def test_one_key_replaced(data, value):
+def test_a_message_with_one_key_replaced_is_decoded_or_refused(data, value):
     envelope = data.draw(envelopes())
     envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
     for decoder in DECODERS[:2]:
@@ -86,7 +86,7 @@ def test_one_key_replaced(data, value):
 
 @settings(max_examples=200)
 @given(st.data(), json_values)
-def test_one_key_replaced_in_text(data, value):
+def test_a_text_with_one_key_replaced_is_decoded_or_refused(data, value):
     envelope = data.draw(envelopes())
     envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
     for decoder in DECODERS:
@@ -94,7 +94,7 @@ def test_one_key_replaced_in_text(data, value):
 
 
 @pytest.mark.parametrize("good", [encode_batch(GOOD), encode_live(GOOD_LIVE)], ids=["batch", "live"])
-def test_one_key_removed(good):
+def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
     decoder = decode_batch if b"codec" in good else decode_live
     for key in json.loads(good):
         envelope = json.loads(good)
@@ -105,7 +105,7 @@ def test_one_key_removed(good):
 
 @settings(max_examples=300)
 @given(batches(), st.data())
-def test_message_damaged_anywhere(batch, data):
+def test_a_damaged_message_is_decoded_or_refused(batch, data):
     message = bytearray(encode_batch(batch))
     at = data.draw(st.integers(0, len(message) - 1))
     message[at] = data.draw(st.integers(0, 255))
@@ -115,7 +115,7 @@ def test_message_damaged_anywhere(batch, data):
 
 @settings(max_examples=200)
 @given(st.data())
-def test_compressed_samples_damaged(data):
+def test_damaged_compressed_samples_are_decoded_or_refused(data):
     envelope = json.loads(encode_batch(GOOD))
     packed = bytearray(base64.b64decode(envelope["samples"]))
     at = data.draw(st.integers(0, len(packed) - 1))
@@ -143,16 +143,16 @@ def test_compressed_samples_damaged(data):
         [],
     ],
 )
-def test_message_refused(decoder, message):
+def test_an_invalid_message_is_refused(decoder, message):
     with pytest.raises(ContractError):
         decoder(message)
 
 
-def test_error_of_a_long_value_is_short():
+def test_the_error_for_a_long_value_is_short():
     with pytest.raises(ContractError) as caught:
         decode_batch(dict(json.loads(encode_batch(GOOD)), codec="x" * 10_000))
     assert len(str(caught.value)) < 200
 
 
-def test_there_is_one_error():
+def test_the_contracts_error_is_a_value_error():
     assert issubclass(ContractError, ValueError)

@@ -28,7 +28,7 @@ def test_pong_round_trip(ping_id, sent_us, padding, received_ms):
     ("ping_id", "sent_us"),
     [(math.nan, 0), (-1, 0), (2**53 + 1, 0), (True, 0), ("1", 0), (1, math.nan), (1, 2**53)],
 )
-def test_ping_refused(ping_id, sent_us):
+def test_an_invalid_ping_is_refused(ping_id, sent_us):
     with pytest.raises(ContractError, match=r"ping id|sent_us"):
         encode_ping(ping_id, sent_us)
 
@@ -44,11 +44,11 @@ def test_ping_refused(ping_id, sent_us):
         '{"id":1,"sent_us":0,"received_ms":1000000000000000}',
     ],
 )
-def test_pong_refused(pong):
+def test_an_invalid_pong_is_refused(pong):
     with pytest.raises(ContractError):
         decode_pong(pong)
 
 
-def test_pong_goes_to_the_robot_that_asked():
+def test_a_pong_goes_to_the_robot_that_sent_the_ping():
     topic = RULES["pong"].action.topic("iort", robot="car")
     assert topic == build_topic(PONG, "car", RULE)

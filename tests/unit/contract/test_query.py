@@ -1,4 +1,4 @@
-"""The messages of a query: what is encoded is decoded, everything else is refused."""
+"""Query messages are decoded as they were encoded; invalid ones are refused."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ ANSWER = QueryAnswer(2, ("speed",), 3, 1, 1, "codec", {"temp_fet": 2}, {"topic":
 
 
 @pytest.mark.parametrize("request_", [REQUEST, QueryRequest("car", "vesc")])
-def test_a_request_comes_as_it_was_sent(request_: QueryRequest) -> None:
+def test_a_request_is_decoded_as_it_was_encoded(request_: QueryRequest) -> None:
     assert decode_query_request(json.loads(encode_query_request(request_))) == request_
 
 
-def test_a_request_names_no_more_than_it_must_and_times_are_within_bounds() -> None:
+def test_a_request_needs_only_robot_and_stream_and_its_times_are_clamped() -> None:
     assert decode_query_request({"robot": "car", "stream": "vesc"}) == QueryRequest("car", "vesc")
     far = decode_query_request({"robot": "car", "stream": "vesc", "start_us": -(2**60), "end_us": 2**60})
     assert (far.start_us, far.end_us) == (FIRST_US, LAST_US)
@@ -60,7 +60,7 @@ def test_an_invalid_request_is_refused(change: dict[str, object], reason: str) -
     "answer",
     [ANSWER, QueryAnswer(url="https://there"), QueryAnswer(samples=b""), QueryAnswer(error="no condition")],
 )
-def test_an_answer_comes_as_it_was_sent(answer: QueryAnswer) -> None:
+def test_an_answer_is_decoded_as_it_was_encoded(answer: QueryAnswer) -> None:
     assert decode_query_answer(json.dumps(encode_query_answer(answer))) == answer
 
 
@@ -82,7 +82,7 @@ def test_an_invalid_answer_is_refused(change: dict[str, object]) -> None:
         decode_query_answer(json.dumps({**encode_query_answer(ANSWER), **change}))
 
 
-def test_samples_come_as_they_were_packed() -> None:
+def test_samples_are_unpacked_as_they_were_packed() -> None:
     assert unpacked_samples(SAMPLES) == (TIMES_US, COLUMNS)
     assert unpacked_samples(packed_samples([], {})) == ([], {})
     with pytest.raises(ContractError, match="packs"):

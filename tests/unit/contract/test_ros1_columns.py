@@ -1,4 +1,4 @@
-"""ROS messages in batches, as columns or as they were published, and the same bytes again."""
+"""ROS messages in batches, as columns or as published bytes, are restored byte for byte."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def codec_of(batch: Batch) -> str:
 
 
 def again(batch: Batch, layouts: Any = None) -> list[bytes]:
-    """The messages out of the wire's batch, and out of a table's item."""
+    """The messages decoded from the wire's batch and from a table's item."""
     message = encode_batch(batch)
     _, messages = messages_of(message, LAYOUTS if layouts is None else layouts)
     assert messages is not None
@@ -79,7 +79,7 @@ def header_of(seq: int, sec: int, nanosec: int, frame: str) -> bytes:
 # --- columns ----------------------------------------------------------------------------------------
 
 
-def test_messages_of_numbers_are_columns_and_the_same_bytes_again() -> None:
+def test_numeric_messages_are_stored_as_columns_and_restored_byte_for_byte() -> None:
     batch = batch_of(FLAT, [flat(x=i / 10, n=i, on=i % 2) for i in range(50)])
     assert codec_of(batch) == CODEC
     decoded = decode_batch(encode_batch(batch))
@@ -88,10 +88,10 @@ def test_messages_of_numbers_are_columns_and_the_same_bytes_again() -> None:
     assert decoded.columns["x"] == [i / 10 for i in range(50)]
     assert decoded.columns["on"] == [bool(i % 2) for i in range(50)]
     assert decoded.columns["big"] == [2**63] * 50
-    assert again(batch) == batch.messages.raw  # type: ignore[union-attr]  # it was given some
+    assert again(batch) == batch.messages.raw  # type: ignore[union-attr]  # messages were given
 
 
-# Bit for bit, these do not come back through a column; they are kept as they are.
+# A column would change the bits of these values, so their messages are kept as bytes.
 QUIET, SIGNALLING = 0x7FF8000000000001, 0x7FF0000000000001
 
 
@@ -114,11 +114,11 @@ QUIET, SIGNALLING = 0x7FF8000000000001, 0x7FF0000000000001
     ids=["NaN", "quiet NaN", "signalling NaN", "infinity", "float32 infinity", "negative zero",
          "float32 negative zero", "a bool of 2", "a bool of 255", "cut", "longer", "empty"],
 )  # fmt: skip
-def test_what_a_column_would_change_is_kept_as_it_is(odd: bytes) -> None:
+def test_messages_that_a_column_would_change_are_kept_as_bytes(odd: bytes) -> None:
     raws = [flat(), odd, flat(n=4)]
     batch = batch_of(FLAT, raws)
     assert codec_of(batch) == SERIALIZED_CODEC
-    # Whoever has the batch needs no layout of anybody's.
+    # The batch itself contains the layout.
     assert again(batch, {}) == raws
     decoded = decode_batch(encode_batch(batch))
     assert decoded.columns["n"][::2] == [3, 4]
@@ -126,7 +126,7 @@ def test_what_a_column_would_change_is_kept_as_it_is(odd: bytes) -> None:
 
 @settings(max_examples=200)
 @given(st.lists(st.binary(min_size=23, max_size=23), min_size=1, max_size=8))
-def test_any_bytes_of_a_type_of_numbers_come_back(raws: list[bytes]) -> None:
+def test_any_bytes_of_a_numeric_type_are_restored(raws: list[bytes]) -> None:
     batch = batch_of(FLAT, raws)
     assert again(batch) == raws
     decoded = decode_batch(encode_batch(batch))
@@ -149,7 +149,7 @@ def test_any_bytes_of_a_type_of_numbers_come_back(raws: list[bytes]) -> None:
     ],
     ids=["plain", "ns", "frames", "no frame", "odd frame", "seconds off", "drift", "no stamp", "greatest"],
 )
-def test_headers_come_back_whatever_they_say(raws: list[bytes]) -> None:
+def test_any_valid_header_is_restored(raws: list[bytes]) -> None:
     batch = batch_of(STAMPED_FLAT, raws)
     assert codec_of(batch) == CODEC
     assert again(batch) == raws
@@ -168,17 +168,17 @@ def test_headers_come_back_whatever_they_say(raws: list[bytes]) -> None:
     ],
     ids=["no UTF-8", "a second of nanoseconds", "many nanoseconds", "a long frame", "cut", "empty"],
 )
-def test_headers_that_nobody_sends_come_back_too(odd: bytes) -> None:
+def test_an_invalid_header_is_restored(odd: bytes) -> None:
     batch = batch_of(STAMPED_FLAT, [stamped(0), odd])
     assert codec_of(batch) == SERIALIZED_CODEC
     assert again(batch, {}) == [stamped(0), odd]
 
 
-def test_columns_take_less_than_the_messages_would() -> None:
-    """A drive's numbers; what has no pattern is kept as bytes, which its text would be twice as long as."""
+def test_columns_are_smaller_than_the_messages_bytes() -> None:
+    """Smooth numbers of a drive are stored as columns; noise is kept as bytes, half as long as its text."""
     smooth = batch_of(STAMPED_FLAT, [stamped(i, ns=i * 7 % 1000) for i in range(500)])
     assert codec_of(smooth) == CODEC
-    raws = smooth.messages.raw  # type: ignore[union-attr]  # it was given some
+    raws = smooth.messages.raw  # type: ignore[union-attr]  # messages were given
     packed = len(zlib.compress(pack(Messages(STAMPED_FLAT.id, STAMPED_FLAT.layout, raws))))
     assert len(encode_batch(smooth)) * 3 // 4 < packed
     noise = random.Random(1)
@@ -186,7 +186,7 @@ def test_columns_take_less_than_the_messages_would() -> None:
     assert codec_of(noisy) == SERIALIZED_CODEC
 
 
-def test_the_layout_must_be_known_and_be_the_types() -> None:
+def test_the_layout_must_be_known_and_fit_the_columns() -> None:
     batch = batch_of(FLAT, [flat()])
     message = encode_batch(batch)
     with pytest.raises(ContractError, match=f"type .{FLAT.id}. is unknown"):
@@ -201,12 +201,12 @@ def test_the_layout_must_be_known_and_be_the_types() -> None:
             messages_of(message, {FLAT.id: wrong})
 
 
-def test_samples_that_were_never_messages_have_none() -> None:
+def test_samples_without_messages_decode_without_messages() -> None:
     batch = Batch(BOOT, 0, [T0], {"x": [1]})
     assert messages_of(encode_batch(batch), LAYOUTS) == (batch, None)
 
 
-# What may stand behind the columns of a batch of two samples, and is of no type of ours.
+# The description of messages after the columns of a batch of two samples.
 ABOUT = {"type": STAMPED_FLAT.id, "seq": 1, "stamp": "000000", "frame_id": "a"}
 
 
@@ -263,13 +263,13 @@ WRONG_ABOUT = [
 
 
 @pytest.mark.parametrize("about", WRONG_ABOUT, ids=range(len(WRONG_ABOUT)))
-def test_what_makes_no_messages_is_refused(about: str) -> None:
+def test_an_invalid_description_of_messages_is_refused(about: str) -> None:
     with pytest.raises(ContractError):
         from_columns({"x": [1.5, 2.5], "n": [1, 2]}, about, [T0, T0 + 1], LAYOUTS)
 
 
 @given(json_values | st.dictionaries(st.sampled_from(sorted(ABOUT)), json_values))
-def test_any_json_behind_the_columns_makes_messages_or_is_refused(value: Any) -> None:
+def test_any_json_after_the_columns_gives_messages_or_is_refused(value: Any) -> None:
     known = isinstance(value, dict) and value.keys() <= ABOUT.keys()
     about = _about(**value) if known else json.dumps(value)
     try:
@@ -293,13 +293,13 @@ def test_any_json_behind_the_columns_makes_messages_or_is_refused(value: Any) ->
         {"x": [1.5, 2.5], "n": [0.5, 2]},
     ],
 )
-def test_columns_that_are_not_the_types_are_refused(columns: Any) -> None:
+def test_columns_that_do_not_fit_the_type_are_refused(columns: Any) -> None:
     with pytest.raises(ContractError, match="the columns do not fit the type"):
         from_columns(columns, _about(), [T0, T0 + 1], LAYOUTS)
 
 
-def test_a_frame_of_megabytes_is_not_multiplied() -> None:
-    """It packs to kilobytes, and would be made again once a sample."""
+def test_a_long_frame_id_is_not_repeated_for_each_sample() -> None:
+    """The frame id compresses to kilobytes, but each sample's message would repeat it."""
     frame, n = "x" * 1_000_000, 50_000
     about = _about(stamp="000" * n, frame_id=frame)
     with pytest.raises(ContractError, match="frame_id"):
@@ -312,10 +312,10 @@ def test_a_frame_of_megabytes_is_not_multiplied() -> None:
     ):
         batch = batch_of(STAMPED_FLAT, [header_of(i, 5, 0, "\0" * size) + bytes(9) for i in range(n)])
         assert codec_of(batch) == codec
-        assert again(batch) == batch.messages.raw  # type: ignore[union-attr]  # it was given some
+        assert again(batch) == batch.messages.raw  # type: ignore[union-attr]  # messages were given
 
 
-def test_a_field_whose_name_nobody_may_ask_for_is_kept_and_not_shown() -> None:
+def test_a_field_with_too_long_a_name_is_stored_without_a_column() -> None:
     name = "a" * (MAX_FIELD_CHARACTERS + 1)
     kind = RosType("/t", "a_msgs/A", "1", f"float64 {name}\nuint8 n")
     raws = [struct.pack("<dB", 0.5, i) for i in range(3)]
@@ -324,7 +324,7 @@ def test_a_field_whose_name_nobody_may_ask_for_is_kept_and_not_shown() -> None:
     assert dict(decode_batch(encode_batch(batch)).columns) == {"n": [0, 1, 2]}
 
 
-def test_a_definition_that_is_too_long_for_a_batch_is_recorded_without_a_view() -> None:
+def test_messages_with_too_long_a_definition_are_stored_without_columns() -> None:
     definition = "".join(f"float64 {'a' * 1000}{i}\n" for i in range(100))
     kind = RosType("/t", "a_msgs/A", "1", definition)
     raws = [bytes([i]) * 800 for i in range(3)]
@@ -357,7 +357,7 @@ def test_other_messages_are_kept_byte_for_byte(kind: RosType, raws: list[bytes])
     assert again(batch, {}) == raws
 
 
-def test_the_view_of_arrays_that_change_their_length_has_nothing_where_there_is_nothing() -> None:
+def test_missing_array_elements_are_null_in_the_view() -> None:
     raws = [u32(2) + text("a") + text("b") + u32(0), u32(1) + text("c") + u32(1) + struct.pack("<d", 0.5)]
     found = decode_batch(encode_batch(batch_of(NAMES, raws)))
     assert found.columns == {"names.0": ["a", "c"], "names.1": ["b", None], "x.0": [None, 0.5]}
@@ -365,27 +365,27 @@ def test_the_view_of_arrays_that_change_their_length_has_nothing_where_there_is_
     assert found.times_us == [T0, T0 + 1000]
 
 
-def test_values_that_are_not_finite_are_counted_in_the_view() -> None:
+def test_nonfinite_values_are_counted_in_the_view() -> None:
     raws = [flat(x=math.nan), flat(x=-0.0), flat(y=math.inf)]
     found = decode_batch(encode_batch(batch_of(FLAT, raws)))
     assert (found.columns["x"], found.columns["y"]) == ([None, 0, 1.5], [0.5, 0.5, None])
     assert found.nonfinite == 2
 
 
-def test_what_stands_beside_messages_is_in_their_samples() -> None:
+def test_columns_beside_messages_are_part_of_their_samples() -> None:
     raws = [u32(0) + u32(0), u32(1) + text("a") + u32(0)]
     batch = batch_of(NAMES, raws, {"data.key": ["k", None], "data.at": [0, 4]})
     found, messages = messages_of(encode_batch(batch), {})
     assert found.columns == {"names.0": [None, "a"], "data.key": ["k", None], "data.at": [0, 4]}
     assert messages is not None
     assert list(messages.raw) == raws
-    # Of numbers alone, too.
+    # Numeric messages, too.
     numbers = batch_of(FLAT, [flat()], {"note": ["n"]})
     assert codec_of(numbers) == SERIALIZED_CODEC
     assert again(numbers, {}) == [flat()]
 
 
-def test_halves_have_their_messages() -> None:
+def test_each_half_of_a_batch_keeps_its_messages() -> None:
     batch = batch_of(NAMES, [u32(0) + u32(0)] * 3, {"note": ["a", "b", "c"]})
     first, second = split_batch(batch)
     assert (len(again(first, {})), len(again(second, {}))) == (1, 2)
@@ -394,7 +394,7 @@ def test_halves_have_their_messages() -> None:
         encode_batch(Batch(BOOT, 0, [T0], {}, 0, Messages(NAMES.id, "", [b"", b""])))
 
 
-def test_messages_too_large_for_a_batch_are_halved_to_what_is_read_again() -> None:
+def test_messages_too_large_for_a_batch_are_split_into_readable_halves() -> None:
     batch = batch_of(UNKNOWN, [b"x" * 700_000] * 4)
     with pytest.raises(ContractError, match="messages of a batch must be at most 2097152 bytes, got 2800000"):
         encode_batch(batch)
@@ -406,7 +406,7 @@ def test_messages_too_large_for_a_batch_are_halved_to_what_is_read_again() -> No
 
 @settings(max_examples=200)
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=6), st.text(max_size=9), st.text(max_size=9))
-def test_any_messages_are_packed_and_unpacked(raws: list[bytes], type_id: str, about: str) -> None:
+def test_any_messages_are_unpacked_as_they_were_packed(raws: list[bytes], type_id: str, about: str) -> None:
     found = unpack(pack(Messages(type_id, about, raws)), len(raws))
     assert (found.type_id, found.layout, list(found.raw)) == (type_id, about, raws)
 
@@ -446,12 +446,12 @@ def head(**changes: Any) -> bytes:
         (head(sizes={}), "sizes must be 2 integers"),
     ],
 )
-def test_a_head_that_nobody_writes_is_refused(body: bytes, named: str) -> None:
+def test_an_invalid_head_is_refused(body: bytes, named: str) -> None:
     with pytest.raises(ContractError, match=named):
         unpack(body, 2)
 
 
-def test_what_stands_behind_the_columns_must_be_text() -> None:
+def test_the_part_after_the_columns_must_be_text() -> None:
     good = json.loads(encode_batch(batch_of(FLAT, [flat()])))
     body = inflate(good["samples"], CODEC)
     for behind, taken in ((b"[1]", True), (b"\xff\xfe", False)):
@@ -467,7 +467,7 @@ def test_what_stands_behind_the_columns_must_be_text() -> None:
 
 @settings(max_examples=200)
 @given(st.sampled_from([FLAT, STAMPED_FLAT, NAMES]), st.data())
-def test_a_batch_of_messages_damaged_anywhere_is_read_or_refused(kind: RosType, data: Any) -> None:
+def test_a_damaged_batch_of_messages_is_read_or_refused(kind: RosType, data: Any) -> None:
     raws = {FLAT: [flat()] * 2, STAMPED_FLAT: [stamped(0), stamped(1)], NAMES: [u32(0, 0)] * 2}[kind]
     envelope = json.loads(encode_batch(batch_of(kind, raws)))
     body = bytearray(inflate(envelope["samples"], envelope["codec"]))
@@ -484,8 +484,8 @@ def test_a_batch_of_messages_damaged_anywhere_is_read_or_refused(kind: RosType, 
             assert messages is None or len(messages.raw) == 2
 
 
-def test_a_message_of_millions_of_values_costs_no_more_than_a_view() -> None:
-    """A batch of a stranger's: what cannot be shown is not taken apart, and what is shown is bounded."""
+def test_a_message_of_millions_of_values_gives_a_bounded_view() -> None:
+    """Even in a hostile batch, only the values that the view may show are decoded."""
     kind = RosType("/t", "a_msgs/A", "1", "B[] b\n" + LINE + "MSG: a_msgs/B\nint8[] a\n")
     one = u32(64) + (u32(64) + bytes(64)) * 64
     batch = batch_of(kind, [one] * 400)
@@ -499,7 +499,7 @@ def test_a_message_of_millions_of_values_costs_no_more_than_a_view() -> None:
 
 
 def forced(batch: Batch) -> bytes:
-    """The batch as somebody encodes it who does not count its values."""
+    """The batch as an encoder without the limit of values writes it."""
     assert batch.messages is not None
     dt = [0] + [1000] * (len(batch.times_us) - 1)
     deflater = zlib.compressobj(zdict=DICTIONARY)
@@ -509,7 +509,7 @@ def forced(batch: Batch) -> bytes:
     return json.dumps(envelope).encode()
 
 
-def test_batches_of_more_values_than_are_allowed_are_halved() -> None:
+def test_a_batch_with_too_many_values_is_split_into_halves() -> None:
     kind = RosType("/t", "a_msgs/A", "1", "".join(f"uint8[64] a{i}\n" for i in range(8)))
     batch = batch_of(kind, [bytes(512)] * 98)
     with pytest.raises(ContractError, match="98 samples of 512 fields"):
@@ -529,7 +529,7 @@ NESTED = (
 
 
 @pytest.mark.parametrize("definition", ["", "uint8 a", NESTED, STAMPED + "uint8 u"])
-def test_a_layout_says_all_that_decoding_needs(definition: str) -> None:
+def test_a_layout_is_sufficient_for_decoding(definition: str) -> None:
     parsed = parse("a_msgs/A", definition)
     written = layout(parsed)
     read = parse("a_msgs/A", written)
@@ -542,7 +542,7 @@ def test_a_layout_says_all_that_decoding_needs(definition: str) -> None:
     assert "KIND" not in written
 
 
-def test_a_type_is_told_by_its_topic_its_name_and_its_checksum() -> None:
+def test_topic_name_and_checksum_identify_a_type() -> None:
     named = {
         type_id(*one) for one in [("/a", "b", "c"), ("/a", "b", "d"), ("/a", "c", "c"), ("", "/ab", "c")]
     }
@@ -554,7 +554,7 @@ def test_a_type_is_told_by_its_topic_its_name_and_its_checksum() -> None:
     assert MessageType("s", "/t", "k", "1", "no definition at all").layout == ""
 
 
-def test_a_message_reads_as_its_sample_when_it_is_asked() -> None:
+def test_a_message_decodes_its_fields_on_access() -> None:
     message = RosMessage(flat(), FLAT, beside={"note": "n"})
     assert dict(message) == {"x": 1.5, "y": 0.5, "n": 3, "on": True, "big": 2**63, "note": "n"}
     assert (len(message), message["n"], "note" in message) == (6, 3, True)
@@ -564,7 +564,7 @@ def test_a_message_reads_as_its_sample_when_it_is_asked() -> None:
 
 
 @given(st.binary(max_size=30), st.binary(min_size=1, max_size=9), st.binary(max_size=30))
-def test_a_content_that_is_cut_out_is_filled_in_again(before: bytes, content: bytes, after: bytes) -> None:
+def test_a_content_that_was_cut_out_is_restored(before: bytes, content: bytes, after: bytes) -> None:
     raw = before + u32(len(content)) + content + after
     less, at = cut(raw, content)
     assert len(less) == len(raw) - len(content)
@@ -572,13 +572,13 @@ def test_a_content_that_is_cut_out_is_filled_in_again(before: bytes, content: by
 
 
 @pytest.mark.parametrize("at", [-1, 1, 3, 100])
-def test_a_content_is_filled_in_nowhere_else(at: int) -> None:
+def test_a_content_is_restored_only_at_an_empty_array(at: int) -> None:
     with pytest.raises(MessageError, match=f"no empty array at byte {at}"):
         filled(u32(0) + b"abc", b"x", at)
 
 
 @pytest.mark.parametrize("wrong", ["", "\n", "a_msgs/A\nB b", "a_msgs/A\nfloat64", "x" * (MAX_LAYOUT + 1)])
-def test_a_layout_that_is_none_is_refused(wrong: str) -> None:
+def test_an_invalid_layout_is_refused(wrong: str) -> None:
     kind = Messages("0123abcd", wrong, [b""])
     if wrong.strip():
         with pytest.raises(MessageError):

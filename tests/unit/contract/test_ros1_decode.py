@@ -23,7 +23,7 @@ from tests.unit.contract.ros1_messages import HEADER, LINE, STAMPED, header, tex
 
 
 def nested_header(path: str) -> dict[str, Any]:
-    """What `header()` is in the view where it is not the message's own."""
+    """The view of a nested `header()`."""
     return {f"{path}.seq": 1, f"{path}.stamp.sec": 5, f"{path}.stamp.nanosec": 7000,
             f"{path}.frame_id": "base_link"}  # fmt: skip
 
@@ -72,7 +72,7 @@ def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
         ("", b"", {}),
     ],
 )  # fmt: skip
-def test_decode(definition: str, data: bytes, values: dict[str, Any]) -> None:
+def test_a_message_decodes_to_flat_fields(definition: str, data: bytes, values: dict[str, Any]) -> None:
     found = decoded(definition, data)
     assert found == values
     assert [type(v) for v in found.values()] == [type(v) for v in values.values()]
@@ -119,14 +119,16 @@ SELECT_DATA = (
         (["sped", "speed", "two.2.x", "b.w"], {"speed": 2.5}, ["b.w", "sped", "two.2.x"]),
     ],
 )  # fmt: skip
-def test_only_what_is_selected(select: list[str], values: dict[str, Any], unknown: list[str]) -> None:
+def test_only_selected_fields_are_decoded(
+    select: list[str], values: dict[str, Any], unknown: list[str]
+) -> None:
     decoder = Decoder(parse("a_msgs/A", SELECTABLE), select=select)
     assert decoder.decode(SELECT_DATA) == values
     assert decoder.unknown == unknown
     assert not decoder.left_out
 
 
-def test_what_is_no_telemetry_is_left_out_and_counted() -> None:
+def test_fields_without_telemetry_are_left_out_and_counted() -> None:
     definition = "uint8[] image\nfloat32[] ranges\nfloat64[100] grid\nstring s\nuint8 last"
     data = u32(3) + b"abc" + u32(65) + bytes(65 * 4) + bytes(800) + text("x" * (MAX_TEXT + 1)) + b"\x01"
     decoder = Decoder(parse("a_msgs/A", definition))
@@ -167,8 +169,8 @@ def test_fields_beyond_512_are_cut_from_the_view_and_counted(
 
 @pytest.mark.parametrize("length", ["", "[64]", "[16777216]"])
 @pytest.mark.parametrize("leaf", ["uint8 u", "string s", "string[0] s", "uint8[] u"])
-def test_types_within_types_cost_no_more_than_a_view(length: str, leaf: str) -> None:
-    """Some lines nest so deeply that nobody could walk through all of it."""
+def test_nested_types_give_a_bounded_view(length: str, leaf: str) -> None:
+    """A definition of a few lines can describe more fields than anyone can visit."""
     kinds = [f"T{i}" for i in range(20)]
     line = "".join(f"{{0}}{length} a{i}\n" for i in range(9 if not length else 1))
     definition = line.format(kinds[0])
@@ -180,12 +182,12 @@ def test_types_within_types_cost_no_more_than_a_view(length: str, leaf: str) -> 
             Decoder(parse("a_msgs/A", definition), select=select).decode(bytes(1000))
         except MessageError:
             continue
-        # Only a message without a byte is as long as its definition says.
+        # Only an empty message has the length of this definition.
         raise AssertionError("1000 bytes are no such message")
 
 
 @pytest.mark.parametrize(("n", "fields"), [(60, 512), (0, 0)], ids=["full", "empty"])
-def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> None:
+def test_nested_arrays_give_a_bounded_view(n: int, fields: int) -> None:
     """A message of megabytes may hold millions of values, or a quarter of a million empty arrays."""
     kinds = ["T0", "T1", "T2"]
     definition = "T0[] a\n"
@@ -220,7 +222,7 @@ def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> N
         ("string[1000000] a", b"", "too many elements to decode: 1000000"),
     ],
 )
-def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None:
+def test_bytes_that_do_not_fit_the_definition_are_refused(definition: str, data: bytes, error: str) -> None:
     with pytest.raises(MessageError, match=error):
         decoded(definition, data)
     with pytest.raises(MessageError):
@@ -240,18 +242,18 @@ def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None
         ("uint8[99999999999] a", "99999999999 elements"),
     ],
 )
-def test_a_text_that_is_no_definition(definition: str, error: str) -> None:
+def test_an_invalid_definition_is_refused(definition: str, error: str) -> None:
     with pytest.raises(MessageError, match=error):
         parse("a_msgs/A", definition)
 
 
-def test_fields_and_lengths() -> None:
+def test_fields_and_lengths_follow_from_the_definition() -> None:
     fields = parse("a_msgs/A", "uint8[] a\nuint8[3] b\nuint8 c\nHeader h\n" + HEADER).fields()
     assert [f.length for f in fields] == [VARIABLE, 3, None, None]
     assert fields[3].kind == "std_msgs/Header"
 
 
-def test_a_real_recording_is_what_rosbags_reads() -> None:
+def test_a_real_recording_decodes_as_rosbags_decodes_it() -> None:
     from rosbags.highlevel import AnyReader
 
     with AnyReader([recording("f1tenth-motor-servo.bag")]) as reader:
@@ -265,7 +267,7 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
         counts: dict[str, int] = {}
         for connection in reader.connections:
             kind = connection.msgtype.replace("/msg/", "/")
-            # Of the newest rosbags for Python 3.8 it is the text itself.
+            # In the newest rosbags for Python 3.8 it is the text itself.
             definition = getattr(connection.msgdef, "data", connection.msgdef)
             decoder = Decoder(parse(kind, definition))
             for _, _, raw in reader.readers[0].messages([connection]):
@@ -301,7 +303,7 @@ FIELDS = st.lists(st.tuples(KINDS, st.sampled_from(["", "[]", "[2]"])), min_size
 
 @st.composite
 def messages(draw: st.DrawFn) -> tuple[str, list[Any], list[Any]]:
-    """The definition of A, whose last field is an array of B; the values of A and of the Bs."""
+    """A definition of A, whose last field is an array of B, with values of A and of each B."""
     a, b = draw(FIELDS), draw(FIELDS)
     array = draw(st.sampled_from(["", "[]", "[2]"]))
 
@@ -323,7 +325,9 @@ def messages(draw: st.DrawFn) -> tuple[str, list[Any], list[Any]]:
 
 @settings(max_examples=150, deadline=None)
 @given(messages())
-def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]]) -> None:
+def test_any_message_decodes_to_the_values_that_rosbags_serialized(
+    case: tuple[str, list[Any], list[Any]],
+) -> None:
     import numpy as np
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -367,7 +371,7 @@ def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]
 
 
 @given(st.binary(max_size=60), st.sampled_from([None, ["b.1.x"]]))
-def test_garbage_is_refused_and_nothing_else(data: bytes, select: list[str] | None) -> None:
+def test_garbage_raises_only_a_message_error(data: bytes, select: list[str] | None) -> None:
     try:
         decoded(SELECTABLE, data, select=select)
     except MessageError:

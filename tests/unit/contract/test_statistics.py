@@ -1,4 +1,4 @@
-"""A second's summary: every sample once, whichever batches it came in."""
+"""The summary of a second counts every sample once, in whichever batch it arrived."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def summarized(second, batches, vehicle, missing=0):
 # --- one second -------------------------------------------------------------------------------------
 
 
-def test_min_mean_max_and_last_of_every_field_and_what_the_stream_lacked():
+def test_a_summary_has_min_mean_max_and_last_of_every_field_and_counts_gaps():
     first = batch(every(100_000, 5), {"speed": [4624, 10, 9238, 10, 10], "mode": ["a", "b", None, "c", "d"]})
     assert summarized(SECOND, [first], CAR) == {
         "n": 5,
@@ -61,25 +61,25 @@ def test_a_second_without_a_sample_has_no_summary():
     assert summarized(SECOND, [batch([T0 - 1], {"a": [1]}), batch([T0 + S], {"a": [1]})], CAR) is None
 
 
-def test_a_batch_over_the_boundary_counts_in_each_second_with_its_own_samples():
+def test_a_batch_across_two_seconds_counts_each_sample_in_its_own_second():
     across = batch([T0 - 20_000, T0 - 1, T0, T0 + 20_000], {"a": [1, 2, 3, 4]}, seq=4, nonfinite=3)
     before, after = (summarized(SECOND - back, [across], None, missing=4 * back) for back in (1, 0))
     assert (before["n"], before["a_min"], before["a_max"], before["a_last"]) == (2, 1, 2, 2)
     assert (after["n"], after["a_min"], after["a_max"], after["a_last"]) == (2, 3, 4, 4)
     assert (before["batches"], after["batches"]) == (1, 1)
     assert (before["missing_batches"], after["missing_batches"]) == (4, 0)
-    # What belongs to the batch as a whole belongs to the second in which it starts, once.
+    # Figures of the whole batch count once, in the second in which it starts.
     assert (before["nonfinite"], after["nonfinite"]) == (3, 0)
 
 
-def test_the_first_second_of_the_epoch_is_a_second_too():
+def test_the_first_second_of_the_epoch_has_a_summary():
     early = batch([0, 999_999, 1_000_000], {"a": [1, 2, 3]})
     assert summarized(0, [early], None)["n"] == 2
     assert summarized(1, [early], None)["n"] == 1
     assert summarized(-1, [early], None) is None
 
 
-def test_samples_of_one_time_all_count():
+def test_samples_with_equal_times_all_count():
     twice = batch([T0, T0, T0 + 1], {"a": [1, 2, 3]})
     second = summarized(SECOND, [twice], None)
     assert (second["n"], second["a_min"], second["a_mean"], second["a_last"]) == (3, 1, 2, 3)
@@ -106,7 +106,7 @@ def test_fields_appear_and_vanish_from_batch_to_batch():
     assert (second["power_w_min"], second["power_w_max"], second["power_w_last"]) == (12, 26, 26)
 
 
-def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last():
+def test_a_field_of_nulls_is_left_out_and_a_field_of_text_or_bools_keeps_its_last_value():
     columns = {
         "none": [None] * 3,
         "text": ["a", "b", None],
@@ -121,7 +121,7 @@ def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last()
     }
 
 
-def test_a_sensor_that_is_not_fitted_is_no_temperature_and_counted():
+def test_a_sensor_that_is_not_fitted_is_counted_and_gives_no_temperature():
     columns = {
         "temp_motor": [-273.15, 31, 33, -50],
         "temp_fet": [-57] * 4,
@@ -150,7 +150,7 @@ def test_a_sensor_that_is_not_fitted_is_no_temperature_and_counted():
         [1234567891, 1234567891, 1234567891],
     ],
 )
-def test_numbers_at_the_ends_of_their_ranges(column):
+def test_numbers_at_the_ends_of_their_ranges_are_summarized(column):
     second = summarized(SECOND, [batch(every(1, 3), {"a": column})], None)
     assert (second["a_min"], second["a_max"], second["a_last"]) == (min(column), max(column), column[-1])
     assert second["a_min"] <= second["a_mean"] <= second["a_max"]
@@ -191,7 +191,7 @@ def test_speed_needs_the_vehicle_and_power_needs_both_fields():
     assert derive({}, CAR) == {}
 
 
-def test_what_is_derived_is_never_infinite():
+def test_a_derived_value_is_never_infinite():
     columns = {"speed": [1e308], "voltage_input": [1e308], "current_input": [-1e308]}
     assert derive(columns, Vehicle(1e-10)) == {"speed_mps": [None], "power_w": [None]}
 
@@ -207,21 +207,21 @@ def test_what_is_derived_is_never_infinite():
         (0, 1, "aaaaaaaa", 0),
         (0, 2, "aaaaaaaa", 1),
         (7, 70, "aaaaaaaa", 62),
-        # A restart whose spool is durable counts on; one whose spool was lost begins again.
+        # After a restart, numbers continue if the spool survived and start at 0 if it was lost.
         (7, 8, "bbbbbbbb", 0),
         (7, 9, "bbbbbbbb", 1),
         (7, 0, "bbbbbbbb", 0),
         (7, 2, "bbbbbbbb", 2),
-        # A later number at an earlier time, by another clock: what is before this one is still not there.
+        # Another clock gave a later number an earlier time: the numbers before this one are still missing.
         (7, 3, "aaaaaaaa", 3),
         (7, 0, "aaaaaaaa", 0),
     ],
 )
-def test_missing_batches_by_their_numbers(previous, seq, boot, missing):
+def test_missing_batches_are_counted_by_sequence_number(previous, seq, boot, missing):
     near = [] if previous is None else [BatchId(T0, "aaaaaaaa", previous)]
     own = BatchId(T0 + 1, boot, seq)
     assert missing_before(own, near) == missing
-    # What comes later, and the batch itself, change nothing.
+    # Later batches and the batch itself change nothing.
     assert missing_before(own, [*near, own, BatchId(T0 + 2, boot, seq + 1)]) == missing
 
 
@@ -236,27 +236,27 @@ def test_missing_batches_by_their_numbers(previous, seq, boot, missing):
         # The end of the run before.
         ([("aaaaaaaa", 7)], 0, [("aaaaaaaa", 9)], 2),
         ([("aaaaaaaa", 7), ("bbbbbbbb", 4)], 1, [("aaaaaaaa", 9), ("bbbbbbbb", 4)], 3),
-        # Whether a run that is not near is stored cannot be told.
+        # Nearby batches cannot tell whether a distant run is stored.
         ([("aaaaaaaa", 7)], 0, [("dddddddd", 9)], 0),
         ([("cccccccc", 1)], 2, [("aaaaaaaa", 9)], 0),
     ],
 )
-def test_missing_batches_of_a_run_that_names_those_before(near, seq, previous, missing):
+def test_a_run_that_names_the_runs_before_it_tells_their_missing_batches(near, seq, previous, missing):
     ids = [BatchId(T0 + i, *each) for i, each in enumerate(near)]
     ends = [RunEnd(*each) for each in previous]
     assert missing_before(BatchId(T0 + 9, "cccccccc", seq), ids, ends) == missing
 
 
-def test_of_a_run_that_goes_on_in_time_the_end_is_not_missed():
-    """A recording that is played twice: around the second one's first batch is only a part of the first."""
+def test_the_end_of_a_run_that_continues_later_is_not_missing():
+    """A recording is played twice: only part of the first run lies near the second run's first batch."""
     first = [BatchId(T0 + i * S, "aaaaaaaa", i) for i in range(5)]
     again = BatchId(T0 + S, "bbbbbbbb", 0)
     assert missing_before(again, sorted([*first, again]), [RunEnd("aaaaaaaa", 90)]) == 0
 
 
 @given(st.permutations(range(12)), st.sets(st.integers(0, 11), max_size=11))
-def test_whatever_the_clocks_say_each_missing_number_is_told_once(order, lost):
-    """Numbers of one run at times of several clocks: what is stored tells all that is not, but the last."""
+def test_each_missing_number_is_reported_once_with_any_clocks(order, lost):
+    """Numbers of one run with times of several clocks: all missing numbers are found but those at the end."""
     ids = sorted(BatchId(T0 + at * S, "aaaaaaaa", seq) for at, seq in enumerate(order) if seq not in lost)
     told = sum(missing_before(own, ids) for own in ids)
     assert told == max(own.seq for own in ids) + 1 - len(ids)
@@ -264,13 +264,13 @@ def test_whatever_the_clocks_say_each_missing_number_is_told_once(order, lost):
 
 @pytest.mark.parametrize("boots", [("aaaaaaaa", "bbbbbbbb"), ("bbbbbbbb", "aaaaaaaa")])
 @pytest.mark.parametrize("shift_us", [0, 1, 400_000, -400_000])
-def test_a_run_that_lies_over_another_in_time_misses_nothing(boots, shift_us):
-    """A recording that is played twice with its own times: the second run's numbers follow the first's."""
+def test_a_run_that_overlaps_another_in_time_misses_nothing(boots, shift_us):
+    """A recording is played twice with its own times; the second run's numbers continue the first's."""
     first = [BatchId(T0 + i * S, boots[0], i) for i in range(10)]
     second = [BatchId(T0 + i * S + shift_us, boots[1], 10 + i) for i in range(10)]
     ids = sorted([*first, *second])
     assert [missing_before(own, ids) for own in ids] == [
-        # Before the first of all nothing is known but its number.
+        # Before the first batch, only its number is known.
         own.seq if own == ids[0] else 0
         for own in ids
     ]
@@ -291,14 +291,14 @@ def test_a_run_that_lies_over_another_in_time_misses_nothing(boots, shift_us):
         ([20, 50, 20, 5, 35], 0),
     ],
 )
-def test_holes_are_steps_over_three_times_the_usual(steps, holes):
+def test_a_step_over_three_times_the_usual_one_is_a_hole(steps, holes):
     times = [T0]
     for step in steps:
         times.append(times[-1] + step)
     assert count_holes(times) == holes
 
 
-def test_a_hole_between_two_batches_is_seen_from_the_second_after():
+def test_a_hole_between_two_batches_counts_in_the_later_second():
     before = batch(every(20_000, 40, T0 - S), seq=0)
     after = batch(every(20_000, 50), seq=1)
     assert summarized(SECOND, [before, after], None)["gaps"] == 1

@@ -1,4 +1,4 @@
-"""Names and topics: what is built is parsed, and a hostile name is refused at every edge."""
+"""Topics are parsed as they were built; every edge refuses a hostile name."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_record_topic_is_basic_ingest_to_the_record_rule(robot, stream, namespac
 
 
 @pytest.mark.parametrize("name", HOSTILE, ids=ascii)
-def test_hostile_names_are_refused_everywhere(name):
+def test_every_function_refuses_hostile_names(name):
     for refused in (
         lambda: check_robot(name),
         lambda: check_stream(name),
@@ -96,7 +96,7 @@ def test_hostile_names_are_refused_everywhere(name):
 
 
 @given(st.text(st.characters(), max_size=70))
-def test_any_name_is_refused_or_safe(name):
+def test_any_name_is_safe_or_refused(name):
     try:
         check_robot(name)
     except ContractError:
@@ -108,7 +108,7 @@ def test_any_name_is_refused_or_safe(name):
 
 
 @given(st.text(st.characters(), max_size=40) | robots.map("dt/iort/{}/vesc".format))
-def test_any_topic_is_refused_or_built_alike(topic):
+def test_any_topic_is_rebuilt_the_same_or_refused(topic):
     try:
         parsed = parse_topic(topic)
     except ContractError:
@@ -117,6 +117,6 @@ def test_any_topic_is_refused_or_built_alike(topic):
 
 
 @pytest.mark.parametrize("namespace", ["Iort", "1iort", "io-rt", "io_rt", "a" * 17])
-def test_namespace_is_stricter(namespace):
+def test_a_namespace_has_stricter_rules_than_a_name(namespace):
     with pytest.raises(ContractError, match="namespace"):
         check_namespace(namespace)

@@ -53,7 +53,7 @@ UNITS = {"V", "A", "degC", "1", "erpm", "1e-4 Ah", "1e-4 Wh", "counts", "enum", 
 
 
 @pytest.mark.parametrize(("version", "expected"), [(1, ROS1), (2, ROS2)])
-def test_fields_are_those_of_the_message(version, expected):
+def test_the_fields_are_those_of_the_message(version, expected):
     assert {name for name, field in VESC_FIELDS.items() if version in field.ros} == set(expected)
 
 
@@ -62,7 +62,7 @@ def test_ros1_message_has_13_fields():
 
 
 @pytest.mark.parametrize("field", VESC_FIELDS.values(), ids=lambda field: field.name)
-def test_field(field):
+def test_every_field_is_complete_in_the_table(field):
     assert VESC_FIELDS[field.name] is field
     assert encode_batch(Batch(BOOT, 0, [0], {field.name: [0]}))
     assert field.unit in UNITS
@@ -72,7 +72,7 @@ def test_field(field):
     assert field.ros
 
 
-def test_faults_are_the_firmwares_whole_list():
+def test_the_faults_are_the_firmwares_complete_list():
     assert list(FAULTS) == list(range(34))
     assert FAULT_CODES["OVER_TEMP_FET"] == FAULT_CODES["OVER_TEMP_MOTOR"] - 1 == 5
     assert FAULT_CODES["ABS_OVERSPEED"] == 33
@@ -97,5 +97,5 @@ def test_faults_are_the_firmwares_whole_list():
         ("temperature_outside", -60.0, False),
     ],
 )
-def test_a_sensor_that_is_not_fitted(field, value, expected):
+def test_a_sensor_that_is_not_fitted_gives_no_temperature(field, value, expected):
     assert absent(field, value) is expected

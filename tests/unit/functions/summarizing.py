@@ -1,4 +1,4 @@
-"""The telemetry table, its stream and Lambda 2 behind it, in memory; batches to put in."""
+"""The telemetry table, its stream and Lambda 2 in memory, and batches to store."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Stream:
         return process({"Records": records}, self.tables, self.refuse)
 
     def refuse(self, refused):
-        """The queue before the quarantine, which takes all but what ``jammed`` says."""
+        """A fake dead-letter queue that takes every record not in ``jammed``."""
         self.refused += [one for one in refused if one.number not in self.jammed]
         return [one for one in refused if one.number in self.jammed]
 

@@ -1,4 +1,4 @@
-"""Admit: only what the operator opened, once, for whom it was opened; and nothing when in doubt."""
+"""Admit: a name is admitted once, only to the robot for which the operator opened it; errors refuse."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LATER_S = int(time.time()) + 3600
 
 
 def request(robot="car", serial="s1", certificate="new", claim="claim"):
-    """What AWS IoT asks; "Pre-provisioning hook input"."""
+    """The request of AWS IoT; "Pre-provisioning hook input"."""
     return {
         "claimCertificateId": claim,
         "certificateId": certificate,
@@ -98,7 +98,7 @@ def test_an_opened_name_is_admitted_once(robots, capsys):
     ]
 
 
-def test_a_certificate_that_asks_again_is_admitted_also_when_the_time_is_over(robots):
+def test_the_admitted_certificate_is_admitted_again_after_the_time_limit(robots):
     robots.put(until_s=LATER_S, **{ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits"})
     assert robots.ask(request()) is True
     robots.change(ADMIT_UNTIL_S, 1)
@@ -109,7 +109,7 @@ def test_a_certificate_that_asks_again_is_admitted_also_when_the_time_is_over(ro
     assert robots.row()[ADMITTED_CERTIFICATE] == "new"
 
 
-def test_a_claim_is_known_by_its_id_and_by_what_its_certificate_is(robots, caplog):
+def test_a_claim_is_identified_by_its_id_and_its_certificates_fingerprint(robots, caplog):
     caplog.set_level("INFO")
     for claim in ("ab12", "cd34", "CD34", "0xAB12"):
         robots.clear()
@@ -125,7 +125,7 @@ def test_a_claim_is_known_by_its_id_and_by_what_its_certificate_is(robots, caplo
         assert f"for ab12 or cd34, asked with {claim}" in caplog.text
 
 
-def test_it_is_ready_when_lambda_has_imported_it_and_carries_little():
+def test_the_import_creates_the_client_and_loads_few_modules():
     program = (
         "import sys; from functions import admit; "
         "print('boto3' in sys.modules, 's3transfer' in sys.modules, admit._dynamodb.cache_info().currsize)"
@@ -149,7 +149,7 @@ def test_it_is_ready_when_lambda_has_imported_it_and_carries_little():
 REFUSED = [
     (None, {}, "is not registered"),
     ({"until_s": None}, {}, "no certificate may be issued"),
-    # A robot that drives, and whose name was not opened again, keeps it.
+    # A working robot keeps its name until the operator opens the name again.
     ({"until_s": None, SERIAL: "s1", ADMITTED_CERTIFICATE: "old"}, {}, "no certificate may be issued"),
     ({"until_s": 1}, {}, "is over"),
     ({SERIAL: "another"}, {}, "another machine has the name"),
@@ -159,7 +159,7 @@ REFUSED = [
 ]
 
 
-def test_everything_else_is_refused_and_changes_nothing(robots, caplog):
+def test_every_other_request_is_refused_and_changes_nothing(robots, caplog):
     for row, asked, why in REFUSED:
         robots.clear()
         caplog.clear()
@@ -171,7 +171,7 @@ def test_everything_else_is_refused_and_changes_nothing(robots, caplog):
         assert robots.row() == before
 
 
-def test_what_it_was_opened_for_is_admitted(robots):
+def test_a_request_that_meets_the_opened_conditions_is_admitted(robots):
     for row in [{ADMIT_CLAIM: "claim"}, {SERIAL: "s1"}, {SERIAL: "s1", ADMIT_CLAIM: "claim"}]:
         robots.put(**row)
         assert robots.ask(request()) is True
@@ -194,7 +194,7 @@ INCOMPLETE = [
 ]
 
 
-def test_a_request_that_is_not_complete_is_refused(robots, capsys):
+def test_an_incomplete_request_is_refused(robots, capsys):
     robots.put()
     before = robots.row()
     for event in INCOMPLETE:
@@ -203,7 +203,7 @@ def test_a_request_that_is_not_complete_is_refused(robots, capsys):
         assert json.loads(capsys.readouterr().out)["RobotsRefused"] == 1
 
 
-def test_what_cannot_be_decided_is_refused(robots, caplog):
+def test_a_request_is_refused_after_an_error_of_the_table(robots, caplog):
     for code in ["ThrottlingException", "AccessDeniedException", "InternalServerError"]:
         caplog.clear()
         with Stubber(admit._dynamodb()) as stub:
@@ -219,7 +219,7 @@ def test_a_deployment_without_its_table_refuses(robots, monkeypatch):
     assert robots.ask(request()) is False
 
 
-def test_its_slowest_answer_is_in_time(synthesized):
+def test_the_slowest_answer_is_in_time(synthesized):
     (timeout_s,) = (
         function["Timeout"]
         for function in synthesized.resources("AWS::Lambda::Function").values()
@@ -240,7 +240,7 @@ ITS_ROW = {ADMITTED_CERTIFICATE: {"S": "first"}, ADMITTED_MS: {"N": str(NOW_MS)}
     ("status", "connected_ms", "gives_way"),
     [
         ("PENDING_ACTIVATION", None, True),
-        # A robot that drives with an older certificate while it is renewed.
+        # A working robot uses its older certificate while a new one is issued.
         ("PENDING_ACTIVATION", NOW_MS + 1, True),
         ("ACTIVE", None, False),
         ("INACTIVE", None, False),
@@ -251,7 +251,7 @@ ITS_ROW = {ADMITTED_CERTIFICATE: {"S": "first"}, ADMITTED_MS: {"N": str(NOW_MS)}
         (None, NOW_MS + 3_600_000, False),
     ],
 )
-def test_only_a_certificate_that_never_came_through_gives_way(status, connected_ms, gives_way):
+def test_only_a_certificate_that_never_connected_gives_way(status, connected_ms, gives_way):
     row = dict(ITS_ROW)
     if connected_ms is not None:
         row[CONNECTED_MS] = {"N": str(connected_ms)}
@@ -260,7 +260,7 @@ def test_only_a_certificate_that_never_came_through_gives_way(status, connected_
 
 @pytest.fixture
 def iot(monkeypatch):
-    """moto's AWS IoT, of which only the status of certificates is asked: `made` in a status."""
+    """moto's AWS IoT: `made` makes a certificate with a status."""
     import boto3
 
     monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
@@ -275,23 +275,23 @@ def iot(monkeypatch):
 
 
 def spent(robots, certificate, *, ago_ms=admit.SETTLED_MS, **row):
-    """A name that a certificate was admitted to, so long ago."""
+    """A name to which a certificate was admitted some time ago."""
     robots.clear()
     robots.put(**{SERIAL: "s1", ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits", **row})
     assert robots.ask(request(certificate=certificate, claim=row.get(ADMIT_CLAIM, "claim"))) is True
     robots.change(ADMITTED_MS, time.time_ns() // 1_000_000 - ago_ms)
 
 
-def test_a_certificate_that_was_admitted_and_never_registered_gives_way_to_another(robots, iot):
+def test_an_admitted_certificate_that_never_registered_gives_way_to_another(robots, iot):
     first = iot("PENDING_ACTIVATION")
     spent(robots, first)
     assert robots.ask(request(certificate="second")) is True
     assert robots.row()[ADMITTED_CERTIFICATE] == "second"
-    # The first one lost the name with that.
+    # The first certificate has lost the name.
     assert robots.ask(request(certificate=first)) is False
 
 
-def test_one_that_came_through_keeps_the_name(robots, iot, caplog):
+def test_a_registered_certificate_keeps_the_name(robots, iot, caplog):
     spent(robots, iot("ACTIVE"))
     before = robots.row()
     assert robots.ask(request(certificate="second")) is False
@@ -309,27 +309,27 @@ def test_one_that_came_through_keeps_the_name(robots, iot, caplog):
         ({}, (ADMITTED_MS, time.time_ns() // 1_000_000 + 3_600_000)),
     ],
 )
-def test_nobody_else_gets_it_and_aws_iot_is_not_even_asked(robots, iot, monkeypatch, caplog, case):
+def test_a_request_of_another_robot_is_refused_without_asking_aws_iot(robots, iot, monkeypatch, caplog, case):
     asked, change = case
     spent(robots, iot("PENDING_ACTIVATION"))
     if change is not None:
         robots.change(*change)
     before = robots.row()
-    # Whoever asked AWS IoT would have no answer, and fail.
+    # A call to AWS IoT would get no answer and fail.
     monkeypatch.setenv("AWS_ENDPOINT_URL_IOT", "http://127.0.0.1:9")
     assert robots.ask(request(certificate="second", **asked)) is False
     assert "the check failed" not in caplog.text
     assert robots.row() == before
 
 
-def test_where_aws_iot_does_not_answer_nothing_gives_way(robots, iot, monkeypatch, caplog):
+def test_a_certificate_keeps_the_name_while_aws_iot_does_not_answer(robots, iot, monkeypatch, caplog):
     spent(robots, iot("PENDING_ACTIVATION"))
     monkeypatch.setenv("AWS_ENDPOINT_URL_IOT", "http://127.0.0.1:9")
     assert robots.ask(request(certificate="second")) is False
     assert "the check failed" in caplog.text
 
 
-def test_of_two_that_take_over_one_has_it(robots, iot):
+def test_one_of_two_simultaneous_takeovers_succeeds(robots, iot):
     first = iot("PENDING_ACTIVATION")
     spent(robots, first)
     # Both have read the row; the second one's condition is no longer met.
@@ -340,6 +340,6 @@ def test_of_two_that_take_over_one_has_it(robots, iot):
     assert robots.row()[ADMITTED_CERTIFICATE] == "second"
 
 
-def test_a_row_from_before_admissions_were_kept_is_closed(robots):
+def test_a_row_without_recorded_admissions_is_closed(robots):
     robots.put(until_s=None, **{SERIAL: "s1", ADMITTED_CERTIFICATE: "old"})
     assert robots.ask(request()) is False

@@ -1,4 +1,4 @@
-"""Alerts: what a human is told, and how often."""
+"""Alerts: which mails are sent, and how often."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def emitted(capsys):
     return [sum(line.get(name, 0) for line in lines) for name in ("AlertsSent", "AlertsHeld")]
 
 
-def test_a_fault_is_told_with_robot_code_and_time(notices):
+def test_a_mail_names_the_faults_robot_code_and_time(notices):
     mailbox = Mailbox()
     process(event(fault_code=5, voltage_input=12.0), 10.5, notices, mailbox, NOW_S)
     ((subject, text),) = mailbox.mails
@@ -53,20 +53,20 @@ def test_a_fault_is_told_with_robot_code_and_time(notices):
     [
         ({"fault_code": 2, "voltage_input": 9.0}, ["alert_fault_2", "alert_low_voltage"]),
         ({"fault_code": 0, "voltage_input": 9.0}, ["alert_low_voltage"]),
-        # However many codes a car makes up, they are one cause.
+        # All unknown codes are one cause.
         *(({"fault_code": code}, ["alert_fault_unknown"]) for code in (99, 100, 0.5, 1e300, math.inf)),
-        # A controller that does not measure its voltage says 0.
+        # A controller without voltage measurement reports 0.
         ({"fault_code": 0, "voltage_input": 0}, []),
         ({"fault_code": "3", "voltage_input": None}, []),
         ({"fault_code": True}, []),
         ({}, []),
     ],
 )
-def test_causes(sample, keys):
+def test_causes_follow_from_the_sample(sample, keys):
     assert [cause.key for cause in causes(sample, 10.5)] == keys
 
 
-def test_a_fault_that_lasts_is_told_once_in_a_while(notices, capsys):
+def test_a_lasting_fault_is_mailed_once_per_quiet_period(notices, capsys):
     mailbox = Mailbox()
     for tenth in range(50):
         process(event(fault_code=1), 10.5, notices, mailbox, NOW_S + tenth // 10)
@@ -74,20 +74,20 @@ def test_a_fault_that_lasts_is_told_once_in_a_while(notices, capsys):
     assert emitted(capsys) == [1, 49]
     process(event(fault_code=1), 10.5, notices, mailbox, NOW_S + QUIET_S)
     assert len(mailbox.mails) == 2
-    # Another cause and another car are told at once.
+    # Another cause and another car are mailed at once.
     process(event(fault_code=4), 10.5, notices, mailbox, NOW_S + QUIET_S)
     process({**event(fault_code=1), "topic": "live/iort/car8/vesc"}, 10.5, notices, mailbox, NOW_S + QUIET_S)
     assert [subject.split(",")[0] for subject, _ in mailbox.mails[2:]] == ["iort: car7", "iort: car8"]
 
 
-def test_of_two_environments_one_tells(dynamodb, notices):
+def test_only_one_of_two_environments_sends_the_mail(dynamodb, notices):
     mailbox = Mailbox()
     for one in (notices, Notices(dynamodb, NAMES["robots"])):
         process(event(fault_code=1), 10.5, one, mailbox, NOW_S)
     assert len(mailbox.mails) == 1
 
 
-def test_what_could_not_be_sent_is_told_by_the_next(notices):
+def test_a_mail_that_failed_is_sent_by_the_next_event(notices):
     def refused(_subject, _text):
         raise ConnectionError("no SNS")
 
@@ -98,7 +98,7 @@ def test_what_could_not_be_sent_is_told_by_the_next(notices):
     assert len(mailbox.mails) == 1
 
 
-def test_the_registrys_row_is_kept(dynamodb, notices):
+def test_the_other_attributes_of_the_registrys_row_are_kept(dynamodb, notices):
     dynamodb.put_item(TableName=NAMES["robots"], Item={"robot": {"S": "car7"}, "vehicle": {"S": "f1tenth"}})
     process(event(fault_code=1), 10.5, notices, Mailbox(), NOW_S)
     row = dynamodb.get_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})["Item"]
@@ -106,7 +106,7 @@ def test_the_registrys_row_is_kept(dynamodb, notices):
     assert row["alert_fault_1"] == {"N": str(NOW_S)}
 
 
-def test_a_robot_that_was_removed_gets_no_row_by_what_it_still_sends(dynamodb, notices):
+def test_a_removed_robot_that_still_sends_gets_no_row(dynamodb, notices):
     mailbox = Mailbox()
 
     def removed_meanwhile(_subject, _text):
@@ -120,11 +120,11 @@ def test_a_robot_that_was_removed_gets_no_row_by_what_it_still_sends(dynamodb, n
     assert "Item" not in dynamodb.get_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})
 
 
-def test_another_error_of_the_table_is_not_taken_for_a_repetition(aws):
+def test_an_error_of_the_table_is_raised(aws):
     with pytest.raises(boto3.client("dynamodb").exceptions.ResourceNotFoundException):
         process(event(fault_code=1), 10.5, Notices(boto3.client("dynamodb"), "none"), Mailbox(), NOW_S)
 
 
-def test_a_topic_that_is_not_ours_is_refused(notices):
+def test_an_invalid_topic_is_refused(notices):
     with pytest.raises(ContractError):
         process({**event(fault_code=1), "topic": "x"}, 10.5, notices, Mailbox(), NOW_S)

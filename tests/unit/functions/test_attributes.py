@@ -1,4 +1,4 @@
-"""Reading stored attributes, held to boto3's own deserializer where that reads them at all."""
+"""Stored attributes are read as boto3's deserializer reads them, and long numbers that it refuses too."""
 
 from __future__ import annotations
 

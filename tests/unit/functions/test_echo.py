@@ -1,4 +1,4 @@
-"""Echo: the pong has the ping's content, goes to the ping's robot and nowhere else."""
+"""Echo: the pong has the ping's content and goes only to the ping's robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 
 
 def event(robot="car", namespace="iort", ping_id=7, sent_us=1_700_000_000_000_000, padding=""):
-    """What the echo rule makes of a ping."""
+    """The event that the echo rule makes from a ping."""
     ping = encode_ping(ping_id, sent_us, padding)
     return rule_event(ping, build_topic(PING, robot, LAMBDA, namespace), 1_700_000_000_123)
 
@@ -27,7 +27,7 @@ def event(robot="car", namespace="iort", ping_id=7, sent_us=1_700_000_000_000_00
 @given(
     robots, st.from_regex(r"[a-z][a-z0-9]{0,15}", fullmatch=True), st.integers(0, 2**53), st.text(max_size=9)
 )
-def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
+def test_the_pong_has_the_pings_content(robot, namespace, ping_id, padding):
     topic, payload = echo.pong(event(robot, namespace, ping_id, padding=padding))
     assert topic == build_topic(PONG, robot, LAMBDA, namespace)
     assert decode_pong(payload) == (ping_id, 1_700_000_000_000_000, 1_700_000_000_123)
@@ -39,13 +39,13 @@ def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
 @pytest.mark.parametrize(
     "topic", ["ping/iort/car", "ping/iort/ca+r/lambda", "ping/iort/#/lambda", "", None, 7]
 )
-def test_a_topic_that_is_not_ours_is_refused(topic):
+def test_an_invalid_topic_is_refused(topic):
     with pytest.raises(ContractError, match=r"topic|robot"):
         echo.pong({**event(), TOPIC: topic})
 
 
 @pytest.mark.parametrize("message", [b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000])
-def test_what_is_no_ping_fails_and_so_goes_to_the_quarantine(message):
+def test_an_invalid_ping_fails_the_invocation_and_goes_to_the_quarantine(message):
     with pytest.raises(ContractError, match="ping is"):
         echo.handler(rule_event(message, build_topic(PING, "car", LAMBDA), 1), None)
 

@@ -1,4 +1,4 @@
-"""Health: what the batches of a car say about it."""
+"""Health: the metrics that follow from a car's batches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def batch(columns, *, times_us=None):
     return Batch("0" * 8, 0, times_us or [1_000_000 + 20_000 * i for i in range(length)], columns)
 
 
-def test_the_worst_of_a_drive_counts():
+def test_the_worst_values_of_a_drive_are_measured():
     first = batch({"voltage_input": [12.1, 11.9], "temp_fet": [40.0, 41.5], "fault_code": [0, 5]})
     second = batch({"voltage_input": [11.2, 11.6], "temp_fet": [0.0, 39.0], "temp_motor": [55.5, None]})
     measured = measure("vesc", [first, second])
@@ -29,7 +29,7 @@ def test_the_worst_of_a_drive_counts():
     }
 
 
-def test_what_is_not_measured_is_not_counted():
+def test_unmeasured_values_are_not_counted():
     nothing = {"SampleGaps": 0, "FaultSamples": 0, "BatteryVolts": [], "TemperatureDegC": []}
     assert measure("vesc", [batch({"voltage_input": [0.0, None], "temp_fet": [0, 0]})]) == nothing
     cold = {"voltage_input": [0.0], "temp_motor": [-273.15], "temp_fet": [-57]}
@@ -42,7 +42,7 @@ def test_a_hole_is_a_gap():
     assert measure("vesc", [batch({"x": [0.0] * 6}, times_us=times_us)])["SampleGaps"] == 1
 
 
-def test_round_trips_and_the_agents_own():
+def test_round_trips_and_the_agents_own_figures_are_measured():
     rtt = batch({"broker_ms": [12.0, None], "rule_ms": [None, 31.5], "lambda_ms": [None, None]})
     assert measure(RTT_STREAM, [rtt]) == {
         "RoundTripBrokerMs": [12.0],
@@ -54,11 +54,11 @@ def test_round_trips_and_the_agents_own():
 
 
 @pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
-def test_the_names_are_the_contracts(stream):
+def test_the_metric_names_are_the_contracts(stream):
     assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(metrics_of("health"))
 
 
-def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off():
+def test_several_robots_share_one_log_line_without_loss_of_values():
     one = {"SampleGaps": 1, "FaultSamples": 0, "BatteryVolts": [11.2], "TemperatureDegC": []}
     rtt = {"RoundTripBrokerMs": [5.0] * 3}
     (line,) = together([one, {**one, "BatteryVolts": [12.0]}, rtt])
@@ -75,7 +75,7 @@ def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off(
     assert list(together([])) == [{}]
 
 
-def test_hottest_is_the_same_in_the_alarm_and_in_the_watch() -> None:
+def test_the_alarm_and_the_watch_use_the_same_hottest_temperature() -> None:
     for hot in TEMPERATURES:
         sample = {**dict.fromkeys(TEMPERATURES, 20.0), hot: 81.5}
         measured = measure("vesc", [batch({name: [value] for name, value in sample.items()})])

@@ -1,4 +1,4 @@
-"""Lambda 1: the chosen fields go to the car's channel; whatever is wrong is counted and fails nothing."""
+"""Lambda 1: chosen fields go to the car's channel; faults are counted and fail no invocation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SAMPLE = {"speed": 1200, "voltage_input": 15.8, "fault_code": 0}
 
 
 def event(stream="vesc", robot="car", namespace="iort", **changes):
-    """What the live rule makes of a live message."""
+    """The event that the live rule makes from a live message."""
     sample = changes.pop("sample", SAMPLE)
     ours = {name: changes.pop(name) for name in (TOPIC, RECEIVED_MS) if name in changes}
     message = json.loads(encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
@@ -45,7 +45,7 @@ def event(stream="vesc", robot="car", namespace="iort", **changes):
 
 
 class Channels:
-    """Stands for PubNub: what was published, or the error that it answers with."""
+    """A fake PubNub: it records published messages or raises an error."""
 
     def __init__(self, error=None):
         self.sent, self.error = [], error
@@ -56,10 +56,10 @@ class Channels:
         self.sent.append((channel, message))
 
 
-def show(message, publish, *, fields=FIELDS, legs=None, now_us=NOW_US):
-    """What a new environment does with a message: it writes what it counts at once."""
+def show(message, publish, *, fields=FIELDS, estimator=None, now_us=NOW_US):
+    """Process one message in a new environment, which writes its counts at once."""
     lane = Lane(fields, publish, keep=pytest.fail)
-    lane.estimator = legs or lane.estimator
+    lane.estimator = estimator or lane.estimator
     lane.show(message, now_us)
 
 
@@ -82,7 +82,7 @@ def counted(capsys):
     return read
 
 
-def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
+def test_the_chosen_fields_go_to_the_cars_channel_with_the_times_of_all_hops(counted):
     channels = Channels()
     show(event(), channels)
     ((channel, message),) = channels.sent
@@ -97,26 +97,26 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
         "hops": {"sent_us": SENT_US, "received_ms": RECEIVED, "lambda_us": NOW_US},
         "sample": {"speed": 1200, "voltage_input": 15.8},
     }
-    # How long the way was is not known of a car that has not measured its clock's offset.
+    # Without a measured clock offset, the transport time is unknown.
     hops = {"InCarMs": 4, "ToLambdaMs": 5}
     assert counted() == {"LivePublished": 1, **hops}
 
 
-def test_a_stream_that_is_not_configured_sends_every_field():
+def test_an_unconfigured_stream_sends_every_field():
     channels = Channels()
     show(event("imu"), channels)
     assert channels.sent[0][1]["sample"] == SAMPLE
     assert channels.sent[0][1]["stream"] == "imu"
 
 
-def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_there_are_not_made_up():
+def test_a_configured_stream_sends_only_configured_fields_that_exist():
     channels = Channels()
     show(event(), channels, fields={"vesc": []})
     show(event(), channels, fields={"vesc": ["speed", "absent"]})
     assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
 
 
-def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
+def test_a_sensor_that_is_not_fitted_is_null_in_the_live_message():
     channels = Channels()
     sample = {"temp_motor": -273.15, "temp_fet": 31.5, "current_motor": -60}
     for fields in ({}, {"vesc": frozenset({"temp_motor"})}):
@@ -127,13 +127,13 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
     ]
 
 
-def test_another_deployment_has_channels_of_its_own():
+def test_each_deployment_has_its_own_channels():
     channels = Channels()
     show(event(namespace="lab2"), channels)
     assert channels.sent[0][0] == channel_of("car", "lab2")
 
 
-def test_the_robot_is_the_topics_whatever_the_message_claims():
+def test_the_topic_names_the_robot_and_the_message_cannot_change_it():
     channels = Channels()
     show(event(robot="mine", channel="iort.other"), channels)
     assert channels.sent[0][0] == channel_of("mine")
@@ -154,7 +154,7 @@ def test_the_robot_is_the_topics_whatever_the_message_claims():
 )
 # A car whose clock is a day off is as fresh as any other.
 @pytest.mark.parametrize("clock_error_us", [0, 86_400_000_000, -86_400_000_000])
-def test_stale_by_its_time_in_the_car_and_in_the_cloud(
+def test_a_message_is_stale_after_too_long_in_the_car_and_the_cloud(
     in_car_ms, in_cloud_ms, stale, clock_error_us, counted
 ):
     sent_us = SENT_US + clock_error_us
@@ -168,7 +168,7 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     totals = counted()
     assert totals.get("LiveStale", 0) == stale
     assert totals.get("LivePublished", 0) == (not stale)
-    # A clock that is off says nothing of how long the way was, and rings no alarm.
+    # A wrong clock gives no transport time and sets off no alarm.
     assert "CarToLambdaMs" not in totals
 
 
@@ -181,7 +181,7 @@ def handed(message):
 
 
 def saying(**changes):
-    """An event whose message says something else; nothing where that is `...`."""
+    """An event whose message has these keys changed; `...` removes a key."""
     said = {**json.loads(MESSAGE), **changes}
     return handed(json.dumps({name: value for name, value in said.items() if value is not ...}).encode())
 
@@ -247,7 +247,7 @@ json_values = st.recursive(
     st.dictionaries(st.sampled_from(sorted(json.loads(MESSAGE))), json_values),
     json_values,
 )
-def test_nothing_in_an_event_raises_anything_else(changes, said, anything):
+def test_any_event_is_shown_or_refused(changes, said, anything):
     channels = Channels()
     for one in ({**event(), **changes}, saying(**said), anything):
         with contextlib.suppress(RefusedError):
@@ -257,7 +257,7 @@ def test_nothing_in_an_event_raises_anything_else(changes, said, anything):
         json.dumps(message, allow_nan=False)
 
 
-def test_what_pubnub_does_not_take_is_counted_and_not_raised(counted, caplog):
+def test_an_error_of_pubnub_is_counted_and_not_raised(counted, caplog):
     show(event(), Channels(PublishError("status 403")))
     assert counted() == {"PubNubFailed": 1}
     assert "car: status 403" in caplog.text
@@ -267,7 +267,7 @@ ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
 
 
 class Queue:
-    """Stands for the queue before the quarantine: what it took, or that it takes nothing."""
+    """A fake dead-letter queue: it keeps messages or takes no message."""
 
     def __init__(self, *, takes=True):
         self.kept, self.takes = [], takes
@@ -279,7 +279,7 @@ class Queue:
 
 
 class Served:
-    """One environment of the function, and what it did with each event."""
+    """One environment of the function, with its results."""
 
     def __init__(self, *, takes=True):
         self.channels, self.queue, self.now_us = Channels(), Queue(takes=takes), NOW_US
@@ -290,7 +290,7 @@ class Served:
 
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
-def test_what_is_refused_goes_to_the_queue_and_fails_no_invocation(malformed, counted):
+def test_a_refused_message_goes_to_the_dead_letter_queue_and_the_invocation_succeeds(malformed, counted):
     served = Served()
     served(malformed)
     (entry,) = entries(served.queue.kept[0], lambda _info: [])
@@ -302,16 +302,16 @@ def test_what_is_refused_goes_to_the_queue_and_fails_no_invocation(malformed, co
     assert counted() == {"LiveRefused": 1}
 
 
-def test_what_the_queue_does_not_take_fails_the_invocation_so_that_lambda_sends_it_there():
+def test_the_invocation_fails_if_the_queue_does_not_take_a_refused_message():
     with pytest.raises(RefusedError, match="not JSON"):
         Served(takes=False)(handed(b"not JSON"))
 
 
-def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counted):
+def test_a_robot_with_too_many_refusals_is_cut_off_and_others_are_not(counted):
     served = Served()
     for _ in range(REFUSALS + 30):
         served({**handed(b"x"), TOPIC: build_topic(LIVE, "bad", "vesc")})
-    # Its good ones are not looked at either, and every other robot's are.
+    # The bad robot's valid messages are dropped too; all other robots' are processed.
     served(event(robot="bad"))
     for i in range(40):
         served(event(robot=f"good{i}"))
@@ -322,7 +322,7 @@ def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counte
     ]
     assert [message["robot"] for _, message in served.channels.sent] == [f"good{i}" for i in range(40)]
     served.now_us += 11_000_000
-    # And once it is mended it is seen again.
+    # Once it sends valid messages again, they are shown.
     mended = event(robot="bad", t=served.now_us, sent_us=served.now_us)
     served({**mended, RECEIVED_MS: served.now_us // 1000})
     assert served.channels.sent[-1][1]["robot"] == "bad"
@@ -337,7 +337,7 @@ def test_a_robot_that_is_refused_once_a_second_is_never_cut_off(counted):
         served.now_us = NOW_US + second * 1_000_000
         served(handed(b"x"))
     assert len(served.queue.kept) == 100
-    # A clock that is set back gives nothing twice.
+    # A clock that is set back refills the rate limiter only once.
     served.now_us = NOW_US
     for _ in range(REFUSALS + 1):
         served(handed(b"x"))
@@ -348,7 +348,7 @@ class Context:
     invoked_function_arn = ARN
 
 
-def test_the_handler_has_fields_publisher_and_queue_of_its_environment(aws, monkeypatch, counted):
+def test_the_handler_takes_fields_publisher_and_queue_from_its_environment(aws, monkeypatch, counted):
     parameter = pubnub_parameter("lab2")
     boto3.client("ssm").put_parameter(Name=parameter, Type="SecureString", Value=json.dumps(KEYS))
     queue = boto3.client("sqs").create_queue(QueueName="rejected")["QueueUrl"]
@@ -385,7 +385,7 @@ def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
     assert config.connect_timeout == config.non_subscribe_request_timeout == 1
 
 
-def test_a_message_too_large_is_refused_before_it_is_sent():
+def test_a_message_over_the_size_limit_is_refused_before_sending():
     publisher = PubNubPublisher(**KEYS)
     with pytest.raises(PublishError, match=r"at most 32768 bytes after URL encoding, got \d+"):
         publisher.publish("iort.car", {"text": "x" * MAX_PUBNUB_BYTES})
@@ -394,7 +394,7 @@ def test_a_message_too_large_is_refused_before_it_is_sent():
         publisher.publish("iort.car", {"text": '"' * (MAX_PUBNUB_BYTES // 6)})
 
 
-def test_whatever_the_sdk_raises_is_a_publish_error_without_keys(monkeypatch):
+def test_any_error_of_the_sdk_becomes_a_publish_error_without_keys(monkeypatch):
     publisher = PubNubPublisher(**KEYS)
 
     def broken(*_arguments):
@@ -407,27 +407,27 @@ def test_whatever_the_sdk_raises_is_a_publish_error_without_keys(monkeypatch):
     assert "ValueError" in str(caught.value)
 
 
-def test_the_loggers_that_would_show_the_keys_are_quiet():
+def test_the_loggers_that_could_show_the_keys_are_silenced():
     for name in ("httpx", "httpcore", "pubnub"):
         assert not logging.getLogger(name).isEnabledFor(logging.INFO)
 
 
-def late(sent_us, received_ms, legs, channels, robot="car"):
-    """A live message that was received at once by Lambda, however long it took to get there."""
+def late(sent_us, received_ms, estimator, channels, robot="car"):
+    """Process a live message at the time at which the rule received it."""
     message = {**event(robot=robot, t=sent_us, sent_us=sent_us), "received_ms": received_ms}
-    show(message, channels, legs=legs, now_us=received_ms * 1000)
+    show(message, channels, estimator=estimator, now_us=received_ms * 1000)
 
 
 @pytest.mark.parametrize("offset_us", [0, 3_600_000_000, -3_600_000_000])
-def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys, offset_us):
-    channels, legs = Channels(), DelayEstimator()
+def test_messages_delayed_by_a_stall_are_stale_with_any_car_clock(capsys, offset_us):
+    channels, estimator = Channels(), DelayEstimator()
     start_us = NOW_US
     for i in range(20):
-        late(start_us + i * 100_000 + offset_us, (start_us + i * 100_000) // 1000 + 30, legs, channels)
+        late(start_us + i * 100_000 + offset_us, (start_us + i * 100_000) // 1000 + 30, estimator, channels)
     assert len(channels.sent) == 20
     # Six seconds of messages come all at once.
     for i in range(20, 80):
-        late(start_us + i * 100_000 + offset_us, (start_us + 80 * 100_000) // 1000 + 30, legs, channels)
+        late(start_us + i * 100_000 + offset_us, (start_us + 80 * 100_000) // 1000 + 30, estimator, channels)
     assert len(channels.sent) == 20 + 20
     assert capsys.readouterr().out.count('LiveStale":1') == 40
 
@@ -436,7 +436,7 @@ def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys,
 @pytest.mark.parametrize(
     ("leg_ms", "stale"), [(0, False), (LIVE_MAX_AGE_MS, False), (LIVE_MAX_AGE_MS + 1, True), (60_000, True)]
 )
-def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_without_history(
+def test_a_new_environment_uses_the_clock_offset_that_the_car_measured(
     leg_ms, stale, clock_error_us, counted
 ):
     received_ms = SENT_US // 1000 + leg_ms
@@ -447,42 +447,42 @@ def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_wi
     assert len(channels.sent) == (not stale)
     totals = counted()
     assert (totals.get("LiveStale", 0), totals.get("LivePublished", 0)) == (stale, not stale)
-    # The stale ones too: they are what its alarm waits for.
+    # Stale ones count too: the alarm watches them.
     assert totals.get("CarToLambdaMs", 0) == leg_ms
     if not stale:
         assert channels.sent[0][1]["hops"]["offset_us"] == -clock_error_us
 
 
-def test_clock_set_back_is_believed_after_the_window():
-    legs = DelayEstimator()
-    assert legs.excess_us("car", "0badcafe", 0, 0) == 0
-    assert legs.excess_us("car", "0badcafe", -5_000_000, 100) == 5_100_000
+def test_a_clock_that_was_set_back_is_trusted_after_the_window():
+    estimator = DelayEstimator()
+    assert estimator.excess_us("car", "0badcafe", 0, 0) == 0
+    assert estimator.excess_us("car", "0badcafe", -5_000_000, 100) == 5_100_000
     for second in range(1, 40):
-        excess = legs.excess_us("car", "0badcafe", second * 1_000_000 - 5_000_000, second * 1000)
+        excess = estimator.excess_us("car", "0badcafe", second * 1_000_000 - 5_000_000, second * 1000)
     assert excess == 0
 
 
-def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys):
-    """The name of a run stands in what robots send each other."""
-    channels, legs = Channels(), DelayEstimator()
-    late(NOW_US, NOW_US // 1000 + 30, legs, channels)
-    late(NOW_US + 3_600_000_000, NOW_US // 1000 + 40, legs, channels, robot="thief")
-    late(NOW_US + 100_000, NOW_US // 1000 + 130, legs, channels)
+def test_a_robot_that_copies_anothers_run_name_does_not_make_the_others_messages_late(capsys):
+    """A run's name is no secret: robots send it in their messages."""
+    channels, estimator = Channels(), DelayEstimator()
+    late(NOW_US, NOW_US // 1000 + 30, estimator, channels)
+    late(NOW_US + 3_600_000_000, NOW_US // 1000 + 40, estimator, channels, robot="thief")
+    late(NOW_US + 100_000, NOW_US // 1000 + 130, estimator, channels)
     assert [channel for channel, _ in channels.sent] == ["iort.car", "iort.thief", "iort.car"]
     assert "LiveStale" not in capsys.readouterr().out
 
 
-def test_another_run_of_a_robot_is_measured_by_itself():
-    legs = DelayEstimator()
-    assert legs.excess_us("car", "0badcafe", 3_600_000_000, 0) == 0
-    assert legs.excess_us("car", "cafebabe", 0, 0) == 0
-    assert legs.excess_us("car", "cafebabe", 0, 70) == 70_000
+def test_each_run_of_a_robot_is_measured_separately():
+    estimator = DelayEstimator()
+    assert estimator.excess_us("car", "0badcafe", 3_600_000_000, 0) == 0
+    assert estimator.excess_us("car", "cafebabe", 0, 0) == 0
+    assert estimator.excess_us("car", "cafebabe", 0, 70) == 70_000
 
 
-def test_legs_remember_a_bounded_number_of_robots_and_one_run_of_each():
-    legs = DelayEstimator()
+def test_the_delay_estimator_remembers_a_bounded_number_of_robots_and_one_run_of_each():
+    estimator = DelayEstimator()
     for i in range(3000):
-        legs.excess_us(f"car{i}", "0badcafe", 0, 0)
-        legs.excess_us("hostile", f"{i:08x}", 0, 0)
-    assert len(legs._runs) == 1000
-    assert "car2999" in legs._runs
+        estimator.excess_us(f"car{i}", "0badcafe", 0, 0)
+        estimator.excess_us("hostile", f"{i:08x}", 0, 0)
+    assert len(estimator._runs) == 1000
+    assert "car2999" in estimator._runs

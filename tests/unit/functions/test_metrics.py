@@ -1,4 +1,4 @@
-"""Metrics: a line of the embedded metric format, of names that the contract knows."""
+"""Metrics: lines of the embedded metric format with the contract's names only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         before_ms = time.time_ns() // 1_000_000
         emit(function, **dict.fromkeys(names, 2.5))
         line = json.loads(capsys.readouterr().out)
-        # CloudWatch, "Specification: Embedded metric format": what each of these must be.
+        # The types required by CloudWatch's "Specification: Embedded metric format".
         metadata = line["_aws"]
         assert before_ms <= metadata["Timestamp"] <= before_ms + 60_000
         assert isinstance(metadata["Timestamp"], int)
@@ -38,8 +38,8 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
             assert line[metric["Name"]] == 2.5
 
 
-def test_a_truth_value_is_written_as_a_number(capsys):
-    """CloudWatch takes numbers; JSON's true is none."""
+def test_a_bool_is_written_as_a_number(capsys):
+    """CloudWatch takes only numbers; JSON's true is not a number."""
     emit("admit", RobotsAdmitted=True, RobotsRefused=False)
     line = json.loads(capsys.readouterr().out)
     assert type(line["RobotsAdmitted"]) is int
@@ -47,7 +47,7 @@ def test_a_truth_value_is_written_as_a_number(capsys):
     assert "RobotsRefused" not in line
 
 
-def test_a_list_is_values_and_a_robot_a_metric_of_its_own(capsys):
+def test_a_list_gives_several_values_and_a_robot_its_own_metric(capsys):
     emit("health", robot="car7", BatteryVolts=[11.5, 11.25], TemperatureDegC=[])
     line = json.loads(capsys.readouterr().out)
     (directive,) = line["_aws"]["CloudWatchMetrics"]
@@ -59,7 +59,7 @@ def test_a_list_is_values_and_a_robot_a_metric_of_its_own(capsys):
     assert json.loads(capsys.readouterr().out)["BatteryVolts"] == [float(i) for i in range(50, 150)]
 
 
-def test_a_value_that_cloudwatch_would_reject_leaves_the_others_readable(capsys):
+def test_a_value_out_of_cloudwatchs_range_is_clamped(capsys):
     emit("health", BatteryVolts=[11.5, 1e308, -1e308], TemperatureDegC=1e200)
     line = json.loads(capsys.readouterr().out)
     # "MetricDatum": "Values must be in the range of -2^360 to 2^360."
@@ -67,7 +67,7 @@ def test_a_value_that_cloudwatch_would_reject_leaves_the_others_readable(capsys)
     assert line["TemperatureDegC"] == 2.0**360
 
 
-def test_a_zero_is_not_written_and_a_line_of_zeros_neither(capsys):
+def test_zeros_and_lines_of_zeros_are_not_written(capsys):
     emit("live", LivePublished=1, LiveStale=0)
     line = json.loads(capsys.readouterr().out)
     assert [metric["Name"] for metric in line["_aws"]["CloudWatchMetrics"][0]["Metrics"]] == ["LivePublished"]
@@ -77,7 +77,7 @@ def test_a_zero_is_not_written_and_a_line_of_zeros_neither(capsys):
 
 
 @pytest.mark.parametrize("value", [0, 1])
-def test_an_unknown_name_is_refused_even_when_it_is_zero(value, capsys):
+def test_an_unknown_name_is_refused_even_with_value_zero(value, capsys):
     with pytest.raises(KeyError, match="LiveLost"):
         emit("live", LivePublished=1, LiveLost=value)
     with pytest.raises(KeyError, match="nothing"):
@@ -86,7 +86,7 @@ def test_an_unknown_name_is_refused_even_when_it_is_zero(value, capsys):
 
 
 class Lines:
-    """What would have been written: the time and the values of each line."""
+    """A fake writer: it records the time and the values of each line."""
 
     def __init__(self):
         self.written = []
@@ -96,7 +96,7 @@ class Lines:
         self.written.append((at_s, values))
 
 
-def test_what_is_counted_first_is_written_at_once_and_then_once_in_ten_seconds():
+def test_the_first_count_is_written_at_once_and_later_ones_every_ten_seconds():
     lines = Lines()
     gathered = Gathered("live", lines)
     for i in range(26):
@@ -108,7 +108,7 @@ def test_what_is_counted_first_is_written_at_once_and_then_once_in_ten_seconds()
     assert third["LivePublished"] == 10
 
 
-def test_no_value_is_lost_and_no_line_has_more_than_cloudwatch_takes():
+def test_every_value_is_written_in_lines_of_at_most_100_values():
     lines = Lines()
     gathered = Gathered("live", lines)
     delays = [round(1 + i / 7, 2) for i in range(5000)]
@@ -123,7 +123,7 @@ def test_no_value_is_lost_and_no_line_has_more_than_cloudwatch_takes():
     assert not any("UplinkMs" in each for each in values), "a zero is a value that nobody knows"
 
 
-def test_what_is_left_when_calls_pause_is_of_its_own_minute():
+def test_counts_before_a_pause_are_written_with_their_own_time():
     lines = Lines()
     gathered = Gathered("live", lines)
     for at_s in (1000, 1001, 1002, 1400):
@@ -135,7 +135,7 @@ def test_what_is_left_when_calls_pause_is_of_its_own_minute():
     ]
 
 
-def test_a_clock_set_back_holds_nothing_back_for_long():
+def test_a_clock_that_was_set_back_does_not_delay_lines_for_long():
     lines = Lines()
     gathered = Gathered("live", lines)
     gathered.add(1000, InCarMs=1)
@@ -144,7 +144,7 @@ def test_a_clock_set_back_holds_nothing_back_for_long():
     assert len(lines.written) == 2
 
 
-def test_what_is_gathered_is_a_line_of_its_time(capsys):
+def test_a_gathered_line_has_its_own_timestamp(capsys):
     gathered = Gathered("live")
     for at_s in (1000.0, 1004.0, 1011.0):
         gathered.add(at_s, LivePublished=1, InCarMs=1.2345)

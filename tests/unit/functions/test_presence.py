@@ -1,4 +1,4 @@
-"""Presence: the row is right whatever the order in which the broker's events come, and however often."""
+"""Presence: the row is right with the broker's events in any order and any repetition."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def disconnected(version=0, at_ms=T0, reason="CONNECTION_LOST", client="car"):
 
 @pytest.fixture
 def table(dynamodb, monkeypatch):
-    """moto's robots table with one robot; called with events, it gives the row that they make."""
+    """moto's robots table with one robot; a call with events returns the resulting row."""
     monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
     monkeypatch.setenv("NAMESPACE", "iort")
 
@@ -61,7 +61,7 @@ def table(dynamodb, monkeypatch):
     return row_after
 
 
-def test_a_connection_and_its_end(table):
+def test_a_connection_and_its_end_are_recorded(table):
     assert table(connected()) == {
         "robot": "car",
         "online": True,
@@ -95,7 +95,7 @@ STORIES = {
 }
 
 
-def test_any_order_and_any_repetition_end_alike(table):
+def test_events_in_any_order_and_repetition_give_the_same_row(table):
     for events in STORIES.values():
         _any_order(table, events)
 
@@ -112,7 +112,7 @@ def _any_order(table, events):
             assert "disconnect_reason" not in row
 
 
-def test_numbers_that_start_again_after_an_hour_are_newer(table):
+def test_versions_that_restart_after_an_hour_are_newer(table):
     away = disconnected(9, T0)
     back = connected(0, T0 + 61 * MINUTE_MS)
     for order in itertools.permutations([connected(9, T0 - MINUTE_MS), away, back]):
@@ -120,19 +120,19 @@ def test_numbers_that_start_again_after_an_hour_are_newer(table):
         assert (row["online"], row["session_version"]) == (True, 0), order
 
 
-def test_a_connection_of_hours_ends(table):
+def test_a_connection_of_several_hours_ends(table):
     assert table(connected(2), disconnected(2, T0 + 300 * MINUTE_MS))["online"] is False
-    # And a copy of its beginning, hours late, does not bring it back.
+    # A copy of the connect event that comes hours late does not set the robot online again.
     assert table(connected(2), disconnected(2, T0 + 300 * MINUTE_MS), connected(2))["online"] is False
 
 
-def test_the_agents_version(table, capsys):
+def test_the_agents_version_is_recorded(table, capsys):
     assert table({"robot": "car", "agent_version": "0.1.0"}) == {"robot": "car", "agent_version": "0.1.0"}
     row = table({"robot": "car", "agent_version": "0.1.0"}, connected())
     assert (row["agent_version"], row["online"]) == ("0.1.0", True)
 
 
-def test_a_client_without_a_row_makes_none(table, dynamodb, capsys):
+def test_a_client_without_a_row_gets_no_row(table, dynamodb, capsys):
     for event in (
         connected(client="iort-claim-1"),
         disconnected(client="x"),
@@ -163,7 +163,7 @@ NO_EVENTS = [
 ]
 
 
-def test_what_is_no_event_of_ours_changes_nothing(table, capsys):
+def test_a_foreign_event_changes_nothing(table, capsys):
     for event in NO_EVENTS:
         _changes_nothing(table, event, capsys)
 
@@ -175,18 +175,18 @@ def _changes_nothing(table, event, capsys):
     assert json.loads(capsys.readouterr().out)["PresenceIgnored"] == 1
 
 
-def test_what_dynamodb_refuses_is_tried_again_by_lambda(table, monkeypatch):
+def test_an_error_of_dynamodb_is_raised_so_that_lambda_retries(table, monkeypatch):
     monkeypatch.setenv("ROBOTS_TABLE", "gone")
     with pytest.raises(boto3.client("dynamodb").exceptions.ResourceNotFoundException):
         presence.handler(connected(), None)
 
 
-def test_counts(table, capsys):
+def test_connections_disconnections_and_ignored_events_are_counted(table, capsys):
     table(connected(), disconnected(), disconnected())
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     counted = [{name: line[name] for name in metrics_of("presence") if name in line} for line in lines]
     assert counted == [{"RobotsConnected": 1}, {"RobotsDisconnected": 1}, {"PresenceIgnored": 1}]
 
 
-def test_times_are_whole_numbers(table):
+def test_times_are_stored_as_integers(table):
     assert table(connected())["last_seen_ms"] == Decimal(T0)

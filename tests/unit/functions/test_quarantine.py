@@ -1,4 +1,4 @@
-"""Whatever comes out of the rejected queue is kept with its bytes, once, whoever refused it and however."""
+"""The quarantine keeps every message of the rejected queue once, with its bytes, from any sender."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def none(_info):
 # --- what a message of the queue holds --------------------------------------------------------------
 
 
-def test_a_rules_error_document():
+def test_a_rules_error_document_is_kept():
     (entry,) = entries(rule_error(), none)
     assert (entry.source, entry.topic, entry.robot) == (f"{BY_RULE} iort_record", TOPIC_OF_CAR, "car")
     assert entry.payload == RAW
     assert "DynamoDBv2Action: The provided key element" in entry.reason
 
 
-def test_a_record_that_lambda_2_refused():
+def test_a_record_that_lambda_2_refused_is_kept():
     odd = {**image(7), "boot": {"S": "\x00\udfff and \ufffe, which SQS does not carry"}}
     body = message(Refused("5", "schema version 9", odd))
     body.encode("ascii")
@@ -97,20 +97,20 @@ def test_a_record_that_lambda_2_refused():
     assert json.loads(entry.payload.decode("utf-8", "surrogatepass")) == odd
 
 
-def test_a_batch_of_the_stream_that_was_given_up():
+def test_records_that_exhausted_the_streams_retries_are_kept():
     found = entries(failed_batch(), records)
     assert [json.loads(entry.payload) for entry in found] == [image(2), image(3)]
     assert {(entry.source, entry.robot) for entry in found} == {(BY_STREAM, "car")}
     assert all("RetryAttemptsExhausted" in entry.reason for entry in found)
 
 
-def test_a_batch_whose_records_have_left_the_stream_is_kept_as_far_as_it_is_known():
+def test_a_stream_batch_with_expired_records_is_kept_by_its_position():
     (entry,) = entries(failed_batch(), none)
     assert json.loads(entry.payload)["DDBStreamBatchInfo"] == INFO
     assert "left the stream" in entry.reason
 
 
-def test_an_asynchronous_invocation_that_failed():
+def test_a_failed_asynchronous_invocation_is_kept():
     event = {"topic": build_topic("live", "car", "vesc"), "v": 9}
     (entry,) = entries(invocation(event), none)
     assert entry.source == f"{BY_FUNCTION} iort-processing-Live-1"
@@ -118,13 +118,13 @@ def test_an_asynchronous_invocation_that_failed():
     assert entry.reason == "RetriesExhausted: boom"
 
 
-def test_basic_ingests_prefix_is_no_part_of_the_topic_whether_or_not_it_is_told():
-    """AWS' documentation of the error document does not say."""
+def test_basic_ingests_prefix_is_removed_from_the_topic():
+    """AWS' documentation does not say whether the error document has the prefix."""
     (told,) = entries(rule_error(topic=f"$aws/rules/iort_record/{TOPIC_OF_CAR}"), none)
     (not_told,) = entries(rule_error(), none)
     assert told == not_told
     assert (told.topic, told.robot, told.id) == (TOPIC_OF_CAR, "car", not_told.id)
-    # Of another rule it is no prefix, and only the first one is taken away.
+    # Another rule's prefix stays, and only the first prefix is removed.
     for odd in ("$aws/rules/iort_live/", "$aws/rules/iort_record/$aws/rules/iort_record/"):
         (entry,) = entries(rule_error(topic=odd + TOPIC_OF_CAR), none)
         assert entry.robot == NO_ROBOT
@@ -133,12 +133,12 @@ def test_basic_ingests_prefix_is_no_part_of_the_topic_whether_or_not_it_is_told(
 @pytest.mark.parametrize(
     "topic", ["", "dt", "dt/iort", "dt/iort//vesc", "$aws/events/presence/connected/car", "other/iort/car/a"]
 )
-def test_a_topic_that_names_no_robot(topic):
+def test_a_message_with_a_topic_without_a_robot_is_kept(topic):
     (entry,) = entries(rule_error(topic=topic), none)
     assert (entry.robot, entry.topic, entry.payload) == (NO_ROBOT, topic, RAW)
 
 
-def test_a_robot_is_named_by_a_topic_that_is_otherwise_wrong():
+def test_an_otherwise_invalid_topic_still_names_the_robot():
     for topic in ("dt/iort/car/a/b", "dt/iort/c r/vesc", "dt/iort/car"):
         (entry,) = entries(rule_error(topic=topic), none)
         assert entry.robot == topic.split("/")[2]
@@ -170,7 +170,7 @@ documents = st.recursive(
 
 
 @given(documents.map(json.dumps) | st.text())
-def test_whatever_else_is_in_the_queue_is_kept_as_it_is(body):
+def test_any_other_message_of_the_queue_is_kept_as_it_is(body):
     found = entries(body, none)
     assert found
     for entry in found:
@@ -180,7 +180,7 @@ def test_whatever_else_is_in_the_queue_is_kept_as_it_is(body):
         assert [entry.payload for entry in found] == [body.encode("utf-8", "surrogatepass")]
 
 
-def test_the_same_message_is_the_same_entry_and_another_is_not():
+def test_equal_messages_share_one_entry_and_different_ones_do_not():
     ids = {
         Entry(source, topic, reason, payload).id
         for source in ("rule a", "rule b")
@@ -221,7 +221,7 @@ def test_every_kind_is_kept_with_its_bytes_and_counted(dynamodb, store, capsys):
     assert json.loads(capsys.readouterr().out)["Quarantined"] == 5
 
 
-def test_a_message_that_comes_again_is_one_entry_that_says_how_often(dynamodb, store):
+def test_a_repeated_message_is_one_entry_with_a_count(dynamodb, store):
     process(sqs_event(rule_error()), store, none)
     process(sqs_event(rule_error(cloudwatchTraceId="another"), sent_ms=1_700_000_900_000), store, none)
     (item,) = kept(dynamodb)
@@ -231,7 +231,7 @@ def test_a_message_that_comes_again_is_one_entry_that_says_how_often(dynamodb, s
 
 
 class Broken:
-    """A table that takes everything but the second item."""
+    """A table that refuses the second item."""
 
     def __init__(self, error):
         self.calls, self.error = 0, error
@@ -248,7 +248,7 @@ THROTTLED = {"Error": {"Code": "ProvisionedThroughputExceededException", "Messag
 @pytest.mark.parametrize(
     "error", [ClientError(THROTTLED, "UpdateItem"), RuntimeError("nobody thought of it")]
 )
-def test_only_the_message_that_was_not_kept_comes_again(error):
+def test_only_the_message_that_was_not_kept_is_returned_to_the_queue(error):
     event, table = sqs_event(rule_error(b"1"), rule_error(b"2"), rule_error(b"3")), Broken(error)
     answer = process(event, Store(table, table=QUARANTINE, retention_s=1), none)
     assert answer == {"batchItemFailures": [{"itemIdentifier": "m1"}]}
@@ -267,7 +267,7 @@ def test_only_the_message_that_was_not_kept_comes_again(error):
     ],
     ids=["reason", "robot", "topic", "nested"],
 )
-def test_what_no_table_or_reader_takes_is_kept_and_its_neighbours_are(odd, dynamodb, store):
+def test_an_unreadable_message_is_kept_and_so_are_its_neighbours(odd, dynamodb, store):
     assert process(sqs_event(rule_error(), odd, failed_batch()), store, records) == {"batchItemFailures": []}
     assert len(kept(dynamodb)) == 4
 
@@ -276,7 +276,7 @@ def test_what_no_table_or_reader_takes_is_kept_and_its_neighbours_are(odd, dynam
 
 
 class FakeStreams:
-    """A record a call, as AWS' pages, behind so many empty ones; the second and third are wanted."""
+    """A stream with one record a page, after some empty pages; the second and third are wanted."""
 
     class exceptions:
         class TrimmedDataAccessException(Exception):
@@ -307,18 +307,18 @@ class FakeStreams:
 
 
 @pytest.mark.parametrize("empty", [0, 1, 20])
-def test_the_records_of_a_failed_batch_are_read_page_by_page_behind_empty_ones(empty):
+def test_the_records_of_a_failed_batch_are_read_after_empty_pages(empty):
     found = Stream(FakeStreams(empty=empty)).records(INFO)
     assert [record["dynamodb"]["SequenceNumber"] for record in found] == ["2", "3"]
 
 
-def test_a_part_of_a_batch_is_not_taken_for_all_of_it(dynamodb, store):
+def test_a_batch_that_is_read_only_in_part_stays_in_the_queue(dynamodb, store):
     answer = process(sqs_event(failed_batch()), store, Stream(FakeStreams(ends_at=3)).records)
     assert answer == {"batchItemFailures": [{"itemIdentifier": "m0"}]}
     assert kept(dynamodb) == []
 
 
-def test_what_is_larger_than_an_item_is_kept_as_far_as_it_fits(dynamodb, store):
+def test_a_message_larger_than_an_item_is_cut(dynamodb, store):
     big = {**image(7), "x": {"L": [{"N": "1"}] * 60_000}}
     body = message(Refused("5", "no batch", big))
     assert process(sqs_event(body), store, none) == {"batchItemFailures": []}
@@ -328,7 +328,7 @@ def test_what_is_larger_than_an_item_is_kept_as_far_as_it_fits(dynamodb, store):
     assert item["reason"]["S"].endswith("no batch")
 
 
-def test_records_that_have_left_the_stream_are_none():
+def test_expired_records_read_as_an_empty_list():
     assert Stream(FakeStreams(trimmed=True)).records(INFO) == []
 
 
@@ -351,7 +351,7 @@ class FakeQueue:
         return {"Failed": [{"Id": entry["Id"], "Code": "InternalError"} for entry in refused]}
 
 
-def test_what_is_refused_is_sent_as_much_at_a_time_as_a_call_may_carry():
+def test_refused_records_are_sent_in_calls_within_the_limits_of_sqs():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(23)]
     queue = FakeQueue()
     assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == []
@@ -363,20 +363,20 @@ def test_what_is_refused_is_sent_as_much_at_a_time_as_a_call_may_carry():
     assert DeadLetterQueue(queue, queue_url="queue").refuse([]) == []
 
 
-def test_what_a_throttled_queue_does_not_take_comes_back():
+def test_records_that_a_throttled_queue_does_not_take_are_returned():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(12)]
     assert DeadLetterQueue(FakeQueue(throttled=True), queue_url="queue").refuse(refused) == refused
 
 
-def test_what_the_queue_does_not_take_comes_back():
+def test_records_that_the_queue_does_not_take_are_returned():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(3)]
     queue = FakeQueue(refuses={"reason 1"})
     assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == [refused[1]]
     assert [json.loads(body)["reason"] for body in queue.bodies] == ["reason 0", "reason 2"]
 
 
-def test_a_record_too_large_for_any_queue_is_told_by_its_key():
-    # "1e125" on the wire, and there may be ten thousand of them in a message.
+def test_a_record_too_large_for_a_queue_is_sent_as_its_key():
+    # "1e125" on the wire; a message may hold ten thousand of them.
     numbers = {f"a{i}": {"N": "1" + "0" * 125} for i in range(8_000)}
     refused = Refused("5", "schema version 9", {**image(7), **numbers})
     body = message(refused)
@@ -388,7 +388,7 @@ def test_a_record_too_large_for_any_queue_is_told_by_its_key():
     assert "schema version 9" in entry.reason
 
 
-def test_batches_that_could_not_be_summarised_later_are_kept_by_their_keys():
+def test_deferred_batches_that_failed_are_kept_by_their_keys():
     topic = build_topic(RECORD, "car", "vesc")
     body = json.dumps({PUT_OFF: [[topic, "0000000000000001-0badcafe-0"]]})
     (entry,) = entries(body, list)

@@ -1,4 +1,4 @@
-"""The query function: what it chooses, how it ends in time, and how the station reads its answer."""
+"""The query function: its selection, its time and memory limits, and the station's reading of its answer."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def unpacked(reply):
     return json.loads(zlib.decompress(base64.b64decode(reply["samples"])))
 
 
-def test_gives_the_range_the_fields_and_what_meets_the_condition():
+def test_a_query_returns_the_ranges_samples_that_meet_the_condition():
     reply = asked(
         table(*ride()),
         start_us=START + 200_000,
@@ -69,7 +69,7 @@ def test_gives_the_range_the_fields_and_what_meets_the_condition():
     assert set(reply["fields"]) == {"speed", "name", "speed_mps"}
 
 
-def test_ends_in_time_and_goes_on_from_the_token():
+def test_a_query_ends_in_time_and_continues_from_the_token():
     client, seen, token = table(*ride()), [], None
     for _ in range(10):
         reply = asked(client, left_ms=lambda: 0, token=token, fields=["speed"])
@@ -81,13 +81,13 @@ def test_ends_in_time_and_goes_on_from_the_token():
     assert seen == list(range(100))
 
 
-def test_ends_before_it_runs_out_of_memory():
+def test_a_query_ends_at_its_limit_of_values():
     assert asked(table(*ride()), limits={"max_values": 50})["token"] is not None
 
 
 @pytest.mark.parametrize("scan", [False, True])
 @pytest.mark.parametrize("page_items", [1, 3, 10, 50])
-def test_a_page_that_is_more_than_memory_holds_is_answered_in_parts(page_items, scan):
+def test_a_page_over_the_limit_of_values_is_answered_in_parts(page_items, scan):
     client, seen, token = table(*ride(), page_items=page_items), [], None
     for _ in range(11):
         reply = asked(client, limits={"max_values": 50}, token=token, fields=["speed"], scan=scan)
@@ -99,7 +99,7 @@ def test_a_page_that_is_more_than_memory_holds_is_answered_in_parts(page_items, 
     assert sorted(seen) == list(range(100))
 
 
-def test_what_is_large_goes_through_the_bucket():
+def test_a_large_answer_goes_through_the_bucket():
     kept = []
     reply = asked(
         table(*ride()),
@@ -111,7 +111,7 @@ def test_what_is_large_goes_through_the_bucket():
     assert json.loads(zlib.decompress(kept[0]))["fields"]["speed"] == list(range(100))
 
 
-def test_counts_what_is_no_batch():
+def test_invalid_items_are_counted():
     client = table(*ride(20))
     broken = item_of(Batch("0badcafe", 9, [START + 9_000_000], {"speed": [1]}))
     client.put(TELEMETRY, broken | {"samples": serialize("!")})
@@ -131,12 +131,12 @@ def test_counts_what_is_no_batch():
         ({"where": "speed > '3'"}, "speed is a number, '3' is a text"),
     ],
 )
-def test_refuses_with_the_reason(request_, reason):
+def test_an_invalid_request_is_refused_with_the_reason(request_, reason):
     assert reason in asked(table(*ride()), **request_)["error"]
 
 
 class Cloud:
-    """A `iort_station.cloud.Cloud` whose functions run here."""
+    """A `iort_station.cloud.Cloud` that runs its functions in this process."""
 
     namespace, ca_bundle = "iort", None
 
@@ -166,7 +166,7 @@ class Cloud:
         {"where": "speed != None and name == 'x'"},
     ],
 )
-def test_all_four_ways_give_the_same(question, scan, left_ms):
+def test_queries_here_and_on_lambda_give_the_same_samples(question, scan, left_ms):
     cloud = Cloud(table(*ride()), left_ms=lambda: left_ms)
     here = data.query(cloud, "car", "vesc", **question)
     there = data.query(cloud, "car", "vesc", on="lambda", scan=scan, **question)
@@ -202,14 +202,14 @@ def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
     assert part.absent == {"temp_motor": 1}
 
 
-def test_what_is_exported_as_messages_is_what_was_recorded():
+def test_exported_messages_have_the_recorded_values():
     columns = {"temp_motor": COLD}
     cloud = Cloud(table(Batch("0badcafe", 0, [START + i for i in range(4)], columns)))
     blocks = data.samples(cloud, data.select("car", "vesc"), refused=RefusedItems())
     assert [value for block in blocks for value in block.columns["temp_motor"].tolist()] == COLD
 
 
-def test_a_mistake_is_answered_from_there_as_from_here():
+def test_a_mistake_gives_the_same_error_here_and_on_lambda():
     cloud = Cloud(table(*ride()))
     for question, reason in (
         ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has name, speed"),

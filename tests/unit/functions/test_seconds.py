@@ -1,4 +1,4 @@
-"""A second as it is stored: packed, and for everybody else as flat as it was."""
+"""A second's summary is stored packed and read flat."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.statistics import summarize_second
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
-# Fields that are called like what else a second holds, and like one another's statistics.
+# Field names that look like a second's other keys or like another field's statistics.
 COUNTS = ["n", "batches", "gaps", "topic", "second", "expires_s", "omitted"]
 AWKWARD = [*COUNTS, "a", "a_last", "a_min", "a_last_last"]
 names = st.sampled_from(AWKWARD) | st.from_regex(r"[a-z]{1,3}(_(min|mean|max|last)){0,2}", fullmatch=True)
@@ -25,7 +25,7 @@ three = {"min_size": 3, "max_size": 3}
 
 
 @given(st.dictionaries(names, st.lists(numbers, **three) | st.lists(values, **three)))
-def test_a_second_is_read_as_it_was_made(columns):
+def test_a_packed_second_is_read_as_it_was_summarized(columns):
     packed = summarize_second(0, [Batch("0badcafe", 0, [0, 10, 20], columns)], None)
     assert packed is not None
     packed[EXPIRES_S] = 1_800_000_000
@@ -37,12 +37,12 @@ def test_a_second_is_read_as_it_was_made(columns):
         if known and {type(value) for value in known} <= {int, float}:
             assert (made[f"{name}_min"], made[f"{name}_max"]) == (min(known), max(known))
     assert not packed.keys() & {TOPIC, SECOND, OMITTED}
-    # And through the table, whose numbers are Decimals.
+    # The same through the table, with Decimals as numbers.
     stored = plain({name: attribute(value) for name, value in packed.items()})
     assert flat_second(stored) == plain({name: attribute(value) for name, value in made.items()})
 
 
-def test_a_second_that_was_stored_flat_is_read_as_it_is():
+def test_a_second_that_was_stored_flat_is_still_read():
     flat = {"n": 50, "speed_min": 1, "speed_mean": 1.5, "speed_max": 2, "speed_last": 2, "mode_last": "x"}
     assert flat_second(flat) == flat
 
@@ -57,7 +57,7 @@ def test_a_second_that_was_stored_flat_is_read_as_it_is():
         ({"gaps": [1, 1, 1]}, {f"gaps_{statistic}": 1 for statistic in STATS}),
     ],
 )
-def test_what_a_second_looks_like(columns, expected):
+def test_a_second_is_packed_as_documented(columns, expected):
     packed = summarize_second(0, [Batch("0badcafe", 0, [0, 10, 20], columns)], None)
     whole = {"n": 3, "batches": 1, "missing_batches": 0, "gaps": 0, "nonfinite": 0}
     assert packed == {**whole, **expected}

@@ -1,4 +1,4 @@
-"""A robot's share of Lambda 2: who is over it, what becomes of its batches, and who is told."""
+"""A robot's share of Lambda 2: batches over it wait, and the robot is notified."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"
 
 
 class Processor:
-    """A processor's time by hand: ``each_s`` goes by whenever somebody looks."""
+    """A fake processor clock: each look advances it by ``each_s``."""
 
     def __init__(self, each_s=0.0):
         self.each_s, self.now_s = each_s, 0.0
@@ -35,7 +35,7 @@ class Processor:
 
 
 class Queue:
-    """SQS, which takes what ``full`` does not say."""
+    """A fake SQS; it takes no message while it is ``full``."""
 
     def __init__(self):
         self.sent, self.full = [], False
@@ -50,7 +50,7 @@ class Queue:
 
 
 class Shadows:
-    """The shadows of the robots, as iot-data has them."""
+    """A fake of iot-data's shadows."""
 
     def __init__(self, *, fails=False):
         self.said, self.fails = [], fails
@@ -63,7 +63,7 @@ class Shadows:
 
 
 class Bounded(Stream):
-    """The stream, with Lambda 2 held to shares. Each look at the processor's time costs ``each_s``."""
+    """The stream and Lambda 2 with limited shares. Each look at the processor's time costs ``each_s``."""
 
     def __init__(self, each_s):
         super().__init__()
@@ -82,7 +82,7 @@ class Bounded(Stream):
         return process({"Records": records}, self.tables, self.refuse, bounds=self.bounds)
 
     def summarize_later(self):
-        """What the queue has, as the other function does it."""
+        """Summarise the queue's batches as the later function does."""
         for entry in self.queue.sent:
             records = later.records(self.tables, entry["MessageBody"])
             answer = process({"Records": records}, self.tables, self.refuse, beside_others=True)
@@ -96,25 +96,25 @@ def many(count, *, first=0):
     return [batch(T0 + (first + i) * S, seq=first + i) for i in range(count)]
 
 
-def test_an_allowance_is_had_again_with_time():
-    left = RateLimiter(burst=1.0, a_second=0.1)
-    assert left.spend("car", 0.0, 3.0) == -2.0
-    assert left.left("other", 0.0) == 1.0
-    assert left.left("car", 20.0) == pytest.approx(0.0)
-    assert left.left("car", 1000.0) == 1.0
-    # A clock that was set back takes nothing away, and gives nothing twice.
-    assert left.spend("car", -100.0, 0.0) == -2.0
-    assert left.left("car", 20.0) == pytest.approx(0.0)
+def test_a_rate_limiter_refills_with_time():
+    limiter = RateLimiter(burst=1.0, a_second=0.1)
+    assert limiter.spend("car", 0.0, 3.0) == -2.0
+    assert limiter.left("other", 0.0) == 1.0
+    assert limiter.left("car", 20.0) == pytest.approx(0.0)
+    assert limiter.left("car", 1000.0) == 1.0
+    # A clock that was set back neither drains nor refills the rate limiter.
+    assert limiter.spend("car", -100.0, 0.0) == -2.0
+    assert limiter.left("car", 20.0) == pytest.approx(0.0)
 
 
-def test_allowances_are_of_a_bounded_number_of_robots():
-    left = RateLimiter(burst=1.0, a_second=0.1)
+def test_a_rate_limiter_remembers_a_bounded_number_of_robots():
+    limiter = RateLimiter(burst=1.0, a_second=0.1)
     for i in range(rate_limiter._ROBOTS + 1):
-        left.spend(f"car{i}", 0.0, 0.5)
-    assert (left.left("car0", 0.0), left.left("car1", 0.0)) == (1.0, 0.5)
+        limiter.spend(f"car{i}", 0.0, 0.5)
+    assert (limiter.left("car0", 0.0), limiter.left("car1", 0.0)) == (1.0, 0.5)
 
 
-def test_a_meter_charges_what_its_thread_spent_and_gives_up_far_over_the_share():
+def test_a_meter_charges_its_threads_time_and_stops_far_over_the_share():
     processor = Processor()
     bounded = Share(burst_s=1.0, a_second=0.1, spent_s=processor)
     meter = bounded.meter("car", 0.0)
@@ -122,7 +122,7 @@ def test_a_meter_charges_what_its_thread_spent_and_gives_up_far_over_the_share()
     assert meter.charge(0.25) == 0.0
     assert bounded.over("car", 0.0)
     assert not bounded.over("other", 0.0)
-    # What was begun is done, up to as much again.
+    # Work that has begun continues up to twice the share.
     processor.now_s = 1.75
     meter.check()
     processor.now_s = 1.8
@@ -131,7 +131,7 @@ def test_a_meter_charges_what_its_thread_spent_and_gives_up_far_over_the_share()
     assert not Share.unlimited().over("car", 0.0)
 
 
-def test_batches_over_the_share_wait_and_no_other_robots_do(capsys):
+def test_batches_over_the_share_wait_and_other_robots_batches_do_not(capsys):
     stream = Bounded(each_s=0.1)
     records = stream.stored_at(100.0, *many(30), topic=BAD)
     good = stream.stored_at(100.0, batch(T0, 50), topic=GOOD)
@@ -142,7 +142,7 @@ def test_batches_over_the_share_wait_and_no_other_robots_do(capsys):
     totals = counted(capsys)
     assert totals["BatchesPutOff"] == len(stream.waits()) == 30 - len(done)
     assert totals["BatchesSummarized"] == 1 + len(done)
-    # Whose they are is said beside them, and is in no message of another's.
+    # The robot's name stands beside its batches; no message mixes robots.
     assert {entry["MessageGroupId"] for entry in stream.queue.sent} == {"bad"}
     assert {topic for topic, _ in stream.waits()} == {BAD}
     stream.summarize_later()
@@ -150,7 +150,7 @@ def test_batches_over_the_share_wait_and_no_other_robots_do(capsys):
     assert set(stream.column_of(BAD, "missing_batches")) == {0}
 
 
-def test_a_robot_within_its_share_is_summarised_at_once_again():
+def test_a_robot_back_within_its_share_is_summarised_at_once():
     stream = Bounded(each_s=0.1)
     stream.summarize(stream.stored_at(100.0, *many(30), topic=BAD))
     assert (before := len(stream.waits()))
@@ -161,7 +161,7 @@ def test_a_robot_within_its_share_is_summarised_at_once_again():
     assert T0 // S + 31 in stream.summary(BAD)
 
 
-def test_what_cannot_be_decoded_is_charged_to_whose_it_is():
+def test_undecodable_batches_are_charged_to_their_robot():
     stream = Bounded(each_s=0.1)
     records = stream.stored_at(100.0, *many(30), topic=BAD)
     for record in records:
@@ -171,8 +171,8 @@ def test_what_cannot_be_decoded_is_charged_to_whose_it_is():
     assert len(stream.refused) < 12
 
 
-def test_seconds_that_are_dear_to_read_again_wait_too():
-    """The batch itself is cheap; what the table holds beside it costs far more than the share."""
+def test_seconds_that_are_expensive_to_read_again_wait():
+    """The batch is cheap, but the second's other batches in the table cost more than the share."""
     stream = Bounded(each_s=0.0)
     stream.store(*(batch(T0 + i * 10_000, seq=i) for i in range(60)), topic=BAD)
     records = stream.stored_at(100.0, batch(T0 + 990_000, seq=60), topic=BAD)
@@ -194,7 +194,7 @@ def test_batches_that_the_queue_does_not_take_stay_in_the_stream():
     assert {one["itemIdentifier"] for one in failed} <= numbers
 
 
-def test_a_message_names_a_few_batches_and_a_call_has_a_few_messages():
+def test_deferred_batches_are_sent_in_bounded_messages_and_calls():
     queue = Queue()
     stream = Stream()
     changes = [one["dynamodb"] for one in stream.store(*many(KEYS * 12 + 1), topic=BAD)]
@@ -203,14 +203,14 @@ def test_a_message_names_a_few_batches_and_a_call_has_a_few_messages():
     assert sizes == [KEYS] * 12 + [1]
 
 
-def test_batches_that_are_gone_meanwhile_are_passed_over():
+def test_deferred_batches_that_were_deleted_are_skipped():
     stream = Stream()
     body = json.dumps({PUT_OFF: [[BAD, "0000000000000000-0badcafe-0"]]})
     assert later.records(stream.tables, body) == []
 
 
-def test_a_second_that_somebody_else_wrote_meanwhile_is_read_again():
-    """Later reads, a batch comes and is summarised by Lambda 2, and only then later writes."""
+def test_a_second_that_changed_meanwhile_is_read_again():
+    """While the later function has read but not written, Lambda 2 summarises a new batch."""
     stream = Stream()
     first, second = batch(T0, seq=0), batch(T0 + 500_000, seq=1)
     records = stream.store(first)
@@ -227,7 +227,7 @@ def test_a_second_that_somebody_else_wrote_meanwhile_is_read_again():
     assert stream.column("n") == {0: 2}
 
 
-def test_a_robot_is_told_at_once_then_now_and_then_and_anew_after_a_while():
+def test_a_robot_is_notified_at_once_then_at_intervals_and_anew_after_a_pause():
     shadows = Shadows()
     told = Told(shadows)
     for at_s in (100.0, 101.0, 129.0, 131.0):
@@ -242,30 +242,30 @@ def test_a_robot_is_told_at_once_then_now_and_then_and_anew_after_a_while():
     ]
 
 
-def test_a_robot_that_cannot_be_told_loses_no_summary(caplog):
+def test_a_failed_notification_loses_no_summary(caplog):
     Told(Shadows(fails=True)).tell("bad", 1, 100.0)
     assert "bad is not told" in caplog.text
 
 
-def test_those_who_were_told_are_of_a_bounded_number():
+def test_the_number_of_remembered_notifications_is_bounded():
     told = Told(Shadows())
     for i in range(share._ROBOTS + 10):
         told.tell(f"car{i}", 1, 100.0)
     assert len(told._robots) == share._ROBOTS
 
 
-def test_holes_before_every_batch_are_within_the_share():
+def test_counting_holes_before_every_batch_is_within_the_share():
     stream = Bounded(each_s=0.0)
     stream.stored_at(99.0, *(batch(T0 + i * S // 100, seq=2 * i) for i in range(1000)), topic=BAD)
     new = [batch(T0 + 10 * S + i * S // 100, seq=2 * (1000 + i)) for i in range(100)]
     records = stream.stored_at(100.0, *new, topic=BAD)
     before = stream.client.calls["query"]
     stream.summarize(records)
-    # One query a page of what lies around the second, and few for the batches themselves.
+    # One query a page around the second, and a few for the batches.
     assert stream.client.calls["query"] - before < 30
 
 
-def test_a_robot_is_given_up_while_its_holes_are_counted():
+def test_counting_a_robots_holes_stops_over_the_share():
     stream = Bounded(each_s=0.0)
     processor, numbers = stream.share._spent_s, stream.tables.numbers
 
@@ -280,7 +280,7 @@ def test_a_robot_is_given_up_while_its_holes_are_counted():
     assert len(stream.waits()) == 10
 
 
-def test_a_second_that_changes_as_fast_as_it_is_read_holds_nobody_up():
+def test_a_second_that_changes_at_every_read_does_not_block():
     stream = Bounded(each_s=0.0)
     records = stream.store(batch(T0 + 500_000, seq=100), topic=BAD)
     put, sent = stream.tables.put_seconds, itertools.count(1)

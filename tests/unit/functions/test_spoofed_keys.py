@@ -1,4 +1,4 @@
-"""Whatever a robot's message says in the cloud's place, no rule takes it for what the cloud says: neither
+"""No rule mistakes a key of a robot's message for a key that the cloud adds: neither
 where the rule's keys stay beside the payload's of the same name, nor where the payload's do."""
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ WHOSE = {rule: build_topic(lane, "a", name) for rule, (lane, name, _) in SENT.it
 
 @pytest.fixture(params=[False, True], ids=["rule-wins", "payload-wins"])
 def of_rule(request):
-    """What a rule makes of a message on a topic."""
+    """The event or item that a rule makes from a message on a topic."""
 
     def run(rule, topic, payload):
         sql = RULES[rule].statement(retention_s=RETENTION_S)
@@ -65,18 +65,18 @@ def of_rule(request):
     return run
 
 
-def test_every_rule_is_tried():
+def test_every_rule_has_a_spoofed_message():
     assert {*SENT, "presence", "version"} == set(RULES)
 
 
 @pytest.mark.parametrize("rule", SENT)
-def test_a_rule_makes_of_a_spoofed_message_what_it_makes_of_an_honest_one(of_rule, rule):
+def test_a_rule_handles_a_spoofed_message_like_an_honest_one(of_rule, rule):
     lane, name, message = SENT[rule]
     honest = of_rule(rule, WHOSE[rule], message)
     told = of_rule(rule, WHOSE[rule], spoofed(message, "b", lane, name))
     if MESSAGE_BASE64 in honest:
         assert event_message(honest) == message
-        # The message itself may say what it likes.
+        # The encoded message may hold any keys.
         assert event_message(told) == spoofed(message, "b", lane, name)
         honest, told = ({**one, MESSAGE_BASE64: ""} for one in (honest, told))
     assert told == honest
@@ -92,7 +92,7 @@ def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
     assert set(item) == {*ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
 
 
-def test_a_batch_without_nonfinite_has_none_in_the_table(of_rule):
+def test_a_batch_without_nonfinite_is_stored_without_it(of_rule):
     message = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
     item = of_rule("record", WHOSE["record"], message)
     assert not {NONFINITE, PREVIOUS} & set(item)
@@ -130,7 +130,7 @@ def test_an_alert_names_the_robot_of_the_topic(of_rule, rule):
     assert "2023-11-14 22:13:20 UTC" in text
 
 
-def test_a_version_is_the_robots_of_the_shadows_topic(of_rule):
+def test_a_version_belongs_to_the_robot_of_the_shadows_topic(of_rule):
     topic = f"$aws/things/a/shadow/name/{SHADOW}/update/accepted"
     document = json.loads(spoofed(REPORT, "b", LIVE, "vesc"))
     event = of_rule("version", topic, json.dumps(document).encode())
@@ -139,7 +139,7 @@ def test_a_version_is_the_robots_of_the_shadows_topic(of_rule):
     assert of_rule("version", topic, b'{"state": {"reported": {}}}') is None
 
 
-def test_an_event_of_the_brokers_own_is_taken_as_it_is(of_rule):
+def test_the_brokers_own_event_is_passed_on_unchanged(of_rule):
     event = of_rule("presence", "$aws/events/presence/connected/a", CONNECTED)
     assert event == json.loads(CONNECTED)
     assert presence.change(event)["Key"] == {ROBOT: {"S": "a"}}

@@ -1,4 +1,4 @@
-"""One robot that packs a second full does not hold up the others, and nothing of it is lost."""
+"""A robot that fills a second with batches does not delay other robots, and no batch is lost."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MANY = 3 * SECOND_BATCHES
 
 
 def packed(count, *, second=0, seq=0):
-    """So many batches of one sample in a second."""
+    """n batches of one sample within a second."""
     return [batch(T0 + second * S + n * (S // count), seq=seq + n) for n in range(count)]
 
 
-def test_a_second_is_made_of_its_first_batches_and_the_others_are_refused(stream, capsys):
+def test_a_second_counts_its_first_batches_and_refuses_further_ones(stream, capsys):
     batches = packed(MANY)
     records = stream.store(*batches)
     assert stream.summarize(records) == {"batchItemFailures": []}
@@ -32,14 +32,14 @@ def test_a_second_is_made_of_its_first_batches_and_the_others_are_refused(stream
     assert f'"BatchesSummarized":{SECOND_BATCHES}' in said
 
 
-def test_what_the_queue_does_not_take_is_sent_again(stream):
+def test_a_refused_batch_stays_in_the_stream_if_the_queue_does_not_take_it(stream):
     records = stream.store(*packed(SECOND_BATCHES + 1))
     number = records[-1]["dynamodb"]["SequenceNumber"]
     stream.jammed = {number}
     assert stream.summarize(records) == {"batchItemFailures": [{"itemIdentifier": number}]}
 
 
-def test_as_many_as_allowed_are_not_too_many(stream):
+def test_the_allowed_number_of_batches_is_summarised(stream):
     stream.deliver(*packed(SECOND_BATCHES))
     assert stream.column("batches") == {0: SECOND_BATCHES}
     assert stream.refused == []
@@ -50,7 +50,7 @@ def test_every_event_reads_a_bounded_part_of_a_full_second(stream):
     stream.summarize(records)
     before = stream.client.read
     stream.summarize(records[-1:])
-    # Both seconds, with the pages that they came in.
+    # Both seconds, in whole pages.
     assert stream.client.read - before <= 3 * SECOND_BATCHES
 
 
@@ -65,13 +65,13 @@ def test_the_second_after_a_full_one_misses_nothing(stream, grouped):
     assert refused == {record["dynamodb"]["SequenceNumber"] for record in records[SECOND_BATCHES:MANY]}
 
 
-def test_the_last_batch_of_a_full_second_counts_in_the_next_where_it_reaches(stream):
+def test_a_batch_that_reaches_beyond_a_full_second_counts_in_the_next(stream):
     over = batch(T0 + S - 1_000, 2, seq=MANY)
     stream.deliver(*packed(MANY), over)
     assert stream.column("n") == {0: SECOND_BATCHES, 1: 1}
 
 
-def test_undecodable_neighbours_fill_a_second_too(stream):
+def test_undecodable_neighbours_fill_a_second(stream):
     records = stream.store(*packed(MANY))
     for key, item in list(stream.client.items["telemetry"].items())[: 2 * SECOND_BATCHES]:
         stream.client.items["telemetry"][key] = {**item, "samples": {"S": "AAAA"}}
@@ -80,7 +80,7 @@ def test_undecodable_neighbours_fill_a_second_too(stream):
     assert [one.number for one in stream.refused] == [last["dynamodb"]["SequenceNumber"]]
 
 
-def test_large_batches_fill_a_second_before_a_hundred_do(stream):
+def test_large_batches_fill_a_second_by_their_size(stream):
     text = "x" * 4_000
     batches = [
         Batch("aaaaaaaa", n, range(T0 + n * 10_000, T0 + n * 10_000 + 300), {"a": [text] * 300})
@@ -91,7 +91,7 @@ def test_large_batches_fill_a_second_before_a_hundred_do(stream):
     assert stream.column("batches")[0] + len(stream.refused) == len(batches)
 
 
-def test_other_seconds_and_streams_are_as_ever(stream):
+def test_other_seconds_and_streams_are_not_affected(stream):
     other = "dt/iort/bus/vesc"
     records = stream.store(*packed(MANY)) + stream.store(*packed(2, second=5), topic=other)
     stream.summarize(records)
@@ -99,14 +99,14 @@ def test_other_seconds_and_streams_are_as_ever(stream):
     assert len(stream.refused) == MANY - SECOND_BATCHES
 
 
-def test_a_reader_says_which_seconds_are_full(stream):
+def test_a_reader_reports_full_seconds(stream):
     stream.store(*packed(MANY))
     reader = Reader(stream.tables, TOPIC_OF_CAR, {}, list)
     assert len(reader.read(SECOND, SECOND)[0]) == SECOND_BATCHES + 1
     assert reader.full == {SECOND}
 
 
-def test_batches_within_a_full_second_are_kept_where_the_event_has_a_far_one_too(stream, capsys):
+def test_a_distant_batch_in_the_event_does_not_change_a_full_second(stream, capsys):
     records = stream.store(*packed(MANY), batch(T0 + 100 * S, seq=MANY))
     stream.summarize(records)
     assert len(stream.refused) == MANY - SECOND_BATCHES
@@ -116,8 +116,8 @@ def test_batches_within_a_full_second_are_kept_where_the_event_has_a_far_one_too
     assert "BatchesMissing" not in said
 
 
-def test_a_long_drain_in_one_event_is_summarised_as_batch_by_batch(stream, capsys):
-    """More than is read together, two batches a second that reach into the next one, and one hole."""
+def test_one_large_event_gives_the_same_summary_as_single_batches(stream, capsys):
+    """More batches than one read takes, two a second that reach into the next second, and one hole."""
     batches = [
         batch(T0 + n * S // 2 + 100_000, 20, step_us=25_000, seq=n + 5 * (n >= 100)) for n in range(300)
     ]
@@ -131,7 +131,7 @@ def test_a_long_drain_in_one_event_is_summarised_as_batch_by_batch(stream, capsy
     assert [second for second, missing in stream.column("missing_batches").items() if missing] == [50]
 
 
-def test_topics_that_are_read_side_by_side_come_out_the_same():
+def test_topics_that_are_read_concurrently_give_the_same_summary():
     seen = []
     for at_once in (1, 4):
         stream = Stream()
@@ -144,12 +144,12 @@ def test_topics_that_are_read_side_by_side_come_out_the_same():
 
 
 def large(number):
-    """A batch of a second whose columns are half of what a second may hold, and small on the wire."""
+    """A batch that fills half a second's size limit and is small on the wire."""
     texts = {f"f{i}": ["x" * 4000] * 100 for i in range(10)}
     return Batch("aaaaaaaa", number, [T0 + number * S + i * 5000 for i in range(100)], texts)
 
 
-def test_seconds_that_hold_much_are_not_in_memory_together(stream):
+def test_large_seconds_are_not_in_memory_together(stream):
     batches = [large(number) for number in range(8)]
     records = stream.store(*batches)
     held = []

@@ -1,4 +1,4 @@
-"""Lambda 2, one thing at a time: what a second says, and of which batches."""
+"""Lambda 2: the content of a second's summary, one property a test."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_late_batch_fills_the_gap_that_its_successor_reported(stream, capsys):
 
 
 @pytest.mark.parametrize("apart_s", [2, 3, 59, 61, 100_000])
-def test_a_late_batch_fills_the_gap_of_a_successor_however_far_away(stream, apart_s):
+def test_a_late_batch_fills_the_gap_of_a_distant_successor(stream, apart_s):
     stream.deliver(batch(T0, seq=0))
     # Three batches in the successor's second: all of it must be summarised again, not its start.
     last = [batch(T0 + 2 * apart_s * S + i * 300_000, 5, seq=2 + i) for i in range(3)]
@@ -44,7 +44,7 @@ def test_a_late_batch_fills_the_gap_of_a_successor_however_far_away(stream, apar
     assert stream.column("n") == {0: 1, apart_s: 1, 2 * apart_s: 15}
 
 
-def test_a_second_is_whole_whichever_of_its_batches_comes_last(stream):
+def test_a_second_is_complete_with_its_batches_in_any_order(stream):
     parts = [batch(T0 + i * 250_000, 12, seq=i) for i in range(4)]
     for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
         other = Stream()
@@ -55,7 +55,7 @@ def test_a_second_is_whole_whichever_of_its_batches_comes_last(stream):
         assert other.column("missing_batches") == {0: 0}
 
 
-def test_one_sample_a_batch_as_in_the_thesis(stream):
+def test_batches_of_one_sample_as_in_the_thesis_are_summarised(stream):
     batches = [batch(T0 + i * 20_000, seq=i, speed=[i]) for i in range(150) if i != 70]
     for i in range(0, len(batches), 7):
         stream.deliver(*batches[i : i + 7])
@@ -66,14 +66,14 @@ def test_one_sample_a_batch_as_in_the_thesis(stream):
 
 
 def test_missing_batches_are_counted_once_in_the_metric(stream, capsys):
-    """The seconds are written many times over; a batch that is missing is missing once."""
+    """A second may be written many times, but a missing batch counts once."""
     for i in (0, 1, 5, 6, 7, 8, 9):
         stream.deliver(batch(T0 + i * 20_000, seq=i))
     assert counted(capsys) == {"BatchesSummarized": 7, "SamplesSummarized": 7, "BatchesMissing": 3}
 
 
-def test_what_was_received_long_ago_is_summarised_and_alarms_nobody(stream, capsys):
-    """Batches of an old table are put into the new one: their faults are no news, nor is what they lack."""
+def test_batches_received_long_ago_are_summarised_without_alarms(stream, capsys):
+    """Batches copied from an old table are not news: their faults and gaps must set off no alarm."""
     records = stream.store(batch(T0, seq=0, fault_code=[3]), batch(T0 + 2 * S, seq=2, voltage_input=[5.5]))
     received_ms = int(records[0]["dynamodb"]["NewImage"][RECEIVED_MS]["N"])
 
@@ -89,19 +89,19 @@ def test_what_was_received_long_ago_is_summarised_and_alarms_nobody(stream, caps
     assert (news["BatchesMissing"], news["FaultSamples"], news["BatteryVolts"]) == (1, 1, [5.5])
 
 
-def test_a_restart_begins_a_new_count(stream):
+def test_a_restart_begins_new_sequence_numbers(stream):
     stream.deliver(batch(T0, 10, seq=8), batch(T0 + S, 10, seq=9))
     stream.deliver(
         batch(T0 + 5 * S, 10, seq=0, boot="bbbbbbbb"), batch(T0 + 6 * S, 10, seq=1, boot="bbbbbbbb")
     )
-    # The first eight were never stored; the restart itself lost nothing that can be told.
+    # The first eight were never stored; the restart itself lost no known batch.
     assert stream.column("missing_batches") == {0: 8, 1: 0, 5: 0, 6: 0}
     stream.deliver(batch(T0 + 9 * S, 10, seq=2, boot="cccccccc"))
     assert stream.column("missing_batches")[9] == 0
 
 
 @pytest.mark.parametrize("offset_us", [-1, 0, 1, -20_000, 20_000, 980_000])
-def test_batches_at_the_boundary_of_a_second(stream, offset_us):
+def test_samples_at_the_boundary_count_in_their_own_second(stream, offset_us):
     b = batch(T0 + offset_us, 50)
     stream.deliver(b)
     per_second = defaultdict(int)
@@ -110,8 +110,8 @@ def test_batches_at_the_boundary_of_a_second(stream, offset_us):
     assert stream.column("n") == per_second
 
 
-def test_batches_that_overlap_the_boundary_together(stream):
-    """A car's clock was set back: several batches begin before the second in which all have samples."""
+def test_several_batches_across_one_boundary_all_count(stream):
+    """A car's clock was set back: several batches begin in the second before."""
     drive = [batch(T0 - 600_000 + i * 100_000, 50, step_us=19_000, seq=i) for i in range(5)]
     stream.store(*drive)
     stream.deliver(batch(T0 + 900_000, 3, seq=5))
@@ -128,7 +128,7 @@ def test_topics_and_robots_do_not_mix(stream):
     assert [item["missing_batches"] for item in stream.summary(other).values()] == [4]
 
 
-def test_speed_and_power_from_the_vehicles_parameters(stream):
+def test_speed_and_power_follow_from_the_vehicles_parameters(stream):
     columns = {"speed": [4614, 9228], "voltage_input": [16.0, 15.0], "current_input": [2.0, -1.0]}
     stream.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream.store(batch(T0, 2, **columns), topic="dt/iort/unknown/vesc")
@@ -170,8 +170,8 @@ def test_extreme_values_are_stored(stream):
     assert len(item["power_w_max"].as_tuple().digits) <= 38
 
 
-def test_a_summary_is_kept_as_long_as_the_batches_it_is_made_of(stream):
-    """Its samples may be of years ago: a recorded drive with its own times, a car without a clock."""
+def test_a_summary_expires_with_its_batches(stream):
+    """Samples may be years old: a recorded drive with its own times, or a car without a clock."""
     long_ago = 1_500_000_000
     stream.summarize(
         [
@@ -182,7 +182,7 @@ def test_a_summary_is_kept_as_long_as_the_batches_it_is_made_of(stream):
     assert stream.summary()[long_ago][EXPIRES_S] == EXPIRES + 7
 
 
-def test_a_batch_that_was_stored_without_an_end_has_a_summary_without_one(stream):
+def test_a_batch_without_expiry_has_a_summary_without_expiry(stream):
     item = item_of(batch(T0))
     del item[EXPIRES_S]
     stream.summarize([stream.store_item(item)])
@@ -195,7 +195,7 @@ def test_a_jump_of_the_clock_does_not_read_the_years_between(stream):
     stream.client.calls.clear()
     stream.deliver(batch(0, 10, seq=300), batch(T0, 10, seq=301))
     assert stream.client.calls["query"] < 15
-    # The batch that now has a predecessor in 1970 is summarised again, and nothing between.
+    # Only the batch that now has a predecessor in 1970 is summarised again.
     assert stream.summary().keys() == {0, between[-1].t_us // S, SECOND}
 
 
@@ -207,7 +207,7 @@ def test_the_newest_batch_of_a_driving_car_takes_one_query(stream):
     assert (stream.client.calls["query"], stream.client.calls["batch_write_item"]) == (1, 1)
 
 
-def test_removals_are_passed_over(stream, capsys):
+def test_removals_are_skipped(stream, capsys):
     stream.deliver(batch(T0, 5))
     before = clean(stream.summary())
     capsys.readouterr()
@@ -217,13 +217,13 @@ def test_removals_are_passed_over(stream, capsys):
     assert counted(capsys) == {}
 
 
-def test_an_empty_event_is_nothing(stream):
+def test_an_empty_event_succeeds(stream):
     assert stream.summarize([]) == {"batchItemFailures": []}
     assert stream.client.calls == {}
 
 
 def interleaved(seconds, behind_s=2):
-    """Two publishers of one stream, one of which has a clock that is behind: batches in the order in which
+    """Two publishers of one stream; the clock of one is behind: batches in the order in which
     the agent closes and numbers them."""
     batches = []
     for i in range(seconds):
@@ -233,7 +233,7 @@ def interleaved(seconds, behind_s=2):
 
 
 @pytest.mark.parametrize("grouped", [1, 7, 100])
-def test_clocks_that_interleave_miss_nothing(stream, capsys, grouped):
+def test_interleaved_clocks_miss_no_batch(stream, capsys, grouped):
     drive = interleaved(20)
     for i in range(0, len(drive), grouped):
         stream.deliver(*drive[i : i + grouped])
@@ -242,19 +242,19 @@ def test_clocks_that_interleave_miss_nothing(stream, capsys, grouped):
     assert "BatchesMissing" not in counted(capsys)
 
 
-def test_of_clocks_that_interleave_what_is_missing_is_told_once(stream, capsys):
+def test_a_missing_batch_of_interleaved_clocks_counts_once(stream, capsys):
     drive = interleaved(20)
     lost = drive.pop(21)
     for one in drive:
         stream.deliver(one)
     assert sum(stream.column("missing_batches").values()) == 1
     assert counted(capsys)["BatchesMissing"] == 1
-    # Of its number the next one tells, which is of the other clock.
+    # The next batch, with the other clock, reveals its number.
     (told,) = [second for second, missing in stream.column("missing_batches").items() if missing]
     assert told == drive[21].t_us // S - SECOND != lost.t_us // S - SECOND
 
 
-def test_a_recording_that_is_played_twice_is_stored_twice_and_misses_nothing(stream, capsys):
+def test_a_recording_played_twice_is_stored_twice_and_misses_no_batch(stream, capsys):
     first = [batch(T0 + i * S, 10, step_us=1000, seq=i) for i in range(5)]
     again = [batch(T0 + i * S, 10, step_us=1000, seq=5 + i, boot="bbbbbbbb") for i in range(5)]
     stream.deliver(*first)
@@ -263,6 +263,6 @@ def test_a_recording_that_is_played_twice_is_stored_twice_and_misses_nothing(str
     assert stream.column("batches") == dict.fromkeys(range(5), 2)
     assert stream.column("missing_batches") == dict.fromkeys(range(5), 0)
     assert "BatchesMissing" not in counted(capsys)
-    # The same batch again is still once.
+    # A repeated batch counts once.
     stream.deliver(*again)
     assert stream.column("n") == dict.fromkeys(range(5), 20)

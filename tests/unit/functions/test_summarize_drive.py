@@ -19,7 +19,7 @@ from tests.recordings import recording
 from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch, counted, drive_of
 
 
-def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, capsys):
+def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys):
     for name, table in NAMES.items():
         monkeypatch.setenv(f"{name.upper()}_TABLE", table)
     for queue in ("REJECTED", "PUT_OFF"):
@@ -41,14 +41,14 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     assert {s for s, item in by_second.items() if item["missing_batches"]} == {8}
     assert all(item["speed_mps_mean"] == second for second, item in by_second.items())
     assert counted(capsys)["SamplesSummarized"] == 39 * 50
-    # The same through the fake: what the property tests run on behaves like the real one.
+    # The same through the fake: it must behave as moto does.
     fake = Stream()
     fake.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     fake.deliver(*drive)
     assert {int(item["second"]): item for item in items} == fake.summary()
 
 
-def test_a_drive_of_a_real_car(stream):
+def test_the_drive_of_a_real_car_is_summarised(stream):
     import numpy as np
 
     samples = list(drive_of(recording("f1tenth-motor-servo.bag")))

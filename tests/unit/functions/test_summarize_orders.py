@@ -1,4 +1,4 @@
-"""Lambda 2: the summary follows from what is stored, however the stream's records come in."""
+"""Lambda 2: the summary depends on the stored batches, not on the order of the stream's records."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def drives(draw):
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(drives(), st.randoms(use_true_random=False), st.data())
-def test_order_grouping_duplication_and_halving_of_the_records_change_nothing(drive, rng, data):
+def test_the_summary_does_not_depend_on_order_grouping_or_repetition_of_records(drive, rng, data):
     expected = Stream()
     expected.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     expected.deliver(*drive)
@@ -61,7 +61,7 @@ def test_order_grouping_duplication_and_halving_of_the_records_change_nothing(dr
     rng.shuffle(order)
     seen = []
     while order:
-        # The table runs ahead of its stream: some of what comes later may be stored already.
+        # The table is ahead of its stream: later batches may be stored already.
         take = rng.randint(1, len(order))
         group, order = order[:take], order[take:]
         records = got.store(*group)
@@ -80,15 +80,15 @@ def test_order_grouping_duplication_and_halving_of_the_records_change_nothing(dr
 
 
 def in_order(drive):
-    """Whether numbers and times agree: no clock was set back, and no run came back after another."""
+    """True if numbers and times agree: no clock was set back, and no run continued after another."""
     drive = sorted(drive, key=lambda b: b.id)
     runs = [boot for boot, _ in groupby(b.boot for b in drive)]
     return len(set(runs)) == len(runs) and all(a.seq < b.seq for a, b in pairwise(drive) if a.boot == b.boot)
 
 
 def told(stream, drive):
-    """What the summary says; how many batches are missing only where numbers and times agree, for otherwise
-    it is told by what was there when the second was last made."""
+    """The summary, with missing batches only if numbers and times agree; otherwise that number depends on
+    the batches stored when the second was last summarised."""
     summary = clean(stream.summary())
     if not in_order(drive):
         for item in summary.values():
@@ -97,7 +97,7 @@ def told(stream, drive):
 
 
 def assert_summary(summary, drive):
-    """Against a computation that knows nothing of pages, events or neighbours."""
+    """Compare with a direct computation from all batches."""
     agree = in_order(drive)
     drive = sorted(drive, key=lambda b: b.id)
     samples = defaultdict(list)
@@ -130,10 +130,10 @@ def assert_summary(summary, drive):
 
 @settings(max_examples=60, deadline=None)
 @given(drives())
-def test_a_batch_sent_in_two_halves_leaves_the_same_samples(drive):
+def test_a_batch_sent_in_two_halves_gives_the_same_samples(drive):
     whole, halved = Stream(), Stream()
     whole.deliver(*drive)
-    # The batches of a drive may overlap here, and two that start at once would be one item.
+    # Batches may overlap here; two that start at the same time would be one item.
     taken = {b.t_us for b in drive}
     for b in drive:
         halves = split_batch(b) if len(b.times_us) > 1 and split_batch(b)[1].t_us not in taken else (b,)

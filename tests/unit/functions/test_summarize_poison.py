@@ -1,4 +1,4 @@
-"""Lambda 2: records and neighbours that are wrong are reported, counted and read past."""
+"""Lambda 2 reports and counts invalid records and neighbours, and continues."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.unit.functions.summarizing import T0, S, Stream, batch, clean, counte
 
 
 def poison(**changes):
-    """An item that looks like a batch; a value of None leaves the attribute out."""
+    """An item that looks like a batch; None removes the attribute."""
     envelope = json.loads(encode_batch(batch(T0 + 10 * S + 1, 3, seq=7))) | changes
     return item_of_message(json.dumps({k: v for k, v in envelope.items() if v is not None}).encode())
 
@@ -83,14 +83,14 @@ def test_a_poison_record_is_reported_and_the_others_are_kept(stream, name, capsy
     assert stream.column("missing_batches") == {0: 0, 10: 0, 11: 0}
     assert counted(capsys) == {"BatchesSummarized": 3, "SamplesSummarized": 101, "BatchesRefused": 1}
     assert [record.message[:7] for record in caplog.records] == ["refused"]
-    # The queue before the quarantine does not take it: it stays in the stream, and comes again.
+    # If the dead-letter queue does not take it, it stays in the stream and is delivered again.
     before = clean(stream.summary())
     stream.jammed = {number}
     assert stream.summarize([bad, third]) == {"batchItemFailures": [{"itemIdentifier": number}]}
     assert clean(stream.summary()) == before
 
 
-def test_a_replay_says_what_is_refused_and_puts_nothing_into_quarantine_again(stream):
+def test_a_replay_reports_refused_records_and_does_not_quarantine_them_again(stream):
     good, bad = stream.store(batch(T0, 5)), stream.store_item(POISON["other version"])
     event = {"replay": True, "Records": [*good, bad]}
     answer = process(event, stream.tables, stream.refuse)
@@ -99,16 +99,16 @@ def test_a_replay_says_what_is_refused_and_puts_nothing_into_quarantine_again(st
     assert stream.column("n") == {0: 5}
 
 
-def test_a_poison_neighbour_hides_no_batch_from_the_count(stream):
+def test_a_poison_neighbour_does_not_count_as_a_stored_batch(stream):
     stream.deliver(batch(T0, seq=5))
     for i in range(3):
         stream.summarize([stream.store_item(poison(v=9, batch=f"{T0 + (20 + i) * S}-aaaaaaaa-7"))])
     stream.deliver(batch(T0 + 40 * S, seq=8))
-    # 6 and 7 are missing; that they may be among the poison ones, nobody can say.
+    # 6 and 7 are missing; the poison items may be them, but this cannot be known.
     assert stream.column("missing_batches") == {0: 5, 40: 2}
 
 
-def test_a_hail_of_poison_bounds_what_is_read(stream):
+def test_many_poison_items_are_read_with_few_queries(stream):
     for i in range(200):
         stream.store_item(poison(v=9, batch=f"{T0 + i * S}-aaaaaaaa-7"))
     stream.client.calls.clear()
@@ -117,22 +117,22 @@ def test_a_hail_of_poison_bounds_what_is_read(stream):
     assert stream.column("n") == {500: 1}
 
 
-def test_a_table_that_takes_nothing_fails_the_event_so_that_it_comes_again(monkeypatch):
+def test_a_table_that_accepts_no_writes_fails_the_event(monkeypatch):
     monkeypatch.setattr(tables_module.time, "sleep", lambda _: None)
     stream = Stream(FakeDynamoDB(unprocessed=10**9))
     with pytest.raises(TableError):
         stream.deliver(*(batch(T0 + i * S, seq=i) for i in range(20)))
 
 
-def test_a_vehicle_whose_parameters_are_wrong_stops_nothing(stream, caplog):
+def test_wrong_vehicle_parameters_stop_no_summary(stream, caplog):
     stream.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"S": "fast"}})
     stream.deliver(batch(T0, 2, speed=[1, 2]))
     assert stream.column("speed_max") == {0: 2}
     assert "car" in caplog.text
 
 
-def test_an_attribute_of_more_digits_than_boto3_reads_keeps_no_batch_from_its_summary(stream):
-    """DynamoDB holds numbers up to 9.99e125, however many digits it writes them with."""
+def test_an_attribute_with_more_digits_than_boto3_reads_stops_no_summary(stream):
+    """DynamoDB returns numbers up to 9.99e125 with all their digits."""
     odd = {"N": "-1" + "0" * 125}
     item = item_of_message(encode_batch(batch(T0, 3, a=[1.5] * 3)))
     odd_item = {**item, "far": odd, "deep": {"M": {"far": {"L": [odd]}}}}

@@ -61,7 +61,7 @@ def store(client, *times_us, topic=TOPIC_OF_CAR):
 # --- telemetry --------------------------------------------------------------------------------------
 
 
-def test_batches_come_from_the_time_on_of_one_topic_in_the_order_of_time(client):
+def test_batches_of_a_topic_are_read_from_a_time_on_in_order(client):
     store(client, T0 + 5, T0 + 1, T0 + 2, T0, T0 + 4, T0 + 3)
     store(client, T0 + 2, topic="dt/iort/other/vesc")
     found = list(tables(client).batches_from(TOPIC_OF_CAR, T0 + 1, at_once=2))
@@ -69,15 +69,15 @@ def test_batches_come_from_the_time_on_of_one_topic_in_the_order_of_time(client)
     assert {item[TOPIC] for item in found} == {TOPIC_OF_CAR}
 
 
-def test_every_page_is_read():
+def test_all_pages_are_read():
     client = FakeDynamoDB()
     store(client, *range(T0, T0 + 103))
     assert len(list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2))) == 103
-    # Few are wanted nearly always; whoever wants more wants many.
+    # Nearly every caller wants a few items; the others want many.
     assert client.calls["query"] == 3
 
 
-def test_no_more_is_read_than_is_asked_for():
+def test_an_iterator_reads_only_the_batches_taken_from_it():
     client = FakeDynamoDB()
     store(client, *range(T0, T0 + 7))
     found = tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2)
@@ -85,13 +85,13 @@ def test_no_more_is_read_than_is_asked_for():
     assert (client.calls["query"], client.read) == (1, 2)
 
 
-def test_those_before_come_nearest_first(client):
+def test_earlier_batches_are_read_nearest_first(client):
     store(client, T0, T0 + 1, T0 + 2, T0 + 3, T0 + 4)
     store(client, T0 + 1, topic="dt/iort/other/vesc")
     assert times_of(tables(client).before(TOPIC_OF_CAR, T0 + 2)) == [T0 + 1, T0]
 
 
-def test_batches_of_one_time_are_all_read_wherever_a_page_ends(client):
+def test_batches_with_equal_times_are_all_read_across_pages(client):
     store(client, *[T0] * 12, T0 + 1)
     for at_once in (1, 2, 11, 12, 13):
         found = list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=at_once))
@@ -101,7 +101,7 @@ def test_batches_of_one_time_are_all_read_wherever_a_page_ends(client):
     assert list(tables(client).before(TOPIC_OF_CAR, T0)) == []
 
 
-def test_numbers_tell_which_batches_there_are_between_two_times(client):
+def test_numbers_gives_the_ids_of_batches_between_two_times(client):
     store(client, T0, T0 + 5, T0 + 5, T0 + 9, T0 + 10)
     store(client, T0 + 5, topic="dt/iort/other/vesc")
     put(client, TELEMETRY, {TOPIC: serialize(TOPIC_OF_CAR), BATCH: serialize(f"{T0 + 6}-nobody's")})
@@ -116,14 +116,14 @@ def test_numbers_tell_which_batches_there_are_between_two_times(client):
         lambda found: found.batches_from(TOPIC_OF_CAR, T0, at_once=1),
     ],
 )
-def test_only_what_is_asked_for_is_read(read):
+def test_the_first_item_is_read_alone(read):
     client = FakeDynamoDB(page_items=100)
     store(client, *range(T0, T0 + 9))
     next(read(tables(client)))
     assert client.read == 1
 
 
-def test_a_topic_with_nothing_stored(client):
+def test_a_topic_without_batches_reads_empty(client):
     assert list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=10)) == []
     assert list(tables(client).before(TOPIC_OF_CAR, T0)) == []
 
@@ -145,16 +145,16 @@ def test_a_topic_with_nothing_stored(client):
         ({"speed_to_erpm_gain": Decimal(1), "speed_to_erpm_offset": ["1"]}, None),
     ],
 )
-def test_a_vehicle_is_what_its_row_says_and_a_wrong_row_is_none(client, row, vehicle):
+def test_a_vehicle_is_read_from_its_row_and_an_invalid_row_gives_no_vehicle(client, row, vehicle):
     put(client, ROBOTS, {name: serialize(value) for name, value in {"robot": "car", **row}.items()})
     assert tables(client).vehicle("car") == vehicle
 
 
-def test_a_robot_that_is_not_registered_has_no_vehicle(client):
+def test_an_unregistered_robot_has_no_vehicle(client):
     assert tables(client).vehicle("nobody") is None
 
 
-def test_the_registry_is_read_once_a_minute_or_when_it_is_told_to(monkeypatch):
+def test_the_registry_is_read_once_a_minute_or_on_demand(monkeypatch):
     client, now = FakeDynamoDB(), [0.0]
     monkeypatch.setattr(tables_module.time, "monotonic", lambda: now[0])
     asked = tables(client)
@@ -174,7 +174,7 @@ def test_the_registry_is_read_once_a_minute_or_when_it_is_told_to(monkeypatch):
 # --- summary ----------------------------------------------------------------------------------------
 
 
-def test_seconds_are_written_flat_and_read_back(client):
+def test_seconds_are_read_back_as_they_were_written(client):
     summary = {"n": 50, "a_min": -1.5, "b_last": "text", "c_last": False, EXPIRES_S: 1_800_000_000}
     tables(client).put_seconds({(TOPIC_OF_CAR, 1_700_000_000): summary})
     if isinstance(client, FakeDynamoDB):
@@ -185,19 +185,19 @@ def test_seconds_are_written_flat_and_read_back(client):
 
 
 @pytest.mark.parametrize("n", [0, 1, 25, 26, 60])
-def test_writes_go_out_in_calls_of_at_most_25(n):
+def test_writes_are_sent_in_calls_of_at_most_25_items(n):
     client = FakeDynamoDB()
     tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(n)})
     assert sorted(summary_of(client)) == list(range(n))
     assert client.calls["batch_write_item"] == math.ceil(n / 25)
 
 
-def test_more_than_one_call_of_seconds_against_moto(dynamodb):
+def test_moto_takes_seconds_in_several_calls(dynamodb):
     tables(dynamodb).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(60)})
     assert dynamodb.scan(TableName=SUMMARY, Select="COUNT")["Count"] == 60
 
 
-def test_what_dynamodb_did_not_process_is_sent_again_after_ever_longer_waits(slept):
+def test_unprocessed_items_are_sent_again_with_backoff(slept):
     client = FakeDynamoDB(unprocessed=3)
     tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": second} for second in range(30)})
     assert {second: item["n"] for second, item in summary_of(client).items()} == {s: s for s in range(30)}
@@ -206,23 +206,23 @@ def test_what_dynamodb_did_not_process_is_sent_again_after_ever_longer_waits(sle
     assert slept[0] < slept[-1]
 
 
-def test_what_dynamodb_never_processes_is_an_error_in_the_time_there_is(slept):
+def test_items_that_stay_unprocessed_are_an_error_within_lambdas_time(slept):
     client = FakeDynamoDB(unprocessed=10**9)
     with pytest.raises(TableError, match=r"12 items of summary not written after 8 attempts"):
         tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(20)})
-    # Lambda 2 has 60 s; a call takes a few milliseconds.
+    # Lambda 2 has 60 s; one call takes a few milliseconds.
     assert sum(slept) < 10
 
 
-def test_a_summary_too_large_for_an_item_goes_without_its_largest_values(dynamodb):
-    """As many fields as a batch may have, each with the longest text there may be."""
+def test_a_summary_too_large_for_an_item_omits_its_largest_values(dynamodb):
+    """The maximum number of fields, each with the longest allowed text."""
     summary = {f"note_{i:03}_last": "ä" * (4096 - i) for i in range(512)} | {"n": 50, "a_mean": 1.5}
     tables(dynamodb).put_seconds({(TOPIC_OF_CAR, 1): summary})
     item = plain(dynamodb.scan(TableName=SUMMARY)["Items"][0])
     kept = [name for name in summary if name in item]
     assert item["omitted"] == len(summary) - len(kept) > 0
     assert (item["n"], item["a_mean"]) == (50, Decimal("1.5"))
-    # The shortest ones stayed, and nearly all the room there is was used.
+    # The shortest values stayed, and they use nearly all of the item's size.
     assert sorted(kept)[:1] == ["a_mean"]
     assert "note_511_last" in item
     assert sum(len(str(value).encode()) for value in item.values()) > 350_000
@@ -256,7 +256,7 @@ def test_a_summary_too_large_for_an_item_goes_without_its_largest_values(dynamod
         (math.nan, {"S": "nan"}),
     ],
 )
-def test_a_value_is_the_attribute_that_dynamodb_takes(value, expected):
+def test_a_value_becomes_a_valid_dynamodb_attribute(value, expected):
     assert attribute(value) == expected
 
 
@@ -270,7 +270,7 @@ values = (
 
 
 @given(values)
-def test_every_value_is_read_back_as_it_was_or_as_near_as_dynamodb_can(value):
+def test_every_value_is_read_back_with_dynamodbs_precision(value):
     back = plain({"a": attribute(value)})["a"]
     if isinstance(value, float) and abs(value) > 9.99e125:
         assert back == repr(value)
@@ -281,7 +281,7 @@ def test_every_value_is_read_back_as_it_was_or_as_near_as_dynamodb_can(value):
         assert isinstance(back, bool) == isinstance(value, bool)
 
 
-def test_a_robot_that_names_ever_new_streams_has_a_bounded_row(client):
+def test_a_robot_with_ever_new_streams_has_a_bounded_row(client):
     put(client, ROBOTS, {"robot": {"S": "car"}})
     written = tables(client)
     for number in range(tables_module.MAX_STREAMS + 5):

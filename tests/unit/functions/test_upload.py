@@ -1,4 +1,4 @@
-"""Upload: what a robot asks, what the function answers, and what its addresses allow."""
+"""Upload: the robot's requests, the function's answers, and the uploads that its addresses allow."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ SMALL = asking(b"small", 1)
 # --- the contract -----------------------------------------------------------------------------------
 
 
-def test_a_request_survives_the_wire():
+def test_a_request_is_decoded_as_it_was_encoded():
     for request in (SMALL, asking(bytes(PART_BYTES + 1), 1, 2, done=True)):
         wire = encode_file_request(request)
         assert decode_file_request(wire) == request
@@ -103,7 +103,7 @@ def test_a_request_survives_the_wire():
         {"t": -1},
     ],
 )
-def test_a_file_that_is_not_allowed_is_refused_on_both_sides(wrong):
+def test_encoder_and_decoder_refuse_an_invalid_file(wrong):
     envelope = json.loads(encode_file_request(SMALL))
     envelope["file"].update(wrong)
     with pytest.raises(ContractError):
@@ -128,12 +128,12 @@ def test_a_file_that_is_not_allowed_is_refused_on_both_sides(wrong):
         {"parts_sha256": "x"},
     ],
 )
-def test_a_request_that_is_not_allowed_is_refused(wrong):
+def test_an_invalid_request_for_a_file_is_refused(wrong):
     with pytest.raises(ContractError):
         decode_file_request({**json.loads(encode_file_request(SMALL)), **wrong})
 
 
-def test_no_more_addresses_are_asked_for_than_fit_a_message():
+def test_a_request_asks_for_at_most_as_many_addresses_as_fit_a_message():
     content = file_of(b"")
     large = replace(content, size=PART_BYTES * 20)
     with pytest.raises(ContractError, match="at most 16"):
@@ -154,7 +154,7 @@ def test_no_more_addresses_are_asked_for_than_fit_a_message():
         FileAnswer(ID, refused="never"),
     ],
 )
-def test_an_answer_survives_the_wire(answer):
+def test_an_answer_is_decoded_as_it_was_encoded(answer):
     assert decode_file_answer(encode_file_answer(answer)) == answer
 
 
@@ -171,13 +171,13 @@ def test_an_answer_survives_the_wire(answer):
         {"id": None},
     ],
 )
-def test_an_answer_that_is_not_one_is_refused(wrong):
+def test_an_invalid_answer_is_refused(wrong):
     envelope = {"v": 1, "id": ID, "key": "robots/car/x", "stored": False}
     with pytest.raises(ContractError):
         decode_file_answer(json.dumps({**envelope, **wrong}))
 
 
-def test_the_key_is_the_robots_the_times_and_the_contents():
+def test_a_files_key_has_its_robot_time_and_content_hash():
     key = file_key("car", SMALL.file)
     assert key == f"robots/car/2023/11/14/221320-{sha256(b'small')[:12]}/drive.bag"
     assert file_key("car", file_of(b"other")) != key
@@ -200,7 +200,7 @@ def test_the_key_is_the_robots_the_times_and_the_contents():
         "robots/car/2023/11/14/221320-0123456789AB/drive.bag",
     ],
 )
-def test_a_key_that_is_not_ours_is_refused(key):
+def test_an_invalid_key_is_refused(key):
     with pytest.raises(ContractError):
         parse_file_key(key)
 
@@ -209,7 +209,7 @@ def test_a_key_that_is_not_ours_is_refused(key):
 
 
 class ListsChecksums:
-    """moto's client, whose ListParts leaves out what S3 says of each part: its checksum."""
+    """moto's client; it adds the checksum of each part, which moto's ListParts omits."""
 
     def __init__(self, client):
         self._client = client
@@ -254,7 +254,7 @@ def dynamodb(aws):
 
 @pytest.fixture
 def ask(s3, dynamodb):
-    """Asks as `car`, unless another robot is named."""
+    """Send a request as `car`, or as another named robot."""
 
     def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
         allotment = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
@@ -263,7 +263,7 @@ def ask(s3, dynamodb):
     return ask
 
 
-def test_a_small_files_address_allows_this_content_once_and_nothing_else(ask):
+def test_a_small_files_address_allows_exactly_this_content_once(ask):
     (address,) = ask(SMALL).addresses
     url = urlsplit(address.url)
     query = {name: value for name, (value,) in parse_qs(url.query).items()}
@@ -279,7 +279,7 @@ def test_a_small_files_address_allows_this_content_once_and_nothing_else(ask):
     assert address.headers["x-amz-meta-sha256"] == SMALL.file.sha256
 
 
-def test_a_parts_address_allows_this_part_and_nothing_else(ask):
+def test_a_parts_address_allows_exactly_this_part(ask):
     content = bytes(PART_BYTES) + b"rest"
     first, second = ask(asking(content, 1, 2)).addresses
     for address, size in ((first, PART_BYTES), (second, 4)):
@@ -289,11 +289,11 @@ def test_a_parts_address_allows_this_part_and_nothing_else(ask):
         assert address.headers["content-length"] == str(size)
 
 
-def test_what_is_stored_is_not_asked_for_again(ask, s3):
+def test_a_stored_file_is_not_requested_again(ask, s3):
     s3.put_object(Bucket=NAME, Key=file_key("car", SMALL.file), Body=b"small")
     answer = ask(SMALL)
     assert (answer.stored, answer.addresses) == (True, ())
-    # A key that only begins the same is another.
+    # A key with the same beginning is another file.
     assert not ask(replace(SMALL, file=replace(SMALL.file, name="drive.ba"))).stored
     assert not ask(SMALL, "car-2", bytes_a_day=0).stored
 
@@ -305,7 +305,7 @@ def put(s3, key, upload_id, part, content):
     )
 
 
-def test_a_large_file_goes_on_where_it_was_and_ends_as_one_object(ask, s3):
+def test_a_large_file_resumes_and_becomes_one_object(ask, s3):
     content = bytes(2 * PART_BYTES) + b"rest"
     key, parts = file_key("car", file_of(content)), parts_of(content)
     assert [one.part for one in ask(asking(content, 1, 2, 3)).addresses] == [1, 2, 3]
@@ -315,7 +315,7 @@ def test_a_large_file_goes_on_where_it_was_and_ends_as_one_object(ask, s3):
     answer = ask(asking(content, 1, 2, 3))
     assert answer.have == ((1, 1), (3, 3))
     assert [one.part for one in answer.addresses] == [2]
-    # Whoever says that it is done before it is, is told what it has.
+    # A robot that reports "done" too early gets the stored parts.
     assert not ask(asking(content, done=True)).stored
     put(s3, key, begun["UploadId"], 2, parts[2])
     assert ask(asking(content, done=True)).stored
@@ -340,7 +340,7 @@ def test_parts_of_another_content_never_become_the_file(ask, s3):
     assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
 
 
-def test_a_day_has_so_many_bytes_and_a_large_file_counts_once(ask, dynamodb):
+def test_a_robots_bytes_a_day_are_limited_and_a_large_file_counts_once(ask, dynamodb):
     content = bytes(PART_BYTES + 1)
     limit = {"bytes_a_day": PART_BYTES + 7}
     for _ in range(3):
@@ -352,17 +352,17 @@ def test_a_day_has_so_many_bytes_and_a_large_file_counts_once(ask, dynamodb):
     assert ask(SMALL, **limit, now_s=NOW_S + 86_400).addresses
     row = dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "car"}})["Item"]
     assert row[FILES_BYTES] == {"N": "5"}
-    # To ask whether it is there costs nothing.
+    # Asking whether a file is stored does not count.
     assert ask(replace(SMALL, parts={}), **limit).refused is None
 
 
-def test_a_robot_that_is_not_registered_gets_no_address(ask, dynamodb):
-    assert ask(SMALL, "stranger").refused
-    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "stranger"}})
+def test_an_unregistered_robot_gets_no_address(ask, dynamodb):
+    assert ask(SMALL, "unregistered").refused
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "unregistered"}})
 
 
 class Desk:
-    """One environment of the function: what it answered, and what went to the queue before the quarantine."""
+    """One environment of the function, with its answers and its dead letters."""
 
     def __init__(self, s3, dynamodb):
         self.bucket = Bucket(s3, NAME)
@@ -390,7 +390,7 @@ def desk(s3, dynamodb):
 
 
 def event(request, robot="car", **changes):
-    """What the upload rule makes of a request with some of it changed."""
+    """The event that the upload rule makes from a changed request."""
     message = json.dumps({**json.loads(encode_file_request(request)), **changes}).encode()
     return rule_event(message, build_topic(PING, robot, FILE), 1_700_000_000_123)
 
@@ -409,7 +409,7 @@ def test_the_robot_of_the_topic_is_answered_and_counted(desk, capsys, s3):
     assert units["StoredBytes"] == "Bytes"
 
 
-def test_a_robot_learns_what_is_wrong_with_its_request(desk, capsys):
+def test_a_robot_is_told_the_fault_of_its_request(desk, capsys):
     desk(event(SMALL, parts={"9": "x"}))
     ((_, answer),) = desk.answered
     assert answer.id == ID
@@ -434,7 +434,7 @@ def test_every_malformed_request_is_answered_or_kept(desk, message):
     desk(rule_event(message, build_topic(PING, "car", FILE), 1))
     assert (len(desk.answered), len(desk.kept)) in {(1, 0), (0, 1)}
     for _, answer in desk.answered:
-        # The robot knows it for the answer to what it asked.
+        # The id matches the answer to its request.
         sent = encode_file_answer(answer)
         assert decode_file_answer(sent).id == json.loads(message)["id"]
     for body in desk.kept:
@@ -443,13 +443,13 @@ def test_every_malformed_request_is_answered_or_kept(desk, message):
         assert entry.reason.startswith("Refused: ")
 
 
-def test_what_the_queue_does_not_take_fails_the_invocation(desk):
+def test_the_invocation_fails_if_the_queue_does_not_take_a_dead_letter(desk):
     desk.takes = False
     with pytest.raises(ContractError):
         desk(rule_event(b"{}", build_topic(PING, "car", FILE), 1))
 
 
-def test_the_handler_signs_and_publishes_with_the_clients_of_its_environment(aws, s3, dynamodb, monkeypatch):
+def test_the_handler_uses_the_clients_of_its_environment(aws, s3, dynamodb, monkeypatch):
     from moto.backends import get_backend
     from moto.core import DEFAULT_ACCOUNT_ID
 

@@ -1,4 +1,4 @@
-"""The kept assembly is used as long as it is right, and not a moment longer."""
+"""The kept assembly is reused until any of its inputs changes."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ def assembly(checkout):
     return get
 
 
-def test_same_again_is_not_synthesized_again(assembly):
+def test_unchanged_inputs_are_not_synthesized_again(assembly):
     assert [assembly(), assembly(), assembly()] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(
     "changed", ["app.py", "contract/iort_contract/one.py", "cdk.json", "stacks/one.py", "functions/one.py"]
 )
-def test_any_change_is_synthesized(assembly, checkout, changed):
+def test_any_changed_file_is_synthesized_again(assembly, checkout, changed):
     assembly()
     (checkout / changed).write_text("changed")
     assert assembly() == 2
 
 
-def test_new_file_and_another_namespace_are_synthesized(assembly, checkout):
+def test_a_new_file_or_namespace_is_synthesized(assembly, checkout):
     assembly()
     (checkout / "functions" / "two.py").write_text("")
     assert assembly() == 2
     assert assembly("other") == 3
 
 
-def test_failed_synthesis_leaves_nothing_to_be_used(checkout):
+def test_a_failed_synthesis_is_not_kept(checkout):
     def fail(output):
         output.mkdir()
         raise RuntimeError
@@ -65,7 +65,7 @@ def test_failed_synthesis_leaves_nothing_to_be_used(checkout):
             deployment.assembly(checkout, checkout / "build", namespace="iort", synthesize=fail)
 
 
-def test_old_ones_are_removed(assembly, checkout):
+def test_old_assemblies_are_removed(assembly, checkout):
     for i in range(8):
         assembly(f"n{i}")
     assert len(list((checkout / "build").iterdir())) == kept._KEPT

@@ -1,4 +1,4 @@
-"""The examples of AWS' own documentation, on our reading of IoT SQL and on the emulator's."""
+"""The examples of AWS' documentation give the same results in our IoT SQL and in the emulator's."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def ours(sql, topic, payload):
 
 
 def ministacks(sql, topic, payload):
-    """As the patched broker does it when a message comes."""
+    """Evaluate as the patched broker does for a message."""
     message = iot._rule_message(payload)
     where = iot._rule_where_clause(sql)
     if where and not iot._eval_where(where, topic, payload, message):
@@ -90,12 +90,12 @@ def run(request, monkeypatch):
         ("SELECT a FROM 'a' WHERE a > 1", {"a": "x"}, None),
         ("SELECT a FROM 'a' WHERE a > 1", {"a": None}, None),
         ("SELECT a FROM 'a' WHERE a > 0", {"a": True}, None),
-        # <> of mismatched types is true, and of Undefined neither true nor false.
+        # <> is true for mismatched types, and neither true nor false for Undefined.
         ("SELECT a FROM 'a' WHERE a <> ''", {"a": 7}, {"a": 7}),
         ("SELECT a FROM 'a' WHERE a <> ''", {"a": ""}, None),
     ],
 )
-def test_an_example_of_a_statement(run, sql, payload, expected):
+def test_a_documented_statement_gives_its_result(run, sql, payload, expected):
     assert run(sql, "topic/subtopic", json.dumps(payload).encode()) == expected
 
 
@@ -104,23 +104,23 @@ def test_an_example_of_a_statement(run, sql, payload, expected):
     [
         (THING, "topic()", THING),
         (THING, "topic(1)", "things"),
-        # Of Basic Ingest's topic, whose prefix is not available to the function.
+        # Basic Ingest's prefix is not available to the function.
         (BUILDING, "topic()", BUILDING),
         (BUILDING, "topic(3)", "Floor2"),
     ],
 )
-def test_an_example_of_topic(run, topic, call, expected):
+def test_a_documented_topic_call_gives_its_result(run, topic, call, expected):
     assert run(f"SELECT {call} AS t FROM '#'", topic, b"{}") == {"t": expected}
 
 
 @pytest.mark.parametrize("payload", [b'{"a": 1.50}', b"no JSON", b"\xff\x00", b"", b"[1, 2]"])
 def test_a_binary_payload_is_encoded_byte_by_byte(run, payload):
-    """ "Working with binary payloads": with functions beside it, for any payload."""
+    """ "Working with binary payloads": also beside functions, for any payload."""
     sql = "SELECT encode(*, 'base64') AS data, timestamp() AS ts FROM 'topic/subtopic'"
     assert run(sql, "topic/subtopic", payload) == {"data": base_64(payload), "ts": NOW_MS}
 
 
-def test_which_of_two_keys_of_one_name_stays_is_a_choice_that_aws_does_not_document():
+def test_both_undocumented_orders_of_duplicate_keys_can_be_evaluated():
     message = Message("a/b", b'{"topic": "mine", "x": 1}')
     sql = "SELECT *, topic() AS topic FROM 'a/b'"
     assert evaluate(sql, message) == {"topic": "a/b", "x": 1}

@@ -1,4 +1,4 @@
-"""What the stand-in for PubNub keeps, and how much of it."""
+"""The history of PubNub's stand-in, and its bounds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ def message(token, channel, size=1):
     return Message(token, channel, "", "x" * size)
 
 
-def test_history_keeps_the_newest_of_a_channel():
+def test_the_history_keeps_the_newest_messages_of_a_channel():
     history = History()
     for token in range(1, 251):
         history.add(message(token, "a"))
@@ -17,7 +17,7 @@ def test_history_keeps_the_newest_of_a_channel():
     assert tokens == list(range(151, 251))
 
 
-def test_history_is_bounded():
+def test_the_history_is_bounded_in_channels_and_bytes():
     history, everything = History(channels=3, size_bytes=10), Subscription(["c.*"])
     for token in range(1, 6):
         history.add(message(token, f"c.{token}"))
@@ -28,7 +28,7 @@ def test_history_is_bounded():
     assert [kept.token for _, kept in history.after(0, everything)] == [7]
 
 
-def test_what_a_channel_forgets_makes_room():
+def test_messages_dropped_from_a_channel_free_their_bytes():
     history = History(size_bytes=1_000)
     history.add(message(1, "quiet"))
     for token in range(2, 500):
@@ -36,7 +36,7 @@ def test_what_a_channel_forgets_makes_room():
     assert [kept.token for _, kept in history.after(0, Subscription(["quiet"]))] == [1]
 
 
-def test_an_answer_is_bounded_and_its_cursor_goes_on_from_there():
+def test_an_answer_is_bounded_and_its_cursor_continues():
     history, wanted = History(), Subscription(["c.*"])
     for token in range(1, 301):
         history.add(message(token, f"c.{token % 4}"))

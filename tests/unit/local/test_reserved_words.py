@@ -1,4 +1,4 @@
-"""No expression names an attribute that is one of DynamoDB's reserved words: only a request would say so."""
+"""No expression names one of DynamoDB's reserved words; otherwise only a request would reveal the error."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from ministack.services._dynamodb_keywords import AWS_KEYWORDS
 
 from local.deployment import ROOT
 
-# What the language of expressions is made of; two of them are reserved as names for that reason.
+# Keywords of the expression language; two of them are therefore reserved as names.
 LANGUAGE = {
     *("set", "add", "remove", "delete", "and", "or", "not", "between", "in"),
     *("attribute_exists", "attribute_not_exists", "attribute_type", "begins_with", "contains", "size"),
     *("if_not_exists", "list_append"),
 }
 WORD = re.compile(r"[#:]?[A-Za-z_]\w*")
-# An expression, told from other text by what no sentence has.
+# Patterns that occur in expressions and in no ordinary text.
 EXPRESSION = re.compile(r"attribute_(not_)?exists\(|(=|<|>|BETWEEN|ADD \S+) :\w|^\s*REMOVE [#\w]")
 PLACEHOLDER = "#unknown"
 
 
 def text_of(node, module):
-    """A string with what constants of its module put into it; None for any other node."""
+    """A string with its module's constants filled in; None for any other node."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if not isinstance(node, ast.JoinedStr):

@@ -1,7 +1,7 @@
-"""Lambda 2 under the stream's mapping: whatever goes wrong, the summary is right and nothing is lost.
+"""Lambda 2 under the stream's mapping: the summary is right and no record is lost after any fault.
 
-`local.gaps.parts.stream_mapping` does what AWS documents. Hypothesis makes histories of poison, throttled
-tables, time-outs, lost acknowledgements and repeated batches, and the real handler runs in them.
+`local.gaps.parts.stream_mapping` follows AWS' documentation. Hypothesis makes histories of poison, throttled
+tables, time-outs, lost acknowledgements and repeated batches, and runs the real handler on them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def failed(*which):
 
 
 class Run:
-    """A shard with records, a function that answers by the numbers of its records, and what it saw."""
+    """A shard with records, a function that answers by record numbers, and the records that it received."""
 
     def __init__(self, given, count=8, **changes):
         self.shard = Shard(Settings(**{"batch_size": 8, **changes}))
@@ -101,43 +101,43 @@ def test_the_lowest_number_is_the_checkpoint():
     assert run.seen == [list(range(8)), [3, 4, 5, 6, 7]]
 
 
-def test_without_the_setting_partial_answers_are_successes():
+def test_partial_answers_without_the_setting_are_successes():
     run = Run(lambda _: failed("000003")).all()
     assert run.seen == [list(range(8))]
 
 
-def test_an_error_is_tried_as_often_as_allowed_and_then_given_up():
+def test_a_failing_batch_is_retried_up_to_the_limit_and_then_given_up():
     run = Run(lambda _: Answer(error=True), max_retries=3).all()
     assert run.seen == [list(range(8))] * 4
     assert run.given_up == [(Condition.RETRIES, list(range(8)))]
 
 
-def test_bisecting_isolates_the_record_that_fails_in_order_and_does_not_count_as_a_retry():
+def test_bisecting_isolates_the_failing_record_in_order_without_counting_as_a_retry():
     run = Run(lambda seen: Answer(error=5 in seen), bisect=True, max_retries=0).all()
     assert run.seen == [[*range(8)], [0, 1, 2, 3], [4, 5, 6, 7], [4, 5], [4], [5], [6, 7]]
     assert run.given_up == [(Condition.RETRIES, [5])]
 
 
-def test_an_error_is_bisected_whatever_partial_answers_say():
+def test_an_error_is_bisected_also_with_partial_answers():
     run = Run(lambda seen: Answer(error=0 in seen), bisect=True, report_failures=True, max_retries=0).all()
     assert run.given_up == [(Condition.RETRIES, [0])]
 
 
-def test_a_throttle_counts_for_nothing():
+def test_a_throttle_does_not_count_as_a_retry():
     answers = iter([Answer(throttled=True)] * 50 + [Answer()])
     run = Run(lambda _: next(answers), max_retries=0, bisect=True).all()
     assert len(run.seen) == 51
     assert run.given_up == []
 
 
-def test_what_is_too_old_is_given_up_before_it_is_tried():
+def test_a_record_over_the_age_limit_is_given_up_without_a_try():
     shard = Shard(Settings(batch_size=8, max_age_s=60))
     shard.put([record(0, at_s=0), record(1, at_s=50), record(2, at_s=100)])
     (lane,) = shard.lanes
     assert numbers(lane.batch(100)) == [1, 2]
     (old,) = shard.discarded()
     assert (old.condition, numbers(old.records)) == (Condition.AGE, [0])
-    # And while it is tried.
+    # The same while it is retried.
     lane.answered(Answer(error=True))
     assert numbers(lane.batch(111)) == [2]
     assert [numbers(one.records) for one in shard.discarded()] == [[1]]
@@ -148,7 +148,7 @@ def window(**changes):
     return shard, shard.lanes[0]
 
 
-def test_records_are_gathered_until_the_window_is_over():
+def test_records_are_gathered_until_the_window_ends():
     shard, lane = window()
     assert lane.batch(9) == []
     assert lane.due_s is None
@@ -161,12 +161,12 @@ def test_records_are_gathered_until_the_window_is_over():
     assert lane.due_s is None
 
 
-def test_a_full_batch_waits_for_no_window():
+def test_a_full_batch_does_not_wait_for_the_window():
     shard, lane = window()
     shard.put(record(n) for n in range(4))
     assert numbers(lane.batch(10)) == [0, 1, 2]
     lane.answered(Answer())
-    # The rest begins a window of its own.
+    # The remaining record begins a new window.
     assert lane.batch(10) == []
     assert numbers(lane.batch(12)) == [3]
 
@@ -177,7 +177,7 @@ def test_the_payload_limit_ends_the_window():
     assert numbers(lane.batch(10)) == [0, 1]
 
 
-def test_what_is_tried_again_waits_for_no_window():
+def test_a_retry_does_not_wait_for_the_window():
     shard, lane = window(bisect=True)
     shard.put(record(n) for n in range(3))
     assert numbers(lane.batch(10)) == [0, 1, 2]
@@ -185,7 +185,7 @@ def test_what_is_tried_again_waits_for_no_window():
     assert numbers(lane.batch(10)) == [0]
 
 
-def test_what_is_too_old_begins_no_window():
+def test_a_record_over_the_age_limit_begins_no_window():
     shard, lane = window(max_age_s=60)
     shard.put([record(0, at_s=0)])
     assert lane.batch(59) == []
@@ -207,7 +207,7 @@ def test_an_event_has_at_most_6_mb():
     assert seen == [[0, 1, 2], [3, 4]]
 
 
-def test_concurrent_batches_keep_the_order_of_an_item_only():
+def test_concurrent_batches_keep_only_the_order_of_an_item():
     shard = Shard(Settings(batch_size=2, parallel=4))
     shard.put(record(n % 3) for n in range(12))
     for lane in shard.lanes:
@@ -222,11 +222,11 @@ def test_concurrent_batches_keep_the_order_of_an_item_only():
 
 
 class Crash(BaseException):
-    """The handler's process is gone: killed by a time-out, or by a fault that no code caught."""
+    """The handler's process ended: by a time-out, or by an uncaught fault."""
 
 
 class Faulty(FakeDynamoDB):
-    """Throttles or ends the handler at calls of its choosing, before or after the write."""
+    """A fake DynamoDB that throttles or ends the handler at chosen calls, before or after the write."""
 
     def __init__(self, faults):
         super().__init__(page_items=3)
@@ -252,7 +252,7 @@ POISON = ("undecodable", "fatal")
 
 @st.composite
 def histories(draw):
-    """Batches of two robots with numbers in order, some of them poison; and what goes wrong when."""
+    """Numbered batches of two robots, some of them poison, with the faults of each call."""
     kinds = draw(
         st.lists(
             st.tuples(st.sampled_from(["car", "bus"]), st.sampled_from(["good"] * 5 + list(POISON))),
@@ -282,7 +282,7 @@ def test_the_summary_is_right_and_every_poison_record_is_kept(history, size, hal
         Settings(
             batch_size=size,
             bisect=True,
-            # As many as faults, so that only poison is given up.
+            # As many retries as faults, so that only poison is given up.
             max_retries=len(faults) + len(jams) + 1,
             report_failures=True,
             parallel=parallel,
@@ -291,7 +291,7 @@ def test_the_summary_is_right_and_every_poison_record_is_kept(history, size, hal
     )
     poison, fatal, records = set(), set(), []
     for n, (robot, kind) in enumerate(kinds):
-        # Two batches a second: every second is made of several records, often of different events.
+        # Two batches a second: a second has several records, often from different events.
         topic, start_us = f"dt/iort/{robot}/vesc", T0 + n * 400_000
         item = item_of(Batch("aaaaaaaa", n, [start_us, start_us + 20_000], {"speed": [n, n]}), topic)
         if kind == "undecodable":
@@ -308,7 +308,7 @@ def test_the_summary_is_right_and_every_poison_record_is_kept(history, size, hal
     quarantined, jam = set(), iter(jams)
 
     def refuse(refused):
-        """The queue before the quarantine; now and then it takes nothing."""
+        """A fake dead-letter queue that sometimes takes no message."""
         if refused and next(jam, False):
             return list(refused)
         quarantined.update(one.number for one in refused)
@@ -324,20 +324,20 @@ def test_the_summary_is_right_and_every_poison_record_is_kept(history, size, hal
         batch = lane.batch(0)
         lane.answered(invoke(batch, client, refuse, fatal))
         if rng.random() < 0.2:
-            # An acknowledgement was lost: the same records once more, after what came later.
+            # An acknowledgement was lost: the same records are delivered again after later ones.
             invoke(batch, client, refuse, fatal)
         given_up |= {one["dynamodb"]["SequenceNumber"] for d in shard.discarded() for one in d.records}
     assert not shard.size, "the shard is blocked"
 
     assert quarantined == poison
-    # A record on which the handler dies ends in the failure destination, alone.
+    # A record that ends the handler goes to the failure destination alone.
     assert given_up == fatal
     whole = tables(expected)
     process({"Records": [r for r in records if r["dynamodb"]["SequenceNumber"] not in fatal]}, whole, list)
     for robot in ("car", "bus"):
         topic = f"dt/iort/{robot}/vesc"
         got, want = summary_of(client, topic), summary_of(expected, topic)
-        # What Lambda 2 died on is stored, and so in the summary of any neighbour that shares its second.
+        # The record that ended Lambda 2 is stored, so it counts in the summary of its second's neighbours.
         assert got == want
 
 
@@ -350,7 +350,7 @@ def invoke(batch, client, refuse, fatal):
         return Answer(error=True)
 
 
-def test_a_table_throttled_for_long_gives_the_batches_up_with_their_place_in_the_stream(monkeypatch):
+def test_batches_are_given_up_with_their_stream_position_after_long_throttling(monkeypatch):
     monkeypatch.setattr(tables_module.time, "sleep", lambda _: None)
     client = FakeDynamoDB(unprocessed=10**9)
     shard, topic = Shard(DEPLOYED), "dt/iort/car/vesc"
@@ -364,7 +364,7 @@ def test_a_table_throttled_for_long_gives_the_batches_up_with_their_place_in_the
         lane.answered(invoke(batch, client, list, set()))
     given_up = [one["dynamodb"]["SequenceNumber"] for d in shard.discarded() for one in d.records]
     assert not shard.size
-    # One record by itself is written at last (the fake takes the first of every call).
+    # A single record is written in the end (the fake takes the first of every call).
     assert set(given_up) <= {record_of(item, n)["dynamodb"]["SequenceNumber"] for n, item in enumerate(items)}
     replayed = FakeDynamoDB()
     replayed.items = client.items
@@ -376,14 +376,14 @@ def test_a_table_throttled_for_long_gives_the_batches_up_with_their_place_in_the
     assert sorted(summary_of(replayed)) == [T0 // S + n for n in range(4)]
 
 
-def test_two_batches_of_a_robot_at_once_could_leave_an_old_summary_behind():
-    """Why ParallelizationFactor is 1: with more, order is kept for an item and not for a topic."""
+def test_concurrent_batches_of_a_robot_could_leave_an_outdated_summary():
+    """ParallelizationFactor must be 1: a larger one keeps the order of an item, but not of a topic."""
     client, topic = FakeDynamoDB(), "dt/iort/car/vesc"
     first, second = (item_of(Batch("aaaaaaaa", n, [T0 + n * 400_000], {"a": [n]}), topic) for n in range(2))
     client.put(TELEMETRY, first)
 
     class Slow(FakeDynamoDB):
-        """The first invocation: between its reading and its writing, the second one runs as a whole."""
+        """In the first invocation, between reading and writing, the second one runs completely."""
 
         items = client.items
 
@@ -398,6 +398,6 @@ def test_two_batches_of_a_robot_at_once_could_leave_an_old_summary_behind():
 
     process({"Records": [record_of(first, 1)]}, tables(Slow()), list)
     assert [item["n"] for item in summary_of(client).values()] == [1]
-    # One after the other, as a mapping with one batch at a time does it:
+    # In sequence, as a mapping with one batch at a time runs them:
     process({"Records": [record_of(second, 2)]}, tables(client), list)
     assert [item["n"] for item in summary_of(client).values()] == [2]

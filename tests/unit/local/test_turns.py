@@ -1,4 +1,4 @@
-"""Whoever submits many calls makes nobody wait for them."""
+"""A caller with many calls does not delay other callers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from local.gaps.parts.turns import Turns
 
 
-def test_who_has_calls_waiting_takes_turns_with_the_others():
+def test_callers_with_waiting_calls_take_turns():
     turns, begun, go, done = Turns(1), threading.Event(), threading.Event(), threading.Event()
     called = []
 
@@ -27,7 +27,7 @@ def test_who_has_calls_waiting_takes_turns_with_the_others():
     assert called == ["many 0", "few 0", "many 1", "few 1", "many 2", "many 3", "many 4"]
 
 
-def test_a_call_that_fails_ends_no_thread():
+def test_a_failing_call_does_not_end_its_thread():
     turns, done = Turns(1), threading.Event()
     turns.submit("a", [].pop)
     turns.submit("a", done.set)

@@ -10,7 +10,7 @@ from iort_contract.tables import BATCH, NONFINITE
 
 
 def old_envelope(batch: Batch, **changes: Any) -> dict[str, Any]:
-    """The batch as a message of version 1, with some of it changed. Samples were written as they are now."""
+    """The batch as a changed message of version 1. The form of the samples has not changed since."""
     envelope = json.loads(encode_batch(batch))
     del envelope[BATCH]
     head = {"v": 1, "boot": batch.boot, "seq": batch.seq, "t": batch.t_us}

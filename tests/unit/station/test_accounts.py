@@ -1,4 +1,4 @@
-"""What the audit takes for the last that a run said, and for a run that goes on."""
+"""The audit finds a source's last account, and decides whether its run still goes on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def scan(taken, *, ended=False):
 
 
 def stored(count):
-    """A stream of that many batches of fifty."""
+    """A stream of n batches with fifty samples each."""
     items = [
         {"batch": f"{T_US + seq:016d}-{BOOT}-{seq}", "n": "50", "received_ms": str(T_US // 1000)}
         for seq in range(count)
@@ -32,7 +32,7 @@ def stored(count):
     return audit("scan", items)
 
 
-def test_the_last_account_is_the_last_though_the_clock_was_set_back():
+def test_the_newest_account_wins_after_the_clock_was_set_back():
     items = [
         told(2, SourceAccount("queue", {"dropped_samples": 50}).sample(), t_us=T_US - HOUR_US),
         told(1, scan(150, ended=True), t_us=T_US - HOUR_US),
@@ -46,7 +46,7 @@ def test_the_last_account_is_the_last_though_the_clock_was_set_back():
     assert short.samples == 50
 
 
-def test_whether_a_run_goes_on_is_told_by_the_clouds_clock():
+def test_the_clouds_clock_decides_whether_a_run_goes_on():
     for off_us in (0, -24 * HOUR_US, 24 * HOUR_US):
         found = last_of([told(0, scan(100), t_us=T_US + off_us, received_us=T_US)])
         assert held_against(stored(2), found, T_US + 1_000_000).complete

@@ -1,4 +1,4 @@
-"""`iort adopt`: every batch of an old table is in the new one, once, with all that it held, or is told."""
+"""`iort adopt` copies every batch of an old table once and completely, or reports it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAST = 10**9
 
 
 class Cloud:
-    """A cloud with moto's DynamoDB; ``taken`` is how many writes of a call it takes, the rest comes back."""
+    """A cloud with moto's DynamoDB; each call takes ``taken`` writes and returns the rest as unprocessed."""
 
     namespace = "iort"
 
@@ -53,7 +53,7 @@ class Cloud:
 
 @pytest.fixture
 def old(dynamodb):
-    """Puts messages of version 1 into a table as the record rule of before did."""
+    """Puts messages of version 1 into a table as the older record rule did."""
     types = {"topic": "S", "t": "N"}
     dynamodb.create_table(
         TableName=OLD,
@@ -95,11 +95,11 @@ def in_order(items):
 
 
 def of_today(i, topic=None):
-    """What the record rule of today stores of the batch."""
+    """The item that today's record rule stores for the batch."""
     return item_of_message(encode_batch(batch(i)), topic or build_topic(RECORD, "car", "vesc"), LATER)
 
 
-def test_every_batch_is_stored_as_if_it_came_today(dynamodb, old):
+def test_every_batch_is_stored_in_todays_form(dynamodb, old):
     old(*(old_message(batch(i)) for i in range(60)))
     old(old_message(batch(0)), robot="car-2", stream="tf")
     before, read = stored(dynamodb, OLD), []
@@ -113,7 +113,7 @@ def test_every_batch_is_stored_as_if_it_came_today(dynamodb, old):
     assert stored(dynamodb, OLD) == before
 
 
-def test_twice_changes_nothing(dynamodb, old):
+def test_a_second_adoption_changes_nothing(dynamodb, old):
     old(*(old_message(batch(i)) for i in range(30)), more={"N": "7"})
     first = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     after = stored(dynamodb)
@@ -123,8 +123,8 @@ def test_twice_changes_nothing(dynamodb, old):
     assert len(after) == 30
 
 
-def test_one_robot_alone(dynamodb, old):
-    """And none whose name only begins like it."""
+def test_one_robot_can_be_adopted_alone(dynamodb, old):
+    """Robots whose names only begin with the same text are left out."""
     for robot in ("car", "car2", "other"):
         old(old_message(batch(0)), robot=robot)
     done = adopt(Cloud(dynamodb), OLD, robot="car", units_per_s=FAST)
@@ -132,7 +132,7 @@ def test_one_robot_alone(dynamodb, old):
     assert stored(dynamodb) == [of_today(0)]
 
 
-def test_a_dry_run_says_the_same_and_writes_nothing(dynamodb, old):
+def test_a_dry_run_reports_the_same_and_writes_nothing(dynamodb, old):
     old(*(old_message(batch(i)) for i in range(3)), old_message(batch(9), boot="?"))
     dry = adopt(Cloud(dynamodb), OLD, units_per_s=FAST, dry_run=True)
     assert stored(dynamodb) == []
@@ -152,7 +152,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(dynamodb, old):
     ],
     ids=["1970", "samples", "codec", "version", "number", "other"],
 )
-def test_what_cannot_be_adopted_is_told_and_stays_and_its_neighbours_go(dynamodb, old, changes, cause):
+def test_an_invalid_batch_is_reported_and_its_neighbours_are_adopted(dynamodb, old, changes, cause):
     old(old_message(batch(0)), old_message(batch(1), **changes), old_message(batch(2)))
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     (left,) = done.left
@@ -163,41 +163,41 @@ def test_what_cannot_be_adopted_is_told_and_stays_and_its_neighbours_go(dynamodb
     assert len(stored(dynamodb, OLD)) == 3
 
 
-def test_a_batch_of_another_namespace_would_not_be_found(dynamodb, old):
+def test_a_batch_of_another_namespace_is_not_adopted(dynamodb, old):
     old(old_message(batch(0)), namespace="lab2")
     (left,) = adopt(Cloud(dynamodb), OLD, units_per_s=FAST).left
     assert left.cause == "the namespace must be iort, got lab2"
 
 
-def test_a_batch_whose_car_was_years_ahead_is_data_all_the_same(dynamodb, old):
+def test_a_batch_of_a_car_with_a_clock_years_ahead_is_adopted(dynamodb, old):
     old(old_message(batch(0)), received_ms={"N": "1000"})
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     assert (done.left, stored(dynamodb)) == ([], [{**of_today(0), "received_ms": {"N": "1000"}}])
 
 
-def test_what_has_expired_is_not_written_to_be_deleted_again(dynamodb, old):
+def test_an_expired_batch_is_not_adopted(dynamodb, old):
     old(old_message(batch(0)), expires_s=1_700_000_000)
     old(old_message(batch(1)))
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     assert (done.expired, stored(dynamodb)) == (1, [of_today(1)])
 
 
-def test_what_dynamodb_does_not_take_at_once_is_sent_again(dynamodb, old):
+def test_unprocessed_items_are_sent_again(dynamodb, old):
     old(*(old_message(batch(i)) for i in range(20)))
     cloud = Cloud(dynamodb, taken=8)
     adopt(cloud, OLD, units_per_s=FAST)
     assert (cloud.calls, len(stored(dynamodb))) == (3, 20)
 
 
-def test_what_dynamodb_never_takes_is_an_error_that_says_what_to_do(dynamodb, old, slept):
+def test_items_that_stay_unprocessed_are_an_error_with_advice(dynamodb, old, slept):
     old(old_message(batch(0)))
     with pytest.raises(StationError, match=r"1 items of telemetry not written .*do it again"):
         adopt(Cloud(dynamodb, taken=0), OLD, units_per_s=FAST)
     assert slept
 
 
-def test_no_more_is_written_a_second_than_a_stream_can_spare(dynamodb, old, slept):
-    """A topic is in one partition, which the robot writes too."""
+def test_the_write_rate_is_limited(dynamodb, old, slept):
+    """A topic is one partition, and the robot writes to it at the same time."""
     old(*(old_message(batch(i)) for i in range(100)))
     adopt(Cloud(dynamodb), OLD, units_per_s=5)
     # A small batch is one unit, and 25 are written at once.
@@ -223,7 +223,7 @@ def test_a_table_restored_from_a_backup_is_copied_as_it_is(dynamodb):
 # --- which table ----------------------------------------------------------------------------------------
 
 
-def test_the_table_is_the_one_that_was_kept_or_that_is_named(dynamodb, old):
+def test_the_source_is_the_kept_table_or_the_named_one(dynamodb, old):
     old(old_message(batch(0)))
     assert source_table(Cloud(dynamodb), None) == (OLD, 1)
     assert source_table(Cloud(dynamodb, kept=False), OLD) == (OLD, 1)
@@ -239,6 +239,6 @@ def test_the_table_is_the_one_that_was_kept_or_that_is_named(dynamodb, old):
     ],
     ids=["none kept", "none there", "summaries", "itself"],
 )
-def test_a_table_that_is_none_says_so(dynamodb, name, words):
+def test_an_invalid_table_is_an_error(dynamodb, name, words):
     with pytest.raises(StationError, match=words):
         source_table(Cloud(dynamodb, kept=False), name)

@@ -1,4 +1,4 @@
-"""What the page is answered about a car's past."""
+"""The answers that the page gets about a car's past."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ASKED = {
 }
 
 
-def test_few_samples_come_as_they_are():
+def test_few_samples_are_returned_unchanged():
     found = history(cloud_of(*ride(40)), ASKED)
     assert found["samples"] == 40
     assert found["row_s"] == 0
@@ -30,13 +30,13 @@ def test_few_samples_come_as_they_are():
     assert found["fields"] == {"speed": {"mean": list(range(40))}}
 
 
-def test_many_samples_come_as_mean_within_least_and_most():
+def test_many_samples_are_returned_as_mean_least_and_most():
     found = history(cloud_of(*ride(500)), ASKED)
     speed = found["fields"]["speed"]
     assert found["samples"] == 500
     assert len(found["times_s"]) <= 50
     assert found["row_s"] == pytest.approx(0.2, abs=0.001)
-    # Every sample is in one row: a row's numbers follow those of the row before.
+    # Every sample is in one row: the rows' numbers follow one another.
     assert speed["least"][0] == 0
     assert speed["most"][-1] == 499
     assert [a - b for a, b in zip(speed["least"][1:], speed["most"], strict=False)] == [1] * (
@@ -45,7 +45,7 @@ def test_many_samples_come_as_mean_within_least_and_most():
     assert speed["mean"] == pytest.approx((np.array(speed["least"]) + np.array(speed["most"])) / 2)
 
 
-def test_what_is_no_number_is_the_last_of_its_row_and_null_stays_null():
+def test_a_row_has_the_last_text_or_bool_and_null_stays_null():
     times = [START + 20_000 * i for i in range(4)]
     columns = {"frame": ["a", "b", "c", "d"], "on": [True, False, True, True], "x": [None, None, 3.5, None]}
     found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
@@ -55,14 +55,14 @@ def test_what_is_no_number_is_the_last_of_its_row_and_null_stays_null():
     json.dumps(found, allow_nan=False)
 
 
-def test_a_picture_is_not_lost_among_those_that_the_car_left_out():
+def test_a_thumbnail_beside_nulls_is_not_lost():
     times = [START + 20_000 * i for i in range(6)]
     columns = {"n": list(range(6)), "data.thumbnail": [None, "first", None, None, None, None]}
     found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
     assert found["fields"]["data.thumbnail"]["mean"] == ["first", None]
 
 
-def test_the_fields_of_a_claim_are_of_one_sample():
+def test_the_fields_of_an_attachment_are_of_one_sample():
     parts = {
         "key": ["a.jpg", "b.bin", None, None],
         "sha256": ["0" * 64, "1" * 64, None, None],
@@ -78,7 +78,7 @@ def test_the_fields_of_a_claim_are_of_one_sample():
     }
 
 
-def test_the_mean_of_numbers_near_the_largest_is_one_of_them():
+def test_the_mean_of_very_large_numbers_does_not_overflow():
     times = [START + 20_000 * i for i in range(6)]
     columns = {"x": [1e308, 1.5e308, -1e308, None, 1.7e308, -1.7e308]}
     found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
@@ -92,12 +92,12 @@ def test_the_mean_of_numbers_near_the_largest_is_one_of_them():
     json.dumps(found, allow_nan=False)
 
 
-def test_a_number_that_json_does_not_have_is_null():
+def test_a_number_without_json_form_is_null():
     column = np.array([np.inf, 1.5, -np.inf, np.nan])
     assert values(column) == [None, 1.5, None, None]
 
 
-def test_an_empty_range_is_no_error():
+def test_an_empty_range_gives_an_empty_result():
     late = {**ASKED, "from_us": str(START + 60_000_000), "to_us": str(START + 61_000_000)}
     found = history(cloud_of(*ride(10)), late)
     assert (found["samples"], found["times_s"]) == (0, [])
@@ -118,16 +118,16 @@ def test_an_empty_range_is_no_error():
         ({"rows": str(MAX_ROWS + 1)}, "rows"),
     ],
 )
-def test_what_cannot_be_answered_says_why(change, says):
+def test_an_invalid_question_is_refused_with_the_reason(change, says):
     with pytest.raises(StationError, match=says):
         history(cloud_of(*ride(10)), {**ASKED, **change})
 
 
-def test_vehicles_are_those_whose_gain_is_registered():
+def test_vehicles_are_the_robots_with_a_registered_gain():
     known = {"vehicles": {"car": {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 0.0}}}
     assert answers(cloud_of(*ride(10), gain="4614"))["vehicles"]({}) == known
     assert answers(cloud_of(*ride(10)))["vehicles"]({}) == {"vehicles": {}}
 
 
-def test_streams_are_those_stored():
+def test_streams_are_the_stored_ones():
     assert answers(cloud_of(*ride(10)))["streams"]({"robot": "car"}) == {"streams": ["vesc"]}

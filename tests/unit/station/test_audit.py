@@ -1,4 +1,4 @@
-"""What an audit says of batches that were lost, repeated, delayed or numbered anew."""
+"""An audit reports batches that were lost, repeated, late or numbered anew."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _item(seq, *, boot="0badcafe", n=50, late_ms=0, at=None, previous=None):
 
 
 def _run(boot, seqs, *, at, previous=""):
-    """Batches of a run whose first one names the runs before; each of a second, from ``at`` on."""
+    """Batches of a run, one a second from ``at`` on; the first one names the runs before."""
     return [_item(seq, boot=boot, at=at + seq, previous=previous if seq == 0 else None) for seq in seqs]
 
 
@@ -44,11 +44,11 @@ def test_a_gap_is_named_with_its_neighbours():
     assert (gap.after_us, gap.before_us) == (T_US + 1_000_000, T_US + 4_000_000)
 
 
-def test_nothing_stored_is_not_complete():
+def test_an_empty_stream_is_not_complete():
     assert not audit("vesc", []).complete
 
 
-def test_numbers_before_the_first_are_missing_only_when_asked():
+def test_numbers_before_the_first_batch_are_missing_only_on_request():
     items = [_item(seq) for seq in (7, 8)]
     assert audit("vesc", items).complete
     assert audit("vesc", items).before_first == 7
@@ -56,7 +56,7 @@ def test_numbers_before_the_first_are_missing_only_when_asked():
     assert (found.missing, found.before_first) == (7, 0)
 
 
-def test_runs_continue_each_others_numbers():
+def test_a_run_may_continue_the_numbers_of_the_run_before():
     items = [_item(seq) for seq in range(3)] + [_item(seq, boot="deadbeef") for seq in range(3, 6)]
     assert audit("vesc", items).complete
     found = audit("vesc", [item for item in items if not item["batch"].endswith("-3")])
@@ -64,7 +64,7 @@ def test_runs_continue_each_others_numbers():
     assert found.runs[1].expected == 3
 
 
-def test_a_queue_that_was_lost_starts_again_at_0():
+def test_a_run_after_a_lost_queue_starts_at_0():
     items = [_item(seq) for seq in range(5)] + [_item(seq, boot="deadbeef", at=10 + seq) for seq in range(3)]
     assert audit("vesc", items).complete
     found = audit("vesc", [item for item in items if not item["batch"].endswith("-deadbeef-0")])
@@ -81,21 +81,21 @@ def test_each_run_numbers_from_0_and_names_the_one_before():
     assert audit("vesc", without).runs[0].expected == 3
 
 
-def test_the_start_of_a_run_is_missed_however_short_the_run_before_was():
+def test_the_missing_start_of_a_run_is_found_after_a_short_run():
     items = _run("aaaaaaaa", [0], at=0) + _run("bbbbbbbb", range(4), at=10, previous="aaaaaaaa-0")
-    # A batch names the runs before until one has arrived, so the first that arrives does.
+    # Batches name the runs before until one has arrived, so the first stored batch names them.
     late = [*items[:1], {**items[3], "previous": "aaaaaaaa-0"}, items[4]]
     (gap,) = audit("vesc", late).runs[1].missing
     assert (gap.first, gap.last, gap.after_us, gap.before_us) == (0, 1, T_US, T_US + 12_000_000)
 
 
-def test_a_run_of_which_nothing_is_stored_is_told_by_those_after_it():
+def test_a_run_without_stored_batches_is_found_by_later_runs():
     a, b = _run("aaaaaaaa", range(3), at=0), _run("bbbbbbbb", range(5), at=10, previous="aaaaaaaa-2")
     c = _run("cccccccc", range(2), at=20, previous="aaaaaaaa-2 bbbbbbbb-4")
     assert audit("vesc", [*a, *b, *c]).complete
     found = audit("vesc", [*a, *c])
     assert (found.lost_runs, found.missing, found.complete) == ((("bbbbbbbb", 5),), 5, False)
-    # What comes before all that is stored may have expired, or is out of the range.
+    # Batches before the first stored one may have expired or be out of the range.
     assert audit("vesc", c).complete
     assert audit("vesc", [*b, *c]).complete
     assert audit("vesc", c, from_start=True).lost_runs == (("aaaaaaaa", 3), ("bbbbbbbb", 5))
@@ -103,8 +103,8 @@ def test_a_run_of_which_nothing_is_stored_is_told_by_those_after_it():
     assert audit("vesc", [*z, *b, *c]).lost_runs == (("aaaaaaaa", 3),)
 
 
-def test_numbers_that_went_on_and_numbers_from_0_are_told_apart():
-    """A car whose agent was updated: only the second run went on with the first one's numbers."""
+def test_continued_numbers_and_numbers_from_0_are_distinguished():
+    """A car's agent was updated: only the second run continued the first run's numbers."""
     old = [_item(seq, boot="aaaaaaaa") for seq in range(3)]
     old += [_item(seq, boot="bbbbbbbb") for seq in range(3, 6)]
     new = _run("cccccccc", range(2), at=10, previous="bbbbbbbb-5")
@@ -113,7 +113,7 @@ def test_numbers_that_went_on_and_numbers_from_0_are_told_apart():
     for lost, missing in (("bbbbbbbb-3", 1), ("bbbbbbbb-5", 1), ("cccccccc-1", 1), ("dddddddd-4", 1)):
         left = [item for item in old + new if not item["batch"].endswith(lost)]
         assert audit("vesc", left).missing == missing, lost
-    # An agent of before that is installed again goes on where it had ended.
+    # An older agent that is installed again continues its own numbers.
     back = [_item(seq, boot="eeeeeeee", at=30 + seq) for seq in range(6, 9)]
     assert audit("vesc", old + new + back).complete
     assert audit("vesc", old + new + back[1:]).missing == 1
@@ -125,18 +125,18 @@ def test_a_clock_set_back_between_runs_changes_nothing():
     assert audit("vesc", after + before).complete
 
 
-def test_late_is_against_the_fastest_of_the_run_whatever_the_clock():
+def test_lateness_is_relative_to_the_fastest_batch_of_the_run():
     items = [_item(seq, late_ms=-3_600_000 + (20_000 if seq == 2 else 0)) for seq in range(5)]
     (run,) = audit("vesc", items).runs
     assert (run.late, run.latest_ms) == (1, 20_000)
 
 
-def test_a_number_stored_twice_is_counted_and_its_samples_are_not():
+def test_a_number_stored_twice_is_counted_without_its_samples():
     (run,) = audit("vesc", [_item(0), _item(1), _item(1, at=1.5)]).runs
     assert (run.duplicated, run.batches, run.samples) == (1, 2, 100)
 
 
-def test_what_is_no_batch_is_counted():
+def test_an_invalid_batch_is_counted():
     wrong = [{"batch": "5"}, {**_item(1), "batch": "5-0badcafe-x"}, {**_item(2), "previous": "nobody"}]
     found = audit("vesc", [_item(0), *wrong])
     assert (found.refused, found.complete) == (3, False)
@@ -153,7 +153,7 @@ def test_expected_is_stored_and_missing_in_any_order(seqs, seed):
 
 
 class Newest:
-    """A `iort_station.cloud.Cloud` and its table's client, which know one item."""
+    """A fake `iort_station.cloud.Cloud` and table client with one item."""
 
     namespace = "iort"
 
@@ -170,7 +170,7 @@ class Newest:
         return {"Items": [self._item]}
 
 
-def test_the_agents_figures_are_those_of_its_newest_batch_if_it_is_one():
+def test_the_agents_figures_come_from_its_newest_valid_batch():
     item = item_of(Batch("0badcafe", 0, [T_US], {"backlog_batches": [3]}))
     assert last_figures(Newest(item), "car") == {"backlog_batches": 3.0}
     assert last_figures(Newest({**item, "batch": {"S": "1.5"}}), "car") == {}

@@ -1,4 +1,4 @@
-"""What the operator's side makes of stored batches, a page at once: what the contract makes of each."""
+"""The station decodes pages of stored batches exactly as the contract decodes each batch."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ def id_at(second):
 
 
 def read(*messages):
-    """The blocks of messages in one page, and what was refused."""
+    """The blocks of messages in one page, and the refused items."""
     refused = RefusedItems()
     items = [item_of_message(json.dumps(message).encode()) for message in messages]
     return list(blocks([items], refused)), refused
 
 
 @pytest.mark.parametrize("column", [column for column, _ in WRONG])
-def test_columns_that_nobody_writes_are_refused(column):
+def test_columns_that_no_encoder_writes_are_refused(column):
     found, refused = read(message_of(column))
     assert (len(found), refused.count) == (0, 1)
 
 
-def test_a_sum_that_comes_back_through_64_bits_is_refused():
+def test_a_sum_that_overflows_64_bits_is_refused():
     found, refused = read(message_of([0, 1, *[2**62] * 4, 1], n=6))
     assert (len(found), refused.count) == (0, 1)
 
 
-# What a robot of somebody else's may have stored, as text, since no encoder of ours writes it.
+# Batches of a foreign robot, as text, because no encoder of ours writes them.
 HOSTILE = {
     "deep": "[" * 100_000,
     "deep column": '{"dt":[0,5],"fields":{"f0":' + "[" * 100_000,
@@ -59,14 +59,14 @@ HOSTILE = {
     "no fields": '{"dt":[0,5],"fields":null}',
     "infinite": '{"dt":[0,5],"fields":{"f0":[1e999,1]}}',
     "beyond 64 bits": '{"dt":[0,5],"fields":{"f0":[18446744073709551616,1]}}',
-    "dear": '{"dt":[0,5],"fields":{"f0":[' + "[]," * 50_000 + "0]}}",
+    "expensive": '{"dt":[0,5],"fields":{"f0":[' + "[]," * 50_000 + "0]}}",
     "beyond a float": '{"dt":[0,5],"fields":{"f0":[1' + 400 * "0" + ",1]}}",
 }
 
 
 @pytest.mark.parametrize("codec", [CODEC, PLAIN_CODEC])
 @pytest.mark.parametrize("body", HOSTILE.values(), ids=HOSTILE)
-def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, codec):
+def test_a_hostile_batch_is_refused_and_its_neighbours_are_read(body, codec):
     if codec == CODEC:
         body = body.replace('"f0":[', '"f0":[null,')
     deflater = zlib.compressobj(zdict=DICTIONARY if codec == CODEC else b"")
@@ -78,7 +78,7 @@ def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, cod
     assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3, 1, 3]
 
 
-def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_read():
+def test_a_batch_with_too_many_values_is_refused_and_its_neighbours_are_read():
     n, good = MAX_BATCH_VALUES // 2 + 1, message_of([0, 1, 2])
     large = message_of([0] * (n + 1), [0] * (n + 1), n=n)
     found, refused = read(good, {**large, "batch": id_at(1)})
@@ -87,7 +87,7 @@ def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_re
 
 
 @pytest.mark.parametrize("key", ["", "7", f"{0:016}-{BOOT}-x", "~", f"{-1:016}-{BOOT}-0"])
-def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(key):
+def test_an_item_with_an_invalid_key_is_refused_and_its_neighbours_are_read(key):
     items = [item_of_message(json.dumps(message_of([0, 1, 2])).encode()) for _ in range(2)]
     items[1]["batch"] = {"S": key}
     refused, told = RefusedItems(), []
@@ -99,7 +99,7 @@ def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(k
     assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])
 
 
-def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
+def test_samples_with_equal_times_are_given_in_the_order_of_their_batches():
     parts = [Batch(BOOT, seq, [t, t, t + 5], {"a": [10 * seq, 10 * seq + 1, 10 * seq + 2]})
              for seq, t in enumerate([1_000, 1_000, 1_005])]  # fmt: skip
     items = [item_of_message(encode_batch(batch)) for batch in parts]
@@ -115,7 +115,7 @@ FLAT = RosType("/t", "a_msgs/A", "1", "float64 x\nuint8 n")
 TEXTS = RosType("/u", "a_msgs/B", "2", "string[] s\nfloat64 x")
 
 
-def test_messages_are_samples_too_and_can_be_passed_over():
+def test_messages_are_read_as_samples_or_skipped():
     rows = [struct.pack("<dB", i / 2, i) for i in range(3)]
     texts = [u32(1) + text("a") + struct.pack("<d", 0.5), u32(0) + struct.pack("<d", 1.5), b"odd"]
     odd = [struct.pack("<dB", float("nan"), 7)] * 2
@@ -141,8 +141,8 @@ def test_messages_are_samples_too_and_can_be_passed_over():
 
 @settings(max_examples=100)
 @given(st.lists(columns(), min_size=1, max_size=4), st.data())
-def test_the_station_reads_what_the_contract_reads(parts, data):
-    """A page of batches of both codecs, good and bad, of columns that change their kind."""
+def test_the_station_and_the_contract_read_the_same_batches(parts, data):
+    """A page of valid and invalid batches in both codecs, with columns that change their type."""
     messages, expected, refused = [], [], 0
     for seq, column in enumerate(parts):
         times = [seq * 1_000_000 + 20 * i for i in range(len(column))]
@@ -173,7 +173,7 @@ entries = st.integers(-(2**64), 2**64) | st.sampled_from(
 
 @st.composite
 def written_columns(draw, n):
-    """A column as an encoder writes it, or nearly, or anything."""
+    """A column as an encoder writes it, a nearly valid one, or any JSON."""
     written = draw(st.sampled_from([packed(draw(columns_of(n))), [0, *[1] * n]]))
     if draw(st.booleans()):
         at = draw(st.integers(0, n))
@@ -212,7 +212,7 @@ def test_the_numpy_back_end_and_the_list_back_end_agree(data):
 
 
 def as_read(value):
-    """As the station has it: null is NaN and numbers are floats, unless the column holds more than those."""
+    """The station's form: null is NaN and numbers are floats, unless the column holds other types."""
     if value is None or value != value:  # noqa: PLR0124 - NaN
         return None
     return (
@@ -220,7 +220,7 @@ def as_read(value):
     )
 
 
-def test_a_real_drive_fits_in_a_write_unit_and_comes_back():
+def test_a_second_of_a_real_drive_fits_in_a_write_unit_and_is_restored():
     samples = list(drive_of(recording("f1tenth-motor-servo.bag")))
     sizes = []
     for _, group in itertools.groupby(samples, key=lambda sample: sample[0] // 1_000_000):

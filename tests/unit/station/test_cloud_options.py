@@ -1,4 +1,4 @@
-"""What a newcomer reads who has no account at hand, no region, or nothing deployed in it."""
+"""Errors for a newcomer without an account, without a region or without a deployment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from iort_station.page import keys
 
 @pytest.fixture(autouse=True)
 def newcomer(monkeypatch, tmp_path):
-    """Nobody's machine: no settings of AWS, in the environment or at home."""
+    """A machine without AWS settings in the environment and the home folder."""
     for name in [name for name in os.environ if name.startswith("AWS_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
@@ -34,7 +34,7 @@ def found(tmp_path):
     return cloud
 
 
-def test_neither_account_nor_embedded_cloud_says_how_to_get_either(found):
+def test_the_error_without_any_cloud_names_both_ways(found):
     with pytest.raises(StationError, match=r"no AWS region.*AWS_REGION.*`make demo`"):
         found()
 
@@ -50,7 +50,7 @@ def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
     assert find_embedded(tmp_path) is None
 
 
-def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypatch):
+def test_the_error_outside_a_checkout_says_how_to_name_the_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
         CloudOptions("iort", None, None, local=True, embedded=None).cloud()
@@ -62,7 +62,7 @@ def test_the_environment_names_an_embedded_cloud(tmp_path):
     assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} does not exist" in str(done.exception)
 
 
-def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
+def test_a_region_without_credentials_is_an_error_with_advice(found, monkeypatch):
     with pytest.raises(StationError, match="no AWS credentials: give --profile") as raised:
         found(region="eu-west-1")
     assert "make demo" not in str(raised.value), "who names a region means AWS"
@@ -71,12 +71,12 @@ def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
         found()
 
 
-def test_a_profile_that_is_not_there_is_named(found):
+def test_an_unknown_profile_is_named(found):
     with pytest.raises(StationError, match="nobody"):
         found(profile="nobody")
 
 
-def test_the_region_of_the_cdks_own_variable_is_taken(found, monkeypatch):
+def test_the_cdks_region_variable_is_read(found, monkeypatch):
     monkeypatch.setenv("AWS_REGION", "eu-central-1")
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
@@ -84,7 +84,7 @@ def test_the_region_of_the_cdks_own_variable_is_taken(found, monkeypatch):
     assert found(region="eu-west-1").client("iot").meta.region_name == "eu-west-1"
 
 
-def test_an_embedded_cloud_asks_for_no_profile(monkeypatch):
+def test_an_embedded_cloud_ignores_the_profile(monkeypatch):
     monkeypatch.setenv("AWS_PROFILE", "nobody")
     embedded = Cloud(region="eu-west-1", access_key_id="test", secret_access_key="test")
     assert embedded.client("iot").meta.region_name == "eu-west-1"
@@ -95,9 +95,9 @@ def test_an_embedded_cloud_asks_for_no_profile(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "value"), [("NO_PROXY", "lab.example"), ("no_proxy", "lab.example"), (None, "")]
 )
-def test_an_embedded_cloud_is_asked_around_a_proxy(monkeypatch, tmp_path, name, value):
+def test_requests_to_an_embedded_cloud_bypass_the_proxy(monkeypatch, tmp_path, name, value):
     for each in ("NO_PROXY", "no_proxy"):
-        # What is set first is put back afterwards, also where it was not there.
+        # Set first, so that monkeypatch restores the variable even if it did not exist.
         monkeypatch.setenv(each, "")
         monkeypatch.delenv(each)
     if name:
@@ -113,7 +113,7 @@ def test_an_embedded_cloud_is_asked_around_a_proxy(monkeypatch, tmp_path, name, 
     assert not proxy_bypass("sts.amazonaws.com")
 
 
-def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
+def test_keys_are_asked_for_only_after_the_cloud_is_found(tmp_path):
     done = CliRunner().invoke(app, ["--embedded", str(tmp_path / "cloud.json"), "pubnub"], input="a\nb\n")
     assert isinstance(done.exception, StationError)
     assert "key" not in done.output
@@ -127,13 +127,13 @@ def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
         ("", "sub-c-1", "the publish key"),
     ],
 )
-def test_a_key_that_is_another_is_refused_and_not_repeated(publish, subscribe, said):
+def test_a_key_of_another_kind_is_refused_and_not_printed(publish, subscribe, said):
     with pytest.raises(StationError, match=said) as raised:
         keys.typed(publish, subscribe)
     assert "-c-1" not in str(raised.value)
 
 
-def test_a_typed_key_loses_what_was_copied_with_it():
+def test_whitespace_around_a_typed_key_is_removed():
     typed = keys.typed(" pub-c-1", "sub-c-1\n")
     assert (typed.publish_key, typed.subscribe_key) == ("pub-c-1", "sub-c-1")
 

@@ -16,7 +16,7 @@ NOW_S = 1_700_000_000
 
 
 class FakeCloud:
-    """A `iort_station.cloud.Cloud` with CloudWatch alone."""
+    """A `iort_station.cloud.Cloud` with only CloudWatch."""
 
     namespace = "iort"
 
@@ -51,7 +51,7 @@ def test_our_dashboards_come_first(cloud):
     assert cloudwatch.dashboards(cloud) == ["iort-monitoring", "Zebra", "another"]
 
 
-def test_a_widget_has_its_place_and_its_metrics_values(cloud):
+def test_a_widget_has_its_position_and_its_metrics_values(cloud):
     rows = [
         ["My/Cars", "Laps", "Car", "a", {"stat": "Sum", "period": 60, "label": "laps"}],
         [".", "Speed", ".", "a", {"stat": "Maximum", "period": 60, "yAxis": "right"}],
@@ -74,7 +74,7 @@ def test_a_widget_has_its_place_and_its_metrics_values(cloud):
     assert (words["kind"], words["text"]) == ("text", "# Hello")
 
 
-def test_shorthand_of_a_row_is_what_the_row_before_has():
+def test_shorthand_in_a_row_repeats_the_row_before():
     rows = [
         ["AWS/IoT", "Success", "RuleName", "a", "ActionType", "Lambda", {"label": "x"}],
         [".", "Failure", ".", "b", ".", "."],
@@ -89,10 +89,10 @@ def test_shorthand_of_a_row_is_what_the_row_before_has():
     ]
 
 
-def test_what_it_does_not_draw_it_names(cloud):
+def test_widgets_that_are_not_drawn_are_named(cloud):
     put(cloud, "d", {"type": "log", "properties": {"query": "x"}}, {"type": "explorer", "properties": {}})
     found = cloudwatch.dashboard(cloud, "d", minutes=5, now_s=NOW_S)
-    # Of a log widget the rows are asked for by its number.
+    # A log widget's rows are requested by its number.
     assert [(each["number"], each["kind"], each["text"].split(":")[0]) for each in found["widgets"]] == [
         (0, "log", ""),
         (1, "other", "a widget of type explorer"),
@@ -128,13 +128,13 @@ def test_alarms_are_shown_in_the_widgets_order_with_state_and_reason(cloud):
     assert abs(drawn["alarms"][1]["since_s"] - time.time()) < 3600
 
 
-def test_a_dashboard_that_is_not_there_says_so(cloud):
+def test_an_unknown_dashboard_is_an_error(cloud):
     with pytest.raises(StationError, match="dashboard 'nobody' does not exist"):
         cloudwatch.dashboard(cloud, "nobody", minutes=5, now_s=NOW_S)
 
 
 class Searched:
-    """CloudWatch with one dashboard, whose one widget searches, and with the results of that."""
+    """A fake CloudWatch with one dashboard, its one search widget, and the search's results."""
 
     namespace = "iort"
 

@@ -1,4 +1,4 @@
-"""The log widgets of dashboards: what is asked of Logs Insights, and what becomes of its answers."""
+"""The log widgets of dashboards: queries to Logs Insights and their answers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ QUERY = "SOURCE '/aws/lambda/a' | SOURCE \"b\" | fields @timestamp, @message\n| 
 
 
 class Insights:
-    """CloudWatch with one dashboard, and Logs Insights that has these answers, one a time."""
+    """A fake CloudWatch with one dashboard, and Logs Insights with these answers, one a call."""
 
     namespace = "iort"
 
@@ -45,7 +45,7 @@ def row(**cells: str) -> list[dict[str, str]]:
     return [{"field": f"@{name}", "value": value} for name, value in cells.items()]
 
 
-def test_the_widgets_own_query_is_asked_of_its_log_groups() -> None:
+def test_the_widgets_own_query_is_sent_for_its_log_groups() -> None:
     found = [row(timestamp="t1", message="one", ptr="x"), row(message="x" * 5000, log="1:a", ptr="y")]
     cloud = Insights({"status": "Scheduled"}, {"status": "Running"}, {"status": "Complete", "results": found})
     told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
@@ -55,31 +55,31 @@ def test_the_widgets_own_query_is_asked_of_its_log_groups() -> None:
         "startTime": NOW_S - 900,
         "endTime": NOW_S,
     }
-    # As they come, by name; a cell that a row does not have is empty, and none is longer than anybody reads.
+    # Columns are in their order of appearance; a missing cell is empty, and long cells are cut.
     assert told["columns"] == ["@timestamp", "@message", "@log"]
     assert told["rows"] == [["t1", "one", ""], ["", "x" * cloudwatch_logs.MAX_TEXT, "1:a"]]
     assert (told["found"], told["from_s"], told["to_s"]) == (2, NOW_S - 900, NOW_S)
 
 
-def test_rows_that_nobody_reads_are_counted_and_left_out() -> None:
+def test_rows_over_the_limit_are_counted_and_left_out() -> None:
     cloud = Insights({"status": "Complete", "results": [row(message=str(i)) for i in range(250)]})
     told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
     assert (len(told["rows"]), told["found"]) == (cloudwatch_logs.MAX_ROWS, 250)
 
 
-def test_a_query_in_another_language_is_asked_in_it() -> None:
+def test_a_query_keeps_its_own_query_language() -> None:
     cloud = Insights({"status": "Complete"}, queryLanguage="PPL")
     assert cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)["rows"] == []
     assert cloud.asked["queryLanguage"] == "PPL"
 
 
 @pytest.mark.parametrize("status", ["Failed", "Cancelled", "Timeout"])
-def test_a_query_that_fails_says_so(status: str) -> None:
+def test_a_failed_query_is_an_error(status: str) -> None:
     with pytest.raises(StationError, match=f"ended the query: {status.lower()}"):
         cloudwatch_logs.rows(Insights({"status": status}), NAME, 1, minutes=15)
 
 
-def test_nothing_else_can_be_asked_of_the_logs() -> None:
+def test_only_log_widgets_that_name_log_groups_can_be_queried() -> None:
     for number in (0, 2):
         with pytest.raises(StationError, match="not a log widget"):
             cloudwatch_logs.rows(Insights(), NAME, number, minutes=15)
@@ -90,7 +90,7 @@ def test_nothing_else_can_be_asked_of_the_logs() -> None:
 
 
 @pytest.mark.parametrize("name", ["billing", "iort", "iort2-platform", "IORT-platform"])
-def test_the_logs_of_other_dashboards_are_not_asked_for(name: str) -> None:
+def test_the_logs_of_another_deployments_dashboard_are_not_queried(name: str) -> None:
     cloud = Insights({"status": "Complete"})
     with pytest.raises(StationError, match="another deployment's"):
         cloudwatch_logs.rows(cloud, name, 1, minutes=15)

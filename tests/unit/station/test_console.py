@@ -1,4 +1,4 @@
-"""Nothing that a robot says is obeyed by the operator's terminal, or by a spreadsheet."""
+"""A robot's texts reach neither the operator's terminal nor a spreadsheet as commands."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rich.text import Text
 import iort_station
 from iort_station.cli.console import Console, visible
 
-# Writes the clipboard; the same in C1; moves the cursor, and rings; turns a line around.
+# Write the clipboard; the same with C1; move the cursor and ring the bell; reverse a line.
 HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_what_a_terminal_obeys_is_shown_as_its_code(text):
+def test_control_characters_are_shown_as_their_codes(text):
     shown = visible(text)
     assert shown.isprintable()
     assert json.loads(f'"{shown}"') == text
 
 
-def test_what_it_does_not_stays():
+def test_printable_text_stays_unchanged():
     text = "Käfer\t1\n日本 🚗 [bold] :car: \\x1b"
     assert visible(text) == text
 
 
 @pytest.mark.parametrize("terminal", [True, False])
 @pytest.mark.parametrize("text", HOSTILE)
-def test_no_way_to_print_lets_it_through(terminal, text):
+def test_the_console_prints_no_control_characters(terminal, text):
     file = io.StringIO()
     console = Console(file=file, force_terminal=terminal, width=200, color_system=None)
     table = Table(title=text)
@@ -44,12 +44,12 @@ def test_no_way_to_print_lets_it_through(terminal, text):
         console.print(one, soft_wrap=True)
     console.print_json(json.dumps([text], ensure_ascii=False))
     said = file.getvalue()
-    # A `Text` has left out the bell and the backspace by itself.
+    # `Text` itself removes the bell and the backspace.
     assert said.count(visible(Text(text).plain)) == 15
     assert not [one for one in said if not one.isprintable() and one != "\n"]
 
 
-def test_a_text_is_no_markup_and_no_picture():
+def test_markup_and_emoji_codes_are_printed_literally():
     file = io.StringIO()
     console, table = Console(file=file, width=200), Table("[link=https://example.org]here[/link]")
     table.add_row("[/]")
@@ -59,8 +59,8 @@ def test_a_text_is_no_markup_and_no_picture():
         assert text in file.getvalue()
 
 
-def test_every_command_prints_by_it():
-    """Other prints are listed: the version, a line of JSON, and the one that makes its text visible."""
+def test_every_command_prints_by_the_console():
+    """The other prints are listed: the version, a line of JSON, and the escaped error."""
     folder, printing = Path(iort_station.__file__).parent, set()
     for path in folder.rglob("*.py"):
         name, tree = str(path.relative_to(folder)), ast.parse(path.read_text())

@@ -36,7 +36,7 @@ def _units(items, lane, price):
     return sum(item.units for item in items if (item.lane, item.price) == (lane, price))
 
 
-def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
+def test_the_record_lane_costs_a_rule_an_action_and_write_units_a_batch():
     items = model.bill(_ONE)
     assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
     assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
@@ -45,18 +45,18 @@ def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
     assert rules.dollars == pytest.approx(3600 * 0.15e-6)
 
 
-def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_ten_seconds():
+def test_the_live_lane_costs_a_rule_an_action_and_an_invocation_a_message():
     items = model.bill(replace(_ONE, live_hz=4.0))
     assert _units(items, "live", "invocation") == 4 * 3600
     assert _units(items, "live", "message") == 360
-    # At the broker two more rules look at it.
+    # Messages through the broker also trigger two more rules.
     assert _units(items, "live", "rule") == _units(items, "live", "action") == 4 * 3600 + 2 * 360
-    seldom = model.bill(replace(_ONE, live_hz=0.05))
-    assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
+    throttled = model.bill(replace(_ONE, live_hz=0.05))
+    assert _units(throttled, "live", "message") == _units(throttled, "live", "invocation") == 180
     assert _units(model.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
 
 
-def test_a_car_that_measures_nothing_still_pings_for_the_clock():
+def test_a_car_without_measured_pings_still_pings_for_the_clock_offset():
     assert CLOCK_PING_S == CLOCK_EVERY_S
     items = model.bill(_ONE)
     assert _units(items, "ping", "message") == 2 * 120, "a ping and a pong"
@@ -65,8 +65,8 @@ def test_a_car_that_measures_nothing_still_pings_for_the_clock():
     assert _units(measured, "ping", "message") == 6 * 3600, "those of the path rule tell the clock, too"
 
 
-def test_the_ratio_is_given_without_log_lines_too():
-    """Lambda's own lines are in the thesis' column, which left them as they are, and not in ours."""
+def test_the_ratio_is_also_given_without_log_lines():
+    """The thesis' column includes Lambda's own log lines, and ours does not."""
     unlogged = [
         sum(item.dollars for item in items if item.service != "CloudWatch")
         for items in (model.thesis_bill(_ONE), model.bill(_ONE))
@@ -75,9 +75,9 @@ def test_the_ratio_is_given_without_log_lines_too():
     assert row[-1] == f"1/{unlogged[0] / unlogged[1]:.1f}"
 
 
-def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
+def test_an_idle_deployment_pays_for_polling_monitoring_and_storage():
     rest = deployment_dollars_per_month(_ONE)
-    # Five long polls of 20 s around the clock, of each of two queues.
+    # Five long polls of 20 s at all times, for each of two queues.
     assert rest["polling the queues"] == pytest.approx(2 * 657_000 * 0.40e-6)
     assert rest["alarms"] == pytest.approx(1.6), "ten of 26 are free"
     assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.8), "and none of those"
@@ -100,7 +100,7 @@ def test_three_dashboards_of_up_to_fifty_metrics_are_free(dashboards, billed):
     assert rest["dashboards"] == billed * 3.0
 
 
-def test_metrics_of_every_robot_are_billed_by_the_robot():
+def test_metrics_of_every_robot_are_billed_per_robot():
     for robots, billed in ((5, 0), (6, 1)):
         usage = replace(_ONE, robots=robots, robot_metrics=True)
         rest = deployment_dollars_per_month(usage)
@@ -108,12 +108,12 @@ def test_metrics_of_every_robot_are_billed_by_the_robot():
         assert rest["metrics"] == pytest.approx((36 + 9 * robots - 10) * 0.30)
 
 
-def test_the_live_page_asks_as_often_as_the_model_says():
+def test_the_live_page_refreshes_as_often_as_the_model_assumes():
     source = (ROOT / "station/web/src/views/cloudwatch.ts").read_text()
     assert f"const REFRESH_S = {PAGE_REFRESH_S};" in source
 
 
-def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():
+def test_point_in_time_recovery_is_billed_by_the_stored_size():
     def kept(usage, price):
         return sum(item.units for item in model.bill(usage) if item.price == price)
 
@@ -121,7 +121,7 @@ def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():
     assert kept(replace(_ONE, recoverable=True), "recovery") == kept(_ONE, "storage") > 0
 
 
-def test_thesis_layout_pays_for_every_sample():
+def test_the_thesis_layout_pays_for_every_sample():
     items = model.thesis_bill(_ONE)
     assert _units(items, "record", "message") == 50 * 3600
     assert _units(items, "record", "write") == 2 * 50 * 3600
@@ -129,7 +129,7 @@ def test_thesis_layout_pays_for_every_sample():
     assert 0.6 < line_items.total(items) < 0.8
 
 
-def test_without_a_live_lane_we_cost_less_than_a_twentieth():
+def test_the_cost_without_a_live_lane_is_under_a_twentieth_of_the_thesis():
     ours = line_items.total(model.bill(replace(_ONE, live_hz=0.0)))
     assert ours < line_items.total(model.thesis_bill(_ONE)) / 20
 
@@ -139,7 +139,7 @@ def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
     assert _units(single, "record", "rule") == 50 * 3600
 
 
-def test_lambda_2_is_shared_by_a_fleet():
+def test_a_larger_fleet_needs_fewer_lambda_2_calls_per_robot():
     calls = {
         robots: model.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)
     }
@@ -166,12 +166,12 @@ def test_every_item_has_a_price_and_every_price_names_its_page():
 @pytest.mark.parametrize(
     "wrong", [{"robots": 0}, {"rate_hz": 0.0}, {"batch_s": 2.0}, {"live_hz": -1.0}, {"hours_per_day": 25.0}]
 )
-def test_refuses_what_no_fleet_can_do(wrong):
+def test_an_impossible_usage_is_refused(wrong):
     with pytest.raises(StationError):
         model.bill(replace(_ONE, **wrong))
 
 
-def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
+def test_the_modelled_log_size_of_lambda_1_matches_its_real_lines(capsys):
     counted = Gathered("live")
     for i in range(36_000):
         delays = dict.fromkeys(("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs"), 2.34 + i % 97)
@@ -182,14 +182,14 @@ def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
     assert whole - 36_000 * len(line_items.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
 
 
-def test_environments_gather_each_for_itself():
+def test_each_environment_gathers_its_own_metrics():
     assert model._live_lines_per_s(_ONE) == 0.1
     # Twenty milliseconds each: two at a time, and more than a hundred in ten seconds.
     assert model._live_lines_per_s(replace(_ONE, robots=10)) == 1.0
     assert model._live_lines_per_s(replace(_ONE, live_hz=0.01)) == 0.01
 
 
-def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
+def test_the_modelled_length_of_other_lines_matches_the_real_lines(capsys):
     batch = message_sizes.batch_of(simulated_drive(50), 50)
     emit("summarize", BatchesSummarized=2, SamplesSummarized=100)
     emit("health", **measure("vesc", [batch]))
@@ -199,7 +199,7 @@ def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
     assert lengths == pytest.approx(modelled, rel=0.1)
 
 
-def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
+def test_the_quota_that_breaks_first_needs_the_fewest_robots():
     paper = scale.on_paper(Usage(robots=10_000, live_concurrency=5))
     at = [need.robots_at_quota for need in paper.needs if need.robots_at_quota]
     assert at == sorted(at)
@@ -208,7 +208,7 @@ def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
     assert unreserved.breaks_first.name.startswith("IoT Core")
 
 
-def test_the_documents_count_what_is_watched_as_the_model_does():
+def test_the_documents_and_the_model_count_the_same_monitoring():
     text = (ROOT / "docs" / "cloud.md").read_text()
     platform, robots = _ONE.dashboards
     for line in (
@@ -222,7 +222,7 @@ def test_the_documents_count_what_is_watched_as_the_model_does():
         assert line in text
 
 
-def test_command_prints_json_that_adds_up(tmp_path):
+def test_the_command_prints_json_that_adds_up(tmp_path):
     done = CliRunner().invoke(
         app, ["cost", "--live-hz", "2", "--json"], env={"XDG_CACHE_HOME": str(tmp_path)}
     )
@@ -234,7 +234,7 @@ def test_command_prints_json_that_adds_up(tmp_path):
 
 
 @pytest.mark.parametrize("batch_s", [0.0, 0.2, 1.0])
-def test_streams_are_billed_each_by_itself(batch_s):
+def test_each_stream_is_billed_separately(batch_s):
     one, three = (
         {(item.lane, item.what): item.units for item in model.bill(Usage(streams=streams, batch_s=batch_s))}
         for streams in (1, 3)
@@ -242,7 +242,7 @@ def test_streams_are_billed_each_by_itself(batch_s):
     times = {what: three[what] / units for what, units in one.items() if units}
     for what in ("rules triggered", "actions", "telemetry written", "telemetry kept", "summary kept"):
         assert times["record", what] == pytest.approx(3), what
-    # How often Lambda 2 is called hangs on the window, until its events are full.
+    # The window limits Lambda 2's calls until its events are full.
     assert times["record", "Lambda 2 invoked"] <= 3
     assert times["connection", "minutes"] == times["agent, rtt", "kept"] == 1
     messages = [next(i.units for i in model.thesis_bill(usage) if i.what == "messages") for usage in USAGES]

@@ -1,4 +1,4 @@
-"""What `iort cost --config` reads of a car.yaml, held to what the agent makes of the same file."""
+"""`iort cost --config` reads the same rates from a car.yaml as the agent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROS = (
     "sources:\n- type: ros1\n  topics: {/a: {stream: a, time: arrival}, /b: {stream: a, time: header}}\n"
     "- {type: vesc, port: /dev/ttyACM0, rate_hz: 3}\n"
 )
-# Every key that the verb reads, with its default and without.
+# Every key that the command reads, with and without its default.
 FILES = (
     SIM,
     RECORDING,
@@ -61,14 +61,14 @@ def in_the_agent(config: Config) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("settings", FILES)
-def test_the_station_reads_the_rates_that_the_agent_reads(car, settings):
+def test_the_station_reads_the_same_rates_as_the_agent(car, settings):
     file = car(settings)
     usage = vars(as_configured(Usage(), file))
     expected = in_the_agent(load_config(file))
     assert {name: usage[name] for name in expected} == expected
 
 
-def test_sources_with_a_rate_of_their_own_are_the_agents():
+def test_the_sources_with_a_rate_are_the_same_as_in_the_agent():
     rates = {
         kind: field.default
         for kind, config in SOURCES.items()
@@ -78,7 +78,7 @@ def test_sources_with_a_rate_of_their_own_are_the_agents():
     assert rates == _OWN_RATE_HZ
 
 
-def test_the_verb_reads_a_file_whose_certificate_is_on_the_robot(tmp_path):
+def test_the_command_reads_a_file_without_the_robots_certificate(tmp_path):
     file = tmp_path / "car.yaml"
     file.write_text(
         "live: {rate_hz: 4}\nsources:\n- {type: sim, rate_hz: 2}\n"
@@ -90,7 +90,7 @@ def test_the_verb_reads_a_file_whose_certificate_is_on_the_robot(tmp_path):
     assert done.exit_code == 0, done.output
     usage = json.loads(done.output)["usage"]
     assert usage["live_hz"] == 2 + 2 * 4
-    # A sample each half second, and two topics of which nothing is known.
+    # One sample each half second, and two topics of unknown rate.
     assert (usage["streams"], usage["rate_hz"]) == (3, (2 + 50 + 50) / 3)
 
 
@@ -105,12 +105,12 @@ def test_the_verb_reads_a_file_whose_certificate_is_on_the_robot(tmp_path):
         ("sources: [", "is not YAML"),
     ],
 )
-def test_a_file_that_cannot_be_understood_is_named_with_its_key(car, settings, said):
+def test_an_invalid_file_is_named_with_its_key(car, settings, said):
     with pytest.raises(StationError) as error:
         as_configured(Usage(), car(settings))
     assert said in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(StationError, match=r"car\.yaml cannot be read"):
         as_configured(Usage(), tmp_path / "car.yaml")

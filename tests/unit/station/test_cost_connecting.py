@@ -1,4 +1,4 @@
-"""What AWS meters of a connection, held to what the agent does when it connects."""
+"""The cost model's figures of a connection match the agent's messages when it connects."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _METER, _SHADOW_METER = 5 * 1024, 1024
 
 
 def messages(usage):
-    """Messages that are metered in an hour, by what they are."""
+    """The metered messages of an hour, by kind."""
     return {item.what: item.units for item in model.bill(usage) if item.price == "message"}
 
 
 class Counting(Loopback):
-    """Knows what was subscribed to."""
+    """An uplink that records its subscriptions."""
 
     def __init__(self, *given, **named):
         super().__init__(*given, **named)
@@ -43,7 +43,7 @@ class Counting(Loopback):
         super().subscribe(topic_filter, handler)
 
 
-def test_an_agent_asks_for_as_much_as_the_model_says():
+def test_an_agent_subscribes_as_the_model_assumes():
     clock, dispatcher = ManualClock(), Dispatcher()
     uplink = Counting(clock, dispatcher)
     config = Config("car1", "host", Path(), Path(), ())
@@ -55,7 +55,7 @@ def test_an_agent_asks_for_as_much_as_the_model_says():
     agent.tick()
     asked = [message for message in uplink.published if f"/name/{SHADOW}/" in message.topic]
     assert [(message.topic.rpartition("/")[2], message.payload) for message in asked] == [("get", b"")]
-    # Nobody has wished for anything: what it reports is all that a shadow then holds.
+    # Without desired settings, the shadow holds only the agent's report.
     uplink.deliver(f"{asked[0].topic}/rejected", b'{"code": 404}')
     dispatcher.run_pending()
     agent.tick()
@@ -63,7 +63,7 @@ def test_an_agent_asks_for_as_much_as_the_model_says():
     assert len(json.dumps(json.loads(uplink.published[-1].payload)["state"])) < _SHADOW_METER
 
 
-def test_an_hour_with_a_connect_has_these_messages_more_than_one_without():
+def test_a_connect_adds_its_messages_to_an_hour():
     more, less = messages(_ONE), messages(replace(_ONE, connects_per_hour=0.0))
     assert {what: more[what] - less[what] for what in more if more[what] != less[what]} == {
         "CONNECT and SUBSCRIBE": 1 + model.SUBSCRIPTIONS,
@@ -71,7 +71,7 @@ def test_an_hour_with_a_connect_has_these_messages_more_than_one_without():
     }
 
 
-def test_an_hour_with_a_connect_has_two_events_of_presence():
+def test_a_connect_adds_two_events_of_presence():
     items = model.bill(replace(_ONE, connects_per_hour=3.0))
     units = {item.price: item.units for item in items if item.lane == "connection"}
     for price in ("rule", "action", "invocation", "write"):
@@ -86,18 +86,18 @@ def test_a_command_is_sent_received_and_acknowledged():
     assert messages(_ONE)["sent, received, acknowledged"] == 0
 
 
-def test_the_thesis_connects_too_and_subscribes_to_nothing():
+def test_the_thesis_layout_pays_for_connects_without_subscriptions():
     items = {item.what: item.units for item in model.thesis_bill(replace(_ONE, connects_per_hour=2.0))}
     assert items["CONNECT"] == 2
 
 
-def test_a_line_of_presence_is_about_as_long_as_it_is_written(capsys, monkeypatch):
+def test_the_modelled_length_of_a_presence_line_matches_the_real_line(capsys, monkeypatch):
     monkeypatch.setenv("NAMESPACE", "iort")
     emit("presence", RobotsConnected=True, RobotsDisconnected=False)
     assert len(capsys.readouterr().out) == pytest.approx(model._PRESENCE_LINE, rel=0.1)
 
 
-def test_an_outage_is_held_to_the_lower_of_what_awss_pages_say():
+def test_an_outage_is_compared_with_the_lower_quota_of_awss_pages():
     assert QUOTAS["IoT Core: connects in a minute after an outage"].value == 500 * 60
     paper = {need.name: need.times for need in scale.on_paper(Usage(robots=60_000)).needs}
     assert paper["IoT Core: connects in a minute after an outage"] == 2

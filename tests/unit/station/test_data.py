@@ -1,4 +1,4 @@
-"""Queries, over a table in memory whose pages are as small as they can be."""
+"""Queries, on a table in memory with the smallest possible pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ START = 1_700_000_000_000_000
 
 
 class FakeCloud:
-    """A `iort_station.cloud.Cloud` whose only service is the table in memory."""
+    """A fake `iort_station.cloud.Cloud` with only the table in memory."""
 
     namespace = "iort"
 
@@ -53,7 +53,7 @@ def cloud_of(*batches, page_items=2, robot="car", gain=None):
 
 
 def ride(n=100, *, each=10, period_us=20_000, fields=("speed",)):
-    """Batches of n samples, whose values are their number."""
+    """Batches of n samples; each value is the sample's index."""
     return [
         Batch(
             "0badcafe",
@@ -65,7 +65,7 @@ def ride(n=100, *, each=10, period_us=20_000, fields=("speed",)):
     ]
 
 
-def test_gives_every_sample_once_and_in_order():
+def test_a_query_gives_every_sample_once_and_in_order():
     found = data.query(cloud_of(*ride()), "car", "vesc")
     assert found.times_us.tolist() == [START + 20_000 * i for i in range(100)]
     assert found.times_us.dtype == np.int64
@@ -75,7 +75,7 @@ def test_gives_every_sample_once_and_in_order():
 
 
 @given(st.integers(-30_000, 2_030_000), st.integers(0, 2_060_000), st.integers(1, 4))
-def test_a_range_has_its_start_and_not_its_end(offset, length, page_items):
+def test_a_range_includes_its_start_and_excludes_its_end(offset, length, page_items):
     cloud = cloud_of(*ride(), page_items=page_items)
     first, last = START + offset, START + offset + length
     found = data.query(cloud, "car", "vesc", first, last)
@@ -93,8 +93,8 @@ def test_a_batch_that_starts_before_the_range_is_read():
     st.lists(st.tuples(st.integers(0, 30), st.integers(1, 5)), min_size=1, max_size=8),
     st.integers(1, 3),
 )
-def test_batches_that_reach_into_one_another_give_every_sample_in_order(starts, page_items):
-    """Clocks that interleave: nothing is lost where two claim one microsecond."""
+def test_overlapping_batches_give_every_sample_in_order(starts, page_items):
+    """Interleaved clocks: samples with the same microsecond are all kept."""
     batches = []
     for seq, (at, n) in enumerate(starts):
         times = [START + 100_000 * (at + i // 2) for i in range(n)]
@@ -105,7 +105,7 @@ def test_batches_that_reach_into_one_another_give_every_sample_in_order(starts, 
     assert list(zip(found.times_us.tolist(), found.columns["speed"].tolist(), strict=True)) == expected
 
 
-def test_null_is_nan_and_a_field_that_some_batches_lack_too():
+def test_nulls_and_missing_fields_are_nan():
     cloud = cloud_of(
         Batch("0badcafe", 0, [START, START + 1], {"speed": [None, 1.5]}),
         Batch("0badcafe", 1, [START + 2], {"speed": [2], "duty_cycle": [0.1]}),
@@ -119,7 +119,7 @@ def test_null_is_nan_and_a_field_that_some_batches_lack_too():
     assert frame.index[0].value == START * 1000
 
 
-def test_texts_flags_and_large_integers_stay_what_they_are():
+def test_texts_bools_and_large_integers_keep_their_types():
     large = 2**53 + 1
     batch = Batch(
         "0badcafe", 0, [START, START + 1], {"s": ["1", None], "b": [True, False], "i": [large, None]}
@@ -130,7 +130,7 @@ def test_texts_flags_and_large_integers_stay_what_they_are():
     assert columns["i"].tolist() == [large, None]
 
 
-def test_items_that_are_no_batches_are_counted_and_the_rest_is_given():
+def test_invalid_items_are_counted_and_the_rest_is_given():
     cloud = cloud_of(*ride(20))
     for at, change in enumerate(({"samples": "!"}, {"n": 7}, {"v": 9}, {"codec": "x"})):
         item = item_of(Batch("0badcafe", 0, [START + 5_000_000 + at], {"speed": [1]}))
@@ -141,7 +141,7 @@ def test_items_that_are_no_batches_are_counted_and_the_rest_is_given():
     assert "base64" in found.reason
 
 
-def test_where_and_fields_work_on_what_is_derived():
+def test_where_and_fields_work_on_derived_fields():
     cloud = cloud_of(*ride(), gain="10")
     found = data.query(cloud, "car", "vesc", fields=["speed_mps"], where="speed_mps >= 9.8")
     assert list(found.columns) == ["speed_mps"]
@@ -149,7 +149,7 @@ def test_where_and_fields_work_on_what_is_derived():
     assert found.unit("speed_mps") == "m/s"
 
 
-def test_what_is_derived_is_what_lambda_2_derives():
+def test_derived_fields_equal_those_of_lambda_2():
     lists = {"speed": [1, None, 3.5], "voltage_input": [12, 11.5, None], "current_input": [1e300, 2, 3]}
     vehicle = Vehicle(4614.0, 3.0)
     arrays = {name: np.array(values, dtype=float) for name, values in lists.items()}
@@ -157,7 +157,7 @@ def test_what_is_derived_is_what_lambda_2_derives():
     assert {name: conditions.values(column) for name, column in ours.items()} == derive_lists(lists, vehicle)
 
 
-def test_every_puts_samples_together_across_pages():
+def test_every_combines_samples_across_pages():
     batches = ride(150, fields=("speed", "fault_code"))
     found = data.query(cloud_of(*batches, page_items=1), "car", "vesc", every="1s")
     assert found.times_us.tolist() == [START, START + 1_000_000, START + 2_000_000]
@@ -165,7 +165,7 @@ def test_every_puts_samples_together_across_pages():
     assert found.columns["fault_code"].tolist() == [49, 99, 149]
 
 
-def test_every_passes_over_null():
+def test_every_ignores_null():
     batch = Batch(
         "0badcafe", 0, [START, START + 1, START + 500_000], {"speed": [None, 3, None], "s": ["a", "b", "c"]}
     )
@@ -177,7 +177,7 @@ def test_every_passes_over_null():
 def test_summary_gives_the_seconds_that_begin_in_the_range():
     cloud = cloud_of(*ride())
     for second in range(3):
-        # As they are written, and as they once were.
+        # In today's packed form and in the older flat form.
         packed = packed_second({"n": 50}, {"speed": [float(second), 1.5, 2, 2]})
         stored = packed if second % 2 else flat_second(packed)
         item = {name: attribute(value) for name, value in stored.items()}
@@ -197,7 +197,7 @@ def test_summary_gives_the_seconds_that_begin_in_the_range():
 
 
 @pytest.mark.parametrize(("drawn", "unit"), [([1, 2, None, 4], "1e-4 Ah"), ([1e-4, 2e-4, None, 4e-4], "Ah")])
-def test_charge_has_the_unit_of_the_driver_that_counted_it(drawn, unit):
+def test_charge_has_the_unit_of_its_driver(drawn, unit):
     times = [START + 20_000 * i for i in range(4)]
     cloud = cloud_of(Batch("0badcafe", 0, times, {"charge_drawn": drawn, "charge_regen": [0, 0, 0, 0]}))
     for found in (data.query(cloud, "car", "vesc"), data.query(cloud, "car", "vesc", every="1s")):
@@ -205,7 +205,7 @@ def test_charge_has_the_unit_of_the_driver_that_counted_it(drawn, unit):
 
 
 @pytest.mark.parametrize(("drawn", "unit"), [(4, "1e-4 Ah"), (4e-4, "Ah")])
-def test_charge_in_a_summary_has_its_unit_too(drawn, unit):
+def test_charge_in_a_summary_has_the_unit_of_its_driver(drawn, unit):
     cloud = cloud_of(*ride())
     summary = {"n": 50, "charge_drawn_mean": drawn * 0.7, "charge_drawn_max": drawn}
     key = {"topic": {"S": TOPIC}, "second": {"N": str(START // 1_000_000)}}
@@ -213,7 +213,7 @@ def test_charge_in_a_summary_has_its_unit_too(drawn, unit):
     assert data.query(cloud, "car", "vesc", summary=True).unit("charge_drawn_mean") == unit
 
 
-def test_an_empty_range_is_no_error():
+def test_an_empty_range_gives_an_empty_result():
     found = data.query(cloud_of(*ride()), "car", "vesc", START - 10, START)
     assert len(found) == 0
 
@@ -233,24 +233,24 @@ def test_an_empty_range_is_no_error():
         ({"robot": "a/b"}, "got 'a/b'"),
     ],
 )
-def test_a_mistake_is_answered_with_what_there_is(question, answer):
+def test_a_mistake_is_answered_with_the_available_names(question, answer):
     arguments = {"robot": "car", "stream": "vesc", **question}
     with pytest.raises(StationError) as refused:
         data.query(cloud_of(*ride()), **arguments)
     assert answer in str(refused.value)
 
 
-def test_a_selection_reads_only_what_it_needs():
+def test_a_selection_reads_only_the_needed_fields():
     selection = select("car", "vesc", fields=["speed_mps"], where="duty_cycle > 0")
     names = ["speed", "duty_cycle", "voltage_input", "speed_mps"]
     assert [name for name in names if selection.needs(name)] == ["speed", "duty_cycle", "speed_mps"]
 
 
-# --- units by what the robot has said of a stream ---------------------------------------------------------
+# --- units from a stream's message types ------------------------------------------------------------------
 
 
 def driven(stream, columns, *said):
-    """A cloud with a second of a stream, and what was said of streams, a second each from the start on."""
+    """A cloud with one second of a stream, and message types sent one a second from the start."""
     cloud = cloud_of()
     put(cloud, stream, Batch("0badcafe", 0, [START], {name: [1.5] for name in columns}))
     for i, kind in enumerate(said):
@@ -263,7 +263,7 @@ def put(cloud, stream, batch):
     cloud.table.put(TELEMETRY, item_of(batch, build_topic("dt", "car", stream)))
 
 
-def test_a_stream_of_any_name_has_the_units_of_its_type():
+def test_the_type_of_a_stream_gives_its_units_under_any_name():
     state = "float64 speed\n"
     vesc = MessageType("esc", "/sensors/core", "vesc_msgs/VescState", "", state)
     other = MessageType("other", "/o", "lab/Other", "", state)
@@ -274,7 +274,7 @@ def test_a_stream_of_any_name_has_the_units_of_its_type():
     assert data.query(cloud, "car", "other").unit("speed") == ""
 
 
-def test_a_type_counts_that_was_said_before_the_range_ended():
+def test_a_type_applies_if_it_was_sent_before_the_end_of_the_range():
     drive = MessageType("s", "/s", "ackermann_msgs/AckermannDrive", "", "float32 speed\n")
     vesc = drive._replace(kind="vesc_msgs/VescState")
     cloud = driven("s", ["speed"], drive, vesc)
@@ -282,14 +282,14 @@ def test_a_type_counts_that_was_said_before_the_range_ended():
     assert data.query(cloud, "car", "s", START, START + 1_000_001).unit("speed") == "erpm"
 
 
-def test_a_log_of_a_vesc_has_its_units_under_any_name_and_others_do_not():
+def test_only_a_vesc_log_has_the_vescs_units_under_any_name():
     log = ["speed", "voltage_input", "current_motor", "duty_cycle", "gnss_lat"]
     found = data.query(driven("ride", log), "car", "ride", fields=["speed", "gnss_lat"])
     assert [found.unit(name) for name in found.columns] == ["erpm", "deg"]
     assert data.query(driven("ride", ["speed"]), "car", "ride").unit("speed") == ""
 
 
-def test_types_are_read_only_when_a_unit_asks():
+def test_types_are_read_only_when_a_unit_is_needed():
     cloud = driven("ride", ["speed"])
     found = data.query(cloud, "car", "ride")
     before = cloud.table.calls["query"]

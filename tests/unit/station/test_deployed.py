@@ -1,4 +1,4 @@
-"""What `iort cost --deployed` finds of alarms and dashboards."""
+"""`iort cost --deployed` counts a deployment's alarms and dashboards."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEARCH = [[{"expression": "SEARCH('{iort,Robot} MetricName=\"BatteryVolts\"', 'S
 
 
 class CloudWatch:
-    """An account with an alarm that names its metric and one that asks Metrics Insights, and dashboards."""
+    """A fake account with a metric alarm, a Metrics Insights alarm, and dashboards."""
 
     namespace = "iort"
 
@@ -48,7 +48,7 @@ class CloudWatch:
         return {"DashboardBody": json.dumps({"widgets": widgets})}
 
 
-def test_alarms_and_dashboards_are_counted_as_they_are_billed():
+def test_alarms_and_dashboards_are_counted_as_aws_bills_them():
     found = watching(CloudWatch({"iort-robots": ROWS, "iort-platform": ROWS * 30, "other": ROWS[:1]}))
     assert found == {
         "alarms": 1,
@@ -60,7 +60,7 @@ def test_alarms_and_dashboards_are_counted_as_they_are_billed():
     assert rest["dashboards"] == 3.0, "the one of over fifty"
 
 
-def test_a_search_on_the_robots_dashboard_is_of_every_robot():
+def test_a_search_on_the_robots_dashboard_means_metrics_of_every_robot():
     found = watching(CloudWatch({"iort-robots": ROWS + SEARCH, "zebra": ROWS}))
     assert (found["dashboards"], found["robot_metrics"]) == ((2, 2), True)
     assert not watching(CloudWatch({}))["robot_metrics"]

@@ -1,4 +1,4 @@
-"""The language of conditions: what it says, what it refuses, and that both evaluators agree."""
+"""The language of conditions: its results, its errors, and the agreement of both evaluators."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def both(text, samples=SAMPLES):
         ("  speed > 0\n and fault_code == 1 ", [0, 1, 0, 0]),
     ],
 )
-def test_says_where_it_holds(text, expected):
+def test_a_condition_selects_the_matching_samples(text, expected):
     assert both(text) == list(map(bool, expected))
 
 
@@ -92,7 +92,7 @@ def test_says_where_it_holds(text, expected):
         ("'é' == name and f'{x}'", 16),
     ],
 )
-def test_refuses_everything_else_and_points_at_it(text, position):
+def test_an_invalid_condition_is_refused_with_its_position(text, position):
     with pytest.raises(ExpressionError) as refused:
         parse(text)
     assert refused.value.position == position
@@ -100,7 +100,7 @@ def test_refuses_everything_else_and_points_at_it(text, position):
 
 
 @pytest.mark.parametrize("text", ["(" * 500 + "1" + ")" * 500, "not " * 200 + "x", "x" * 2000])
-def test_neither_depth_nor_length_breaks_it(text):
+def test_deep_and_long_conditions_are_refused(text):
     with pytest.raises(ExpressionError):
         parse(text)
 
@@ -118,7 +118,7 @@ def test_neither_depth_nor_length_breaks_it(text):
         ("-'x' > 3", 0),
     ],
 )
-def test_refuses_at_once_what_no_field_could_answer(text, position):
+def test_a_condition_that_no_field_can_meet_is_refused_while_parsing(text, position):
     with pytest.raises(ExpressionError) as refused:
         parse(text)
     assert refused.value.position == position
@@ -138,7 +138,7 @@ def test_refuses_at_once_what_no_field_could_answer(text, position):
         ("not abs(name) > 2", "cannot calculate with a text: name is a text"),
     ],
 )
-def test_a_number_compared_with_a_text_is_an_error_and_not_nothing_found(text, said):
+def test_a_number_compared_with_a_text_is_an_error(text, said):
     samples = {**SAMPLES, "mixed": ["a", 1, None, None]}
     node = parse(text)
     with pytest.raises(MismatchError) as in_the_cloud:
@@ -191,7 +191,7 @@ maybe_texts = st.one_of(st.none(), st.sampled_from(["", "x", "y"]))
 
 
 @given(over_texts, st.lists(st.tuples(numbers, numbers, maybe_texts, maybe_texts), min_size=1, max_size=4))
-def test_lists_and_arrays_agree_on_what_cannot_be_answered_too(text, rows):
+def test_lists_and_arrays_agree_on_errors(text, rows):
     samples = dict(zip("abst", map(list, zip(*rows, strict=True)), strict=True))
     try:
         node = parse(text)

@@ -23,7 +23,7 @@ NOON = 1_700_000_000
 
 
 class PagedS3:
-    """moto's client with pages of two keys, where AWS' have a thousand; counts them."""
+    """moto's client with pages of two keys instead of a thousand; it counts the pages."""
 
     def __init__(self, client):
         self._client = client
@@ -65,7 +65,7 @@ def cloud(s3, monkeypatch):
 
 @pytest.fixture
 def store(s3):
-    """Puts a file of a robot's; the SHA-256 may be another's."""
+    """Puts a robot's file; the SHA-256 may be wrong."""
 
     def put(content=b"content", name="drive.bag", second=NOON, robot="car", sha256=None):
         digest = hashlib.sha256(content).hexdigest()
@@ -81,7 +81,7 @@ def names(found):
     return [one.name for one in found]
 
 
-def test_a_robots_files_are_listed_in_the_order_of_their_time_page_by_page(cloud, store, s3):
+def test_a_robots_files_are_listed_by_time_across_pages(cloud, store, s3):
     for i in (4, 0, 3, 1, 2):
         store(name=f"{i}.bag", second=NOON + i * 86_400)
     store(robot="car2", name="other.bag")
@@ -107,7 +107,7 @@ def test_a_robots_files_are_listed_in_the_order_of_their_time_page_by_page(cloud
         (0, 5, ""),
     ],
 )
-def test_a_range_is_of_the_files_time(cloud, store, start_s, end_s, expected):
+def test_a_range_applies_to_the_files_times(cloud, store, start_s, end_s, expected):
     for i in range(5):
         store(name=f"{i}.bag", second=NOON + i * 86_400)
     start_us, end_us = (None if s is None else s * 1_000_000 for s in (start_s, end_s))
@@ -115,7 +115,7 @@ def test_a_range_is_of_the_files_time(cloud, store, start_s, end_s, expected):
     assert names(found) == [f"{i}.bag" for i in expected]
 
 
-def test_a_download_goes_on_and_what_it_brings_is_checked(cloud, store, tmp_path):
+def test_a_download_resumes_and_its_content_is_checked(cloud, store, tmp_path):
     content = bytes(range(256)) * 1000
     store(content, name="rosbag2_1/data.db3")
     (file,) = files.listed(cloud, "car")
@@ -128,7 +128,7 @@ def test_a_download_goes_on_and_what_it_brings_is_checked(cloud, store, tmp_path
     assert path.read_bytes() == content
     assert (heard[0], sum(heard)) == (1000, len(content))
     assert not part.exists()
-    # The same again is there.
+    # A second download finds the file complete.
     assert files.download(cloud, file, tmp_path) == path
     path.write_bytes(b"mine")
     with pytest.raises(StationError, match="is another file"):
@@ -136,7 +136,7 @@ def test_a_download_goes_on_and_what_it_brings_is_checked(cloud, store, tmp_path
     assert path.read_bytes() == b"mine"
 
 
-def test_a_content_that_is_not_what_the_robot_said_is_refused(cloud, store, tmp_path):
+def test_a_content_with_a_wrong_sha256_is_refused(cloud, store, tmp_path):
     store(b"evil", sha256="0" * 64)
     (file,) = files.listed(cloud, "car")
     with pytest.raises(StationError, match="SHA-256 must be"):
@@ -144,7 +144,7 @@ def test_a_content_that_is_not_what_the_robot_said_is_refused(cloud, store, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_a_part_that_is_damaged_is_noticed_and_thrown_away(cloud, store, tmp_path):
+def test_a_damaged_part_is_detected_and_deleted(cloud, store, tmp_path):
     content = b"0123456789"
     store(content)
     (file,) = files.listed(cloud, "car")
@@ -155,7 +155,7 @@ def test_a_part_that_is_damaged_is_noticed_and_thrown_away(cloud, store, tmp_pat
     assert files.download(cloud, file, tmp_path).read_bytes() == content
 
 
-def test_empty_leaves_nothing(cloud, store, s3):
+def test_empty_deletes_all_files(cloud, store, s3):
     for i in range(5):
         store(name=f"{i}.bag")
     s3.create_multipart_upload(Bucket=NAME, Key="robots/car/begun")
@@ -182,7 +182,7 @@ def iort(cloud, monkeypatch):
     return run
 
 
-def test_list(iort, store):
+def test_list_prints_the_selected_files(iort, store):
     store(name="a.bag")
     key = store(name="b.txt", second=NOON + 1)
     assert iort("list", "car").output.splitlines()[0].split() == ["2023-11-14T22:13:20Z", "7", "a.bag"]
@@ -192,7 +192,7 @@ def test_list(iort, store):
     assert "give --last, or" in str(iort("list", "car", "--last", "1d", "--to", "now", status=1).exception)
 
 
-def test_get(iort, store, tmp_path):
+def test_get_downloads_the_newest_file_or_all(iort, store, tmp_path):
     store(b"old", name="a.bag")
     store(b"new", name="a.bag", second=NOON + 1)
     store(b"other", name="b.bag", second=NOON + 2)
@@ -212,7 +212,7 @@ def test_get(iort, store, tmp_path):
     assert "no matching files" in str(iort("get", "car", "--name", "*.zip", status=1).exception)
 
 
-def test_empty_asks(iort, store, s3):
+def test_empty_asks_for_confirmation(iort, store, s3):
     store()
     iort("empty", input="n\n", status=1)
     assert s3.list_objects_v2(Bucket=NAME)["KeyCount"] == 1

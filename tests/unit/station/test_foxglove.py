@@ -1,4 +1,4 @@
-"""Exported recordings, opened by the libraries that Foxglove reads them with."""
+"""Exported recordings open in Foxglove's own libraries."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RICH_SAMPLE: dict[str, Value] = {
 
 
 def blocks(samples: Sequence[Mapping[str, Value]]) -> list[Block]:
-    """The samples a millisecond apart, some hundred a block."""
+    """The samples, one a millisecond, a few hundred in a block."""
     return [
         Block(
             np.arange(len(samples))[at : at + 700] * 1000 + T_US,
@@ -67,7 +67,7 @@ def test_foxglove_reads_every_message_of_every_type(tmp_path: Path, suffix: str)
     assert [header["seq"] for header in headers] == list(range(COUNT))
     assert [header["stamp"]["sec"] * 10**9 + header["stamp"]["nsec"] for header in headers] == times
     assert {header["frame_id"] for header in headers} == {""}
-    # JavaScript has 64-bit integers beside its numbers; they come as texts.
+    # JavaScript's 64-bit integers are printed as texts.
     assert [flat(message) for message in messages["/rich"]] == [
         {**sample, "large": str(sample["large"])} for sample in rich
     ]

@@ -1,4 +1,4 @@
-"""Samples made into messages again, of every shape that a message has."""
+"""Samples become messages again, with messages of every shape."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def made(definition, sample, kind="a_msgs/A"):
     return maker, store, store.deserialize_ros1(raw, "a_msgs/msg/A")
 
 
-def test_a_header_and_one_thing():
+def test_a_message_has_its_header_and_its_nested_fields():
     maker, _, message = made(STAMPED, {"x": 1.5, "code": 7.0})
     assert (message.b.x, message.b.code) == (1.5, 7)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 123_456_000)
     assert maker.lacking == maker.foreign == []
 
 
-def test_a_header_of_ros_2_becomes_one_of_ros_1():
+def test_a_ros_2_header_becomes_a_ros_1_header():
     of_ros2 = STAMPED.replace("uint32 seq\n", "")
     assert of_ros2 != STAMPED
     maker = Maker(MessageType("s", "/t", "a_msgs/A", "", of_ros2), ["x", "code"])
@@ -63,7 +63,7 @@ def test_a_header_of_ros_2_becomes_one_of_ros_1():
     assert (message.header.seq, message.b.x) == (0, 1.5)
 
 
-def test_headers_are_numbered_and_have_the_samples_time():
+def test_headers_have_sequence_numbers_and_the_samples_time():
     path = "Header header\nB[2] parts\n" + HEADER + LINE + "MSG: a_msgs/B\nHeader header\nfloat64 x\n"
     maker = Maker(MessageType("s", "/t", "a_msgs/A", "", path), ["parts.0.x", "parts.1.x"])
     store = get_typestore(Stores.EMPTY)
@@ -79,7 +79,7 @@ def test_headers_are_numbered_and_have_the_samples_time():
     assert seen == [(i, i, "") for i in range(6)]
 
 
-def test_what_flattens_is_made_again():
+def test_a_flattened_message_is_restored():
     sample = {
         "on": True, "small": 7, "large": 2**60 + 1, "name": "ü", "at.sec": 5, "at.nanosec": 6,
         "took.sec": -1, "took.nanosec": 2, "pair.0": 0.5, "pair.1": -2.0, "bytes.0": 1, "bytes.1": 255,
@@ -96,13 +96,13 @@ def test_what_flattens_is_made_again():
     assert maker.lacking == maker.foreign == []
 
 
-def test_fields_may_be_words_of_python():
+def test_fields_may_have_names_of_python_keywords():
     _, _, message = made("float64 from\nB class\n" + LINE + "MSG: a_msgs/B\nint32 lambda\n",
                          {"from": 1.5, "class.lambda": 3})  # fmt: skip
     assert (message.from_, message.class_.lambda_) == (1.5, 3)
 
 
-def test_null_lacking_and_foreign_fields():
+def test_null_missing_and_unknown_fields_are_handled():
     maker, _, message = made(STAMPED, {"x": None, "y": 1})
     assert np.isnan(message.b.x)
     assert message.b.code == 0
@@ -110,7 +110,7 @@ def test_null_lacking_and_foreign_fields():
 
 
 def has_said(*samples):
-    """A cloud in which a robot has said these, a millisecond apart."""
+    """A cloud with these message types of a robot, sent one a millisecond."""
     cloud, topic = cloud_of(), build_topic("dt", "car", TYPES_STREAM)
     for i, one in enumerate(samples):
         columns = {name: [value] for name, value in one.sample().items()}
@@ -118,12 +118,12 @@ def has_said(*samples):
     return cloud
 
 
-def test_what_a_robot_has_said_of_its_messages():
+def test_the_types_that_a_robot_sent_are_read_with_their_times():
     first = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
     second, other = first._replace(md5sum="2" * 32), first._replace(stream="o", topic="/o")
     elsewhere = first._replace(topic="/u")
     cloud = has_said(first, other, second, elsewhere, first)
-    # Each once, and since when; batches refer to them by their ids.
+    # Each type once, with its first time; batches refer to types by id.
     assert types(cloud, "car", "s") == {
         first.id: (1000, first),
         second.id: (3000, second),
@@ -133,13 +133,13 @@ def test_what_a_robot_has_said_of_its_messages():
     assert types(cloud, "car", "nothing") == {}
 
 
-def test_a_definition_that_one_publisher_left_out_is_taken_from_another():
+def test_a_missing_definition_is_taken_from_another_publisher():
     whole = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
     cloud = has_said(whole._replace(definition=""), whole)
     assert types(cloud, "car", "s") == {whole.id: (1000, whole)}
 
 
-def test_samples_without_a_type_get_one():
+def test_samples_without_a_type_get_a_generated_type():
     columns = {"rule_ms": column_of([1.5]), "pose.x": column_of([2]), "ok": column_of([True])}
     kind = made_of("rtt-2", columns)
     maker = Maker(kind, list(columns), own=True)
@@ -153,7 +153,7 @@ def test_samples_without_a_type_get_one():
     assert (message.rule_ms, message.pose_x, message.ok) == (1.5, 2.0, True)
 
 
-def test_a_type_survives_the_wire_and_a_wrong_one_is_refused():
+def test_a_type_is_decoded_as_it_was_encoded_and_an_invalid_one_is_refused():
     kind = MessageType("s", "/t", "a_msgs/A", "x" * 32, STAMPED + "# " + "ü" * 9000)
     assert message_type(kind.sample()) == kind
     with pytest.raises(ContractError, match="characters"):

@@ -1,4 +1,4 @@
-"""Batches of version 1 as batches of this version: the same samples, and nothing else lost."""
+"""Batches of version 1 are converted without loss to batches of this version."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.unit.station.old_messages import old_envelope, old_message
 
 T0 = 1_700_000_000_000_000
 BATCH = Batch("0badcafe", 7, [T0, T0 + 20_000], {"speed": [1.5, None], "mode": ["a", "b"]}, nonfinite=1)
-# Written by the agent of a1b2690: samples of every kind of column, one of them not finite.
+# Written by the agent of a1b2690: columns of every type, one value not finite.
 WRITTEN = {
     "v": 1,
     "boot": "0badcafe",
@@ -31,7 +31,7 @@ WRITTEN = {
 }
 
 
-def test_what_the_agent_of_before_wrote_is_read_as_it_was():
+def test_a_batch_of_the_older_agent_is_read():
     batch = decode_batch(upgraded(WRITTEN))
     assert batch.id == (T0, "0badcafe", 12)
     assert list(batch.times_us) == [T0, T0 + 20_000, T0 + 40_001]
@@ -49,15 +49,15 @@ def test_what_the_agent_of_before_wrote_is_read_as_it_was():
     t_us=st.integers(0, 2**53 - 2),
     speeds=st.lists(st.none() | st.floats() | st.integers(-(2**63), 2**64 - 1), min_size=1, max_size=5),
 )
-def test_any_batch_is_the_same_after_it(seq, t_us, speeds):
+def test_any_batch_is_unchanged_by_the_conversion(seq, t_us, speeds):
     times = [t_us] * len(speeds)
     sent = encode_batch(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
     new = upgraded(old_envelope(decode_batch(sent)))
     assert new == json.loads(sent)
 
 
-def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
-    """What the rule added, and what a robot put there that nobody asked for."""
+def test_an_item_keeps_its_other_attributes_exactly():
+    """The rule's attributes and a robot's unknown attributes."""
     item = item_of_message(old_message(BATCH), expires_s=1_800_000_001)
     item |= {"more": {"N": "1E+125"}, "list": {"L": [{"S": "x"}]}}
     new = upgraded_item(item)
@@ -83,7 +83,7 @@ def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
         ({"nonfinite": -1}, "nonfinite must be .*, got -1"),
     ],
 )
-def test_what_no_id_can_be_made_of_says_why(changes, reason):
+def test_a_batch_without_a_valid_id_is_refused_with_the_reason(changes, reason):
     with pytest.raises(ContractError, match=reason):
         upgraded(old_envelope(BATCH, **changes))
 
@@ -94,5 +94,5 @@ def test_another_version_is_not_old(v):
     assert not is_old({})
 
 
-def test_the_version_of_a_stored_item_is_a_decimal():
+def test_the_version_of_a_stored_item_may_be_a_decimal():
     assert is_old({"v": Decimal(1)})

@@ -1,4 +1,4 @@
-"""Pictures: what is on them, read from the figure, and what cannot be drawn."""
+"""Plots: the content of each figure, and the error for data that cannot be drawn."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def lines(panel):
     return [line for line in panel.get_lines() if len(line.get_xdata()) > 2]
 
 
-def test_a_panel_a_field_and_a_line_a_run_with_units():
+def test_each_field_has_a_panel_with_its_unit_and_each_run_a_line():
     columns = {"speed": np.arange(100.0), "current_motor": np.ones(100)}
     figure = plots.over_time([run("a", **columns), run("b", **columns)], ["speed", "current_motor"])
     assert [panel.get_ylabel() for panel in figure.axes] == ["speed\n(erpm)", "current_motor\n(A)"]
@@ -36,14 +36,14 @@ def test_a_panel_a_field_and_a_line_a_run_with_units():
     assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
 
 
-def test_runs_from_their_start():
+def test_runs_can_be_drawn_from_their_start():
     figure = plots.over_time([run()], ["speed"], from_start=True)
     (line,) = lines(figure.axes[0])
     assert line.get_xdata()[:2].tolist() == [0.0, 0.02]
     assert figure.axes[0].get_xlabel() == "time since the start (s)"
 
 
-def test_no_line_bridges_a_hole():
+def test_a_line_is_interrupted_at_a_hole():
     one = run()
     times = one.result.times_us.copy()
     times[50:] += 10_000_000
@@ -61,7 +61,7 @@ def test_a_long_run_keeps_its_extremes():
     assert (line.get_ydata().max(), line.get_ydata().min()) == (9, -9)
 
 
-def test_a_trajectory_is_drawn_to_scale_and_never_made_up():
+def test_a_trajectory_is_drawn_to_scale_and_only_from_known_positions():
     turn = np.linspace(0, 6, 100)
     pose = {"position.x": np.cos(turn), "position.y": np.sin(turn)}
     figure = plots.trajectory([run("a", **pose), run("b", **pose)])
@@ -73,7 +73,7 @@ def test_a_trajectory_is_drawn_to_scale_and_never_made_up():
         plots.trajectory([run()])
 
 
-def test_a_distribution_is_in_per_cent_with_its_median():
+def test_a_distribution_is_drawn_in_per_cent_with_its_median():
     column = np.append(np.arange(99.0), np.nan)
     (panel,) = plots.distribution([run(speed=column)], ["speed"]).axes
     (median,) = [line for line in panel.get_lines() if len(line.get_xdata()) == 2]
@@ -83,7 +83,7 @@ def test_a_distribution_is_in_per_cent_with_its_median():
     assert panel.get_xlabel() == "speed\n(erpm)"
 
 
-def test_what_cannot_be_drawn_is_named(tmp_path):
+def test_a_field_or_format_that_cannot_be_drawn_is_named(tmp_path):
     with pytest.raises(StationError, match="volts cannot be drawn, only speed"):
         plots.over_time([run()], ["volts"])
     figure = plots.over_time([run()], ["speed"])
@@ -92,7 +92,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "begins"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml"), ("a.pdf", b"%PDF")])
-def test_pictures_are_written(tmp_path, name, begins):
+def test_plots_are_saved_in_every_format(tmp_path, name, begins):
     nothing = np.full(100, np.nan)
     figure = plots.over_time([run(speed=nothing), run("b", speed=np.arange(100.0))], ["speed"])
     plots.save(figure, tmp_path / name)
@@ -100,7 +100,7 @@ def test_pictures_are_written(tmp_path, name, begins):
 
 
 def degrees(latitude="latitude", longitude="longitude", **more):
-    """A hundred metres to the north, then as many to the east, from a receiver that needs its time."""
+    """A drive of 100 m north, then 100 m east; the receiver has no position at first."""
     metre = 180 / (np.pi * 6_371_008.8)
     north = np.append(np.arange(50) * 2, np.full(50, 100)) * metre
     east = np.append(np.zeros(50), np.arange(50) * 2) * metre / np.cos(np.radians(52))
@@ -117,20 +117,20 @@ def degrees(latitude="latitude", longitude="longitude", **more):
         (degrees("fix.latitude", "fix.longitude"), "fix.latitude, fix.longitude"),
     ],
 )
-def test_latitude_and_longitude_are_drawn_as_metres_around_the_first_place_known(columns, names):
+def test_latitude_and_longitude_are_drawn_as_metres_from_the_first_known_position(columns, names):
     figure = plots.trajectory([run("a", **columns)])
     (panel,) = figure.axes
     (line,) = lines(panel)
     x, y = line.get_xdata(), line.get_ydata()
     assert np.isnan(x[:3]).all()
     assert (x[3], y[3]) == (0, 0)
-    # It was 6 m to the north when it knew where it was.
+    # The first known position was 6 m north.
     assert (x[-1], y[-1]) == (pytest.approx(98, rel=1e-4), pytest.approx(94, rel=1e-4))
     assert (panel.get_xlabel(), panel.get_ylabel()) == ("east (m)", "north (m)")
     assert f"{names} around 52.0000540, 13.0000000" in figure.get_suptitle()
 
 
-def test_runs_share_the_place_that_they_are_drawn_around():
+def test_runs_share_their_origin():
     later = degrees()
     later["latitude"] += 0.001
     figure = plots.trajectory([run("a", **degrees()), run("b", **later)])
@@ -138,7 +138,7 @@ def test_runs_share_the_place_that_they_are_drawn_around():
     assert other.get_ydata()[-1] - one.get_ydata()[-1] == pytest.approx(111.2, abs=0.1)
 
 
-def test_a_place_without_a_fix_is_none_and_the_antimeridian_no_jump():
+def test_a_position_without_a_fix_is_left_out_and_the_antimeridian_makes_no_jump():
     status = np.zeros(100)
     status[-10:] = -1
     (line,) = lines(plots.trajectory([run(**degrees(), **{"status.status": status})]).axes[0])

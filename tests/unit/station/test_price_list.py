@@ -21,7 +21,7 @@ from iort_station.errors import StationError
 
 TODAY = date(2026, 11, 22)
 REGION = "eu-west-1"
-# Of each price: the service, what a bill calls it in Ireland, and its price as built in.
+# For each price: the service, its name on a bill in Ireland, and the built-in price.
 USAGES = {
     "connection": "EUW1-ConnectionMinutes",
     "message": "EUW1-Messages",
@@ -69,7 +69,7 @@ def product(service, usage, *tiers, description="", region=REGION):
 
 
 def as_built_in():
-    """The price list if nothing had changed."""
+    """The price list with the built-in prices."""
     return {
         name: product(
             one.service,
@@ -82,7 +82,7 @@ def as_built_in():
 
 
 class Pricing:
-    """The client: products as they are asked for, two a page, and refusals of services."""
+    """A fake pricing client: the requested products, two a page, or an error for a service."""
 
     def __init__(self, products, **refused):
         self.products, self.refused = list(products), refused
@@ -108,7 +108,7 @@ class Pricing:
             yield {"FormatVersion": "aws_v1", "PriceList": found[i : i + 2]}
 
 
-def test_what_is_as_built_in_changes_nothing():
+def test_an_unchanged_price_list_changes_nothing():
     listed = read(Pricing(as_built_in().values()), REGION, TODAY)
     assert (listed.read_on, listed.region, listed.kept) == ("2026-11-22", REGION, {})
     assert listed.each.keys() == PRODUCTS.keys()
@@ -116,8 +116,8 @@ def test_what_is_as_built_in_changes_nothing():
     assert report.differences(listed).body == [(f"as built in: {len(PRODUCTS)} of {len(PRODUCTS)}", "", "")]
 
 
-def test_it_is_asked_as_awss_own_client_asks():
-    """botocore holds the questions and the answers to its model of the API, and pages."""
+def test_the_requests_pass_botocores_validation():
+    """botocore's Stubber checks requests and responses against its model of the API, with paging."""
     client = boto3.client("pricing", region_name=API_REGION, aws_access_key_id="x", aws_secret_access_key="x")
     products = as_built_in().values()
     with Stubber(client) as stubber:
@@ -143,24 +143,24 @@ def test_it_is_asked_as_awss_own_client_asks():
     assert (listed.each.keys(), listed.kept, listed.changed()) == (PRODUCTS.keys(), {}, {})
 
 
-def test_every_price_of_aws_is_asked_for():
+def test_every_aws_price_is_requested():
     assert PRICES.keys() - PRODUCTS.keys() == {"pubnub_publish", "pubnub_receive"}
 
 
-def test_a_price_that_differs_is_told_and_counts():
+def test_a_changed_price_is_reported_and_used():
     products = as_built_in() | {"rule": product("AWSIoT", USAGES["rule"], (0, 0.30e-6))}
     listed = read(Pricing(products.values()), REGION, TODAY)
     assert listed.changed() == {"rule": (0.15, pytest.approx(0.30))}
     line, rest = report.differences(listed).body
     assert line[1:] == ("0.15", "0.3")
     assert rest[0].startswith(f"as built in: {len(PRODUCTS) - 1} of")
-    dearer, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
+    changed, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
     more = sum(item.units for item in before if item.price == "rule") * 0.15e-6
-    assert line_items.total(dearer) == pytest.approx(line_items.total(before) + more)
+    assert line_items.total(changed) == pytest.approx(line_items.total(before) + more)
     assert "2026-11-22" in listed.prices()["rule"].seen
 
 
-def test_a_deployment_at_rest_is_priced_by_it_too():
+def test_the_price_list_applies_to_an_idle_deployment():
     products = as_built_in() | {"metric": product("AmazonCloudWatch", "EU-CW:MetricMonitorUsage", (0, 0.6))}
     prices = read(Pricing(products.values()), REGION, TODAY).prices()
     rest, before = (deployment_dollars_per_month(Usage(), each) for each in (prices, PRICES))
@@ -174,13 +174,13 @@ def test_the_first_tier_that_is_not_free_is_the_price():
     assert read(Pricing(products.values()), REGION, TODAY).each["storage"] == 0.30
 
 
-def test_what_is_called_otherwise_is_found_by_what_its_price_says():
+def test_a_renamed_product_is_found_by_its_description():
     said = "$0.15 per million Rules Triggered"
     products = as_built_in() | {"rule": product("AWSIoT", "EUW1-R42", (0, 0.2e-6), description=said)}
     assert read(Pricing(products.values()), REGION, TODAY).each["rule"] == 0.2e-6
 
 
-def test_a_region_that_writes_no_letters_before():
+def test_a_region_without_a_usage_prefix_is_read():
     products = [
         product("AmazonDynamoDB", "WriteRequestUnits", (0, 0.625e-6), region="us-east-1"),
         product("AmazonDynamoDB", "IA-WriteRequestUnits", (0, 0.78e-6), region="us-east-1"),
@@ -200,7 +200,7 @@ def test_a_region_that_writes_no_letters_before():
         ([0.15], "another unit than ours"),
     ],
 )
-def test_a_price_that_is_not_found_is_kept_and_says_why(instead, why):
+def test_a_missing_price_keeps_its_built_in_value_with_the_reason(instead, why):
     products = as_built_in()
     del products["rule"]
     found = [product("AWSIoT", USAGES["rule"], (0, dollars)) for dollars in instead]
@@ -211,22 +211,22 @@ def test_a_price_that_is_not_found_is_kept_and_says_why(instead, why):
 
 
 @pytest.mark.parametrize("code", ["NotFoundException", "InvalidParameterException"])
-def test_a_service_that_is_not_in_the_list_keeps_its_prices(code):
+def test_a_missing_service_keeps_its_built_in_prices(code):
     listed = read(Pricing(as_built_in().values(), IoTDeviceDefender=code), REGION, TODAY)
     assert listed.kept == {"audit": "IoTDeviceDefender has no .*Audit.* in eu-west-1"}
 
 
-def test_who_may_not_read_it_is_told_which_action_it_needs():
+def test_a_denied_request_names_the_required_action():
     with pytest.raises(StationError, match="pricing:GetProducts"):
         read(Pricing([], AWSIoT="AccessDeniedException"), REGION, TODAY)
 
 
-def test_a_region_without_any_of_our_products_is_an_error():
+def test_a_region_without_our_products_is_an_error():
     with pytest.raises(StationError, match="none of our products in mars-1"):
         read(Pricing(as_built_in().values()), "mars-1", TODAY)
 
 
-def test_what_was_read_is_kept_with_its_day(tmp_path):
+def test_a_price_list_is_kept_with_its_date(tmp_path):
     path = kept_at({"XDG_CACHE_HOME": str(tmp_path / "cache")})
     assert path == tmp_path / "cache" / "iort" / "prices.json"
     assert kept_at({"HOME": "/home/car"}).parts[-3:] == (".cache", "iort", "prices.json")
@@ -250,7 +250,7 @@ def test_what_was_read_is_kept_with_its_day(tmp_path):
         '{"read_on": "2026-11-22", "region": "x", "each": {"rule": "cheap"}, "kept": {}}',
     ],
 )
-def test_a_file_that_is_no_price_list_is_named(tmp_path, text):
+def test_an_invalid_price_file_is_named(tmp_path, text):
     path = tmp_path / "prices.json"
     path.write_text(text)
     with pytest.raises(StationError, match=r"prices\.json must be a price list"):
@@ -261,7 +261,7 @@ def run(*given, **environment):
     return CliRunner().invoke(app, ["cost", *given], env=environment)
 
 
-def test_later_calls_use_what_was_kept_and_say_of_when(tmp_path):
+def test_later_calls_use_the_kept_price_list_and_name_its_date(tmp_path):
     environment = {"XDG_CACHE_HOME": str(tmp_path)}
     listed = Listed("2026-11-22", "eu-north-1", {"rule": 0.3e-6}, {"audit": "not found"})
     keep(listed, kept_at(environment))
@@ -284,7 +284,7 @@ def test_the_embedded_cloud_has_no_price_list(tmp_path):
     assert "only AWS" in str(done.exception)
 
 
-def test_without_credentials_it_says_what_helps(tmp_path):
+def test_missing_credentials_are_an_error_with_advice(tmp_path):
     nothing = dict.fromkeys(
         ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE")
     )

@@ -1,4 +1,4 @@
-"""All readers of a message give one answer: what one refuses, none reads."""
+"""All readers of a message agree: if one refuses it, every reader refuses it."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "base" / "contrac
 
 
 def stored(**changes):
-    """A stored batch as DynamoDB sends it, with some of it changed."""
+    """A stored batch as DynamoDB returns it, with these changes."""
     item = item_of(Batch(RUN, 3, [T_US], {"speed": [1.5]}))
     return {**item, **{name: serialize(value) for name, value in changes.items()}}
 
 
 def by_columns(item):
-    """Read by numpy, in the station."""
+    """Read by the station's numpy back end."""
     refused = RefusedItems()
     found = list(blocks([[item]], refused))
     assert refused.count == (not found)
@@ -62,7 +62,7 @@ READERS = {
     "messages": by_contract(lambda item: messages_of(item, {})),
     "columns": by_columns,
 }
-# Of these the audit sees nothing: it reads no more than the key and two counts.
+# The audit cannot see these faults: it reads only the key and two counts.
 BODIES = [{"nonfinite": -1}, {"nonfinite": 10**9}, {"v": 1}, {"n": 2}, {"codec": "later"}]
 IDS = [
     f"{T_US}-run-1-3",
@@ -77,14 +77,14 @@ IDS = [
 
 
 @pytest.mark.parametrize("changes", [{}, *BODIES, *({"batch": one} for one in IDS)], ids=str)
-def test_every_reader_of_a_stored_batch_says_the_same(changes):
+def test_every_reader_of_a_stored_batch_gives_the_same_verdict(changes):
     item = stored(**changes)
     said = {name: reads(item) for name, reads in READERS.items()}
     assert set(said.values()) == {not changes}, said
 
 
 @pytest.mark.parametrize("text", IDS)
-def test_what_is_no_id_is_none_to_the_audit_either(text):
+def test_the_audit_refuses_an_invalid_id(text):
     with pytest.raises(ContractError):
         batch_id(text)
     assert audit("vesc", [{"batch": text, "n": "1", "received_ms": "1"}]).refused == 1
@@ -94,7 +94,7 @@ def saying(message, **changes):
     return json.dumps({**json.loads(message), **changes}).encode()
 
 
-def test_one_form_of_a_runs_name_holds_in_every_lane_and_on_the_page():
+def test_every_lane_and_the_page_accept_the_same_run_names():
     live = encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
     fleet = encode_fleet(FleetMessage(RUN, 1, T_US, {}))
     command = encode_command(Command(RUN, T_US, 1, T_US, 100, {}))

@@ -21,7 +21,7 @@ SECOND = START // 1_000_000
 
 
 class Cloud(FakeCloud):
-    """The tables in memory and one warm Lambda 2 over them, which has seen the ride already."""
+    """The tables in memory and one warm Lambda 2 that has already summarised the ride."""
 
     def __init__(self, client, *, old_version=False):
         super().__init__(client)
@@ -56,28 +56,28 @@ def again(cloud, since_us=None):
 
 @pytest.fixture
 def cloud():
-    """Four seconds of a ride, summarised with a gain of 10 that Lambda 2 keeps in mind."""
+    """Four seconds of a ride, summarised with a gain of 10 that Lambda 2 has cached."""
     return Cloud(cloud_of(*ride(200), gain="10").table)
 
 
-def test_every_second_has_the_new_speed_at_once_and_again(cloud, capsys):
+def test_every_second_has_the_new_speed_after_one_and_two_runs(cloud, capsys):
     assert cloud.speeds() == {0: 4.9, 1: 9.9, 2: 14.9, 3: 19.9}
     capsys.readouterr()
     set_gain(cloud, 20)
     for _ in range(2):
         assert again(cloud) == {"vesc": Recomputed(4, 0)}
         assert cloud.speeds() == {0: 2.45, 1: 4.95, 2: 7.45, 3: 9.95}
-    # The metrics have counted these batches, and those that were missing, once.
+    # The metrics have already counted these batches and the missing ones.
     assert capsys.readouterr().out == ""
 
 
-def test_what_was_before_the_time_stays(cloud):
+def test_seconds_before_the_start_time_stay(cloud):
     set_gain(cloud, 20)
     assert again(cloud, START + 2_500_000)["vesc"].seconds == 2
     assert cloud.speeds() == {0: 4.9, 1: 9.9, 2: 7.45, 3: 9.95}
 
 
-def test_nothing_else_of_a_second_changes(cloud):
+def test_other_values_of_a_second_stay(cloud):
     before = summary_of(cloud.table)
     again(cloud)
     assert summary_of(cloud.table) == before
@@ -92,20 +92,20 @@ def test_a_second_in_two_events_counts_once():
     assert cloud.speeds() == {second: (50 * second + 49) / 20 for second in range(16)}
 
 
-def test_what_is_no_batch_is_left_out_and_stops_nothing(cloud):
+def test_an_invalid_batch_is_skipped(cloud):
     broken = item_of(Batch("0badcafe", 99, [START + 7], {"speed": [1]}))
     cloud.table.put(TELEMETRY, broken | {"samples": serialize("!")})
     set_gain(cloud, 20)
     assert again(cloud) == {"vesc": Recomputed(4, 1)}
 
 
-def test_a_stream_without_a_speed_is_not_asked_for():
+def test_a_stream_without_a_speed_is_not_recomputed():
     cloud = Cloud(cloud_of(*ride(fields=("duty_cycle",)), gain="10").table)
     assert again(cloud) == {}
     assert cloud.events == []
 
 
-def test_a_lambda_that_does_not_know_how_is_named():
+def test_an_outdated_lambda_is_an_error():
     cloud = Cloud(cloud_of(*ride(), gain="10").table, old_version=True)
     with pytest.raises(StationError, match="deploy the current stacks"):
         again(cloud)
@@ -124,11 +124,11 @@ def test_a_lambda_that_does_not_know_how_is_named():
         ),
     ],
 )
-def test_parameters_that_cannot_be_are_refused(vehicle, said):
+def test_invalid_parameters_are_refused(vehicle, said):
     with pytest.raises(StationError, match=said):
         robots.checked_vehicle(vehicle)
 
 
-def test_a_negative_gain_and_no_offset_can_be():
+def test_a_negative_gain_and_a_zero_offset_are_valid():
     vehicle = {"speed_to_erpm_gain": -1060.5, "speed_to_erpm_offset": 0.0}
     assert robots.checked_vehicle(vehicle) == vehicle

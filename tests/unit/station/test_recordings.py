@@ -1,4 +1,4 @@
-"""Recordings are there once they are whole."""
+"""A recording's file appears only after it is complete."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from iort_station.recordings import recordings
 
 
 @pytest.mark.parametrize("ending", recordings.KINDS)
-def test_what_broke_off_leaves_nothing_behind(tmp_path, ending):
+def test_an_interrupted_export_leaves_no_file(tmp_path, ending):
     path = tmp_path / f"ride{ending}"
     with pytest.raises(StationError, match="broke off"), recordings.KINDS[ending](path):
         raise StationError("broke off")

@@ -1,4 +1,4 @@
-"""What the registry says of the cars."""
+"""The registry's rows of the cars."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.fakes import ROBOTS, serialize
 from tests.unit.station.test_data import FakeCloud, cloud_of
 
 
-def test_presence_says_since_when():
+def test_presence_has_its_start_time():
     cloud = cloud_of(robot="new")
     rows = [
         {"robot": "on", "online": True, "connected_ms": Decimal(2000), "disconnected_ms": Decimal(1000)},
@@ -27,7 +27,7 @@ def test_presence_says_since_when():
     }
 
 
-def test_vehicles_have_what_speed_is_derived_with():
+def test_vehicles_have_their_gain_and_offset():
     cloud = cloud_of(robot="plain", gain="4614")
     rows = [
         {"robot": "shifted", "speed_to_erpm_gain": Decimal(4000), "speed_to_erpm_offset": Decimal("12.5")},
@@ -41,7 +41,7 @@ def test_vehicles_have_what_speed_is_derived_with():
     }
 
 
-def test_vehicle_parameters_are_corrected_and_nothing_else(dynamodb):
+def test_set_vehicle_changes_only_the_given_parameters(dynamodb):
     cloud = FakeCloud(dynamodb)
     registry.enter(cloud, "car", {"speed_to_erpm_gain": 4614.0, "serial": "s"})
     assert registry.set_vehicle(cloud, "car", {"speed_to_erpm_gain": 1060.5}) == {"speed_to_erpm_gain": 4614}

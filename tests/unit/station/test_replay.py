@@ -1,4 +1,4 @@
-"""Replays of what no agent sent: one entry that cannot be read keeps no other back."""
+"""Replays of unreadable dead letters: they do not stop the replay of other entries."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GOOD = Batch("0123abcd", 0, [1_700_000_000_000_000], {"speed": [1.5]})
 
 
 class FakeCloud:
-    """A cloud with a quarantine of these payloads, by the entries' ids, and an empty telemetry table."""
+    """A fake cloud with these payloads in quarantine, by entry id, and an empty telemetry table."""
 
     def __init__(self, payloads, topic=TOPIC):
         self._payloads, self._topic = payloads, topic
@@ -55,7 +55,7 @@ def replayed(*, dry_run=True, **payloads):
 
 
 class Queues(FakeCloud):
-    """With the queue of what was put off."""
+    """A fake cloud that also has the queue of deferred batches."""
 
     def __init__(self, payloads):
         super().__init__(payloads)
@@ -73,7 +73,7 @@ class Queues(FakeCloud):
         self.deleted.append(Key["id"]["S"])
 
 
-def test_what_was_put_off_and_failed_waits_once_more():
+def test_deferred_batches_that_failed_are_queued_again():
     body = json.dumps({PUT_OFF: [[TOPIC, str(GOOD.id)]]})
     cloud = Queues({"late": (BY_LATER, body.encode())})
     listed = [DeadLetter("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
@@ -96,12 +96,12 @@ future = json.dumps(item_of(GOOD, TOPIC) | {"received_ms": {"N": "1"}}).encode()
     [whole[:-100], b"", b"[]", b"\xff", b"[" * 100_000, future],
     ids=["cut", "empty", "no object", "no text", "nested", "ahead"],
 )
-def test_an_entry_that_cannot_be_read_is_refused_and_the_next_one_is_not(odd, source):
+def test_an_unreadable_entry_is_refused_and_the_next_one_is_replayed(odd, source):
     fates = outcomes(bad=(source, odd), good=(BY_STREAM, whole))
     assert fates == [Fate.REFUSED, Fate.WOULD]
 
 
-# --- what agents published before batches had ids -----------------------------------------------------
+# --- batches of version 1, before batches had ids ------------------------------------------------------
 
 
 def old_item(**changes):
@@ -113,7 +113,7 @@ def old_item(**changes):
     [(f"{BY_RULE} iort_record", old_message(GOOD)), (BY_STREAM, old_item())],
     ids=["rule", "stream"],
 )
-def test_a_batch_of_before_would_be_replayed(source, payload):
+def test_a_batch_of_version_1_is_replayed(source, payload):
     assert outcomes(old=(source, payload)) == [Fate.WOULD]
 
 
@@ -127,14 +127,14 @@ def test_a_batch_of_before_would_be_replayed(source, payload):
     ids=["1970", "samples", "version"],
 )
 @pytest.mark.parametrize("source", [BY_STREAM, f"{BY_RULE} iort_record"])
-def test_a_batch_of_before_that_is_none_is_refused(source, changes, reason):
+def test_an_invalid_batch_of_version_1_is_refused(source, changes, reason):
     payload = old_item(**changes) if source == BY_STREAM else old_message(GOOD, **changes)
     (outcome,) = replayed(old=(source, payload))
     assert outcome.fate is Fate.REFUSED
     assert reason in outcome.detail
 
 
-def test_a_number_that_cannot_be_written_keeps_no_other_back():
+def test_an_entry_with_an_unstorable_number_does_not_stop_the_next():
     odd = old_message(GOOD)[:-1] + b',"more":1e400}'
     assert outcomes(odd=(f"{BY_RULE} iort_record", odd), good=(BY_STREAM, whole)) == [
         Fate.REFUSED,
@@ -142,14 +142,14 @@ def test_a_number_that_cannot_be_written_keeps_no_other_back():
     ]
 
 
-def test_what_is_in_the_old_table_alone_is_not_given_to_lambda_2():
-    """It would summarise nothing, and the entry would be deleted."""
+def test_a_batch_only_in_the_old_table_is_not_sent_to_lambda_2():
+    """Lambda 2 would find no batch, and the entry would be deleted."""
     (outcome,) = replayed(old=(BY_STREAM, old_item()), dry_run=False)
     assert (outcome.fate, "iort adopt" in outcome.detail) == (Fate.FAILED, True)
 
 
 @pytest.mark.parametrize("prefix", ["", "$aws/rules/iort_record/"])
-def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(prefix):
+def test_a_batch_is_replayed_with_and_without_basic_ingests_prefix(prefix):
     payload = encode_batch(GOOD)
     cloud = FakeCloud({"a": (f"{BY_RULE} iort_record", payload)}, topic=prefix + TOPIC)
     listed = DeadLetter(
@@ -159,6 +159,6 @@ def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(p
     assert (outcome.fate, outcome.letter.topic) == (Fate.WOULD, TOPIC), outcome.detail
 
 
-def test_keys_that_the_rule_would_not_store_keep_no_batch_from_replay():
+def test_keys_that_the_rule_ignores_do_not_stop_a_replay():
     odd = {**json.loads(encode_batch(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
     assert outcomes(odd=(f"{BY_RULE} iort_record", json.dumps(odd).encode())) == [Fate.WOULD]

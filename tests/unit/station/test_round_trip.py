@@ -1,4 +1,4 @@
-"""What a ROS 1 publisher sends is what an export gives back, byte for byte: any definition, any values."""
+"""An export returns a ROS 1 publisher's messages byte for byte, for any definition and any values."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STEP_S = 0.01
 
 
 def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
-    """The messages by the source, its batches, the queue, the table and the export; all but the network."""
+    """The messages after the source, batches, queue, table and export; all but the network."""
     clock, spool = ManualClock(now_us=T0_US), MemorySpool(max_bytes=2**30)
     encoders: dict[str, BatchEncoder] = {}
 
@@ -86,7 +86,7 @@ ROSOUT = b"\1\0\0\0\7\0\0\0/rosout"
 NONE = bytes(4)
 
 
-# What is known to need care, each by its name.
+# Cases that need special care, by name.
 KNOWN = {
     "an array of variable length": (NAMES, [ROSOUT, NONE, b"\2" + ROSOUT[1:] + bytes(4)]),
     "a byte is signed": (SIGNED, [b"\2\0\0\0\xff\x80", NONE]),
@@ -98,24 +98,24 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("made", KNOWN.values(), ids=KNOWN)
-def test_a_message_comes_back_as_it_was(made: tuple[Message, list[bytes]]) -> None:
-    _comes_back(*made)
+def test_a_message_is_exported_as_it_was_published(made: tuple[Message, list[bytes]]) -> None:
+    _assert_exported(*made)
 
 
 @given(of_some_definition())
-def test_any_message_comes_back_as_it_was(made: tuple[Message, list[bytes]]) -> None:
-    _comes_back(*made)
+def test_any_message_is_exported_as_it_was_published(made: tuple[Message, list[bytes]]) -> None:
+    _assert_exported(*made)
 
 
-def _comes_back(definition: Message, sent: list[bytes]) -> None:
+def _assert_exported(definition: Message, sent: list[bytes]) -> None:
     came = round_trip(definition, sent)
     assert came == sent, [
         (fields(definition, one), fields(definition, other)) for one, other in zip(came, sent, strict=False)
     ]
 
 
-def test_the_types_put_together_by_hand_are_those_of_ros() -> None:
-    """Their checksums are; what no library knows is told apart by the same rule."""
+def test_the_types_written_by_hand_have_ross_checksums() -> None:
+    """The known types have ROS' checksums; the others are computed by the same rule."""
     store, known = get_typestore(Stores.ROS1_NOETIC), 0
     for message in MESSAGES.values():
         name = message.kind.replace("/", "/msg/")

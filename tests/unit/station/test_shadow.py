@@ -1,4 +1,4 @@
-"""What the operator makes of a robot's shadow."""
+"""The station's reading of a robot's shadow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REPORTED = {
 STATE = State(5, {}, REPORTED)
 
 
-def test_what_is_in_force_and_what_is_refused():
+def test_settings_and_rejections_are_read_from_the_report():
     assert STATE.settings() == {
         "fields.vesc": ["speed"], "live.enabled": True, "live.rate_hz": 10, "log_level": "info",
     }  # fmt: skip
@@ -33,7 +33,7 @@ def test_what_is_in_force_and_what_is_refused():
 
 
 class ShadowMissingError(Exception):
-    """The thing has no such shadow."""
+    """The thing has no shadow of this name."""
 
 
 class Data:
@@ -55,20 +55,20 @@ class Data:
         return {"payload": io.BytesIO(json.dumps({"state": {"desired": self.desired}}).encode())}
 
 
-def test_what_the_cloud_said_of_a_share_is_no_wish():
+def test_the_clouds_notice_of_a_share_is_no_desired_setting():
     said = {"since_ms": 1, "last_ms": 2, "batches": 3}
     assert State(1, {"over_share": said, "log_level": "debug"}, {}).desired_settings() == {
         "log_level": "debug"
     }
     assert over_share(Data({"over_share": said}), "car") == OverShare(batches=3, since_ms=1, last_ms=2)
     assert over_share(Data(None), "car") is None
-    # The robot can write there, too.
+    # The robot can also write here.
     for odd in (None, [], {}, said | {"last_ms": 10**30}, said | {"batches": "3"}, said | {"since_ms": -1}):
         assert over_share(Data({"over_share": odd}), "car") is None
 
 
 @pytest.mark.parametrize(
-    ("wishes", "said"),
+    ("desired", "said"),
     [
         ({"live.rate_hz": 10}, True),
         ({"live.rate_hz": 10.0, "fields.vesc": ["speed"]}, True),
@@ -76,32 +76,32 @@ def test_what_the_cloud_said_of_a_share_is_no_wish():
         ({"live.rate_hz": 10, "log_level": "debug"}, None),
         ({"fields.vesc": []}, True),
         ({"ping.rate_hz": 99}, True),
-        # Refused is another value, of an older wish.
+        # The rejected value belongs to an older desired setting.
         ({"ping.rate_hz": 98}, None),
-        # Withdrawn, and not seen by the robot yet.
+        # The setting was withdrawn, and the robot has not seen it yet.
         ({"ping.rate_hz": None}, None),
         ({"live.rate_hz": None}, True),
     ],
 )
-def test_when_a_robot_has_answered(wishes, said):
-    assert answered(wishes, STATE) is said
+def test_an_answer_is_recognised_for_each_desired_setting(desired, said):
+    assert answered(desired, STATE) is said
 
 
-def test_a_long_value_is_refused_by_its_beginning():
+def test_a_long_rejected_value_is_recognised_by_its_beginning():
     long = ["x" * 300]
     rejected = {"fields.vesc": {"value": ('["' + "x" * 300)[:200] + "...", "reason": "no"}}
     assert answered({"fields.vesc": long}, State(1, {}, {"rejected": rejected}))
     assert answered({"fields.vesc": ["y" * 300]}, State(1, {}, {"rejected": rejected})) is None
 
 
-def test_what_became_of_a_command():
+def test_the_outcome_of_a_command_is_read_by_run_and_number():
     assert outcome(STATE, "drive", "feedbeef", 3) == "accepted"
     assert outcome(STATE, "drive", "feedbeef", 4) is None
     assert outcome(STATE, "drive", "0badcafe", 3) is None
     assert outcome(State(0, {}, {}), "drive", "feedbeef", 3) is None
 
 
-def test_a_clock_that_is_off_is_refused():
+def test_a_wrong_clock_is_refused():
     date, cloud_s = "Sat, 21 Nov 2026 10:00:00 GMT", 1_795_255_200
     _check_clock(None, 0, 0)
     for off_s in (-2.0, 0.0, 2.9):
@@ -112,7 +112,7 @@ def test_a_clock_that_is_off_is_refused():
 
 
 @pytest.mark.parametrize("said", ["x", 7, [1], {"drive": "x"}])
-def test_a_robot_that_reports_in_another_form_stops_no_operator(said):
+def test_an_invalid_report_is_read_as_empty(said):
     state = State(1, {}, {"commands": said, "rejected": said})
     assert outcome(state, "drive", "feedbeef", 3) is None
     assert state.rejections() == []

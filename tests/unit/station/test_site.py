@@ -1,4 +1,4 @@
-"""What `iort site` uploads."""
+"""`iort site` uploads the page and its configuration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def built(tmp_path):
     return tmp_path
 
 
-def test_the_build_and_the_configuration_and_nothing_else(built):
+def test_only_the_build_and_the_configuration_are_uploaded(built):
     content = files(TOLD, built)
     assert content.keys() == {"index.html", "page.js", "config.json"}
     told = json.loads(content["config.json"])
@@ -32,13 +32,13 @@ def test_the_build_and_the_configuration_and_nothing_else(built):
     assert not any(b"pub-c-" in body or b"sec-c-" in body for body in content.values())
 
 
-def test_a_page_that_is_not_built_is_not_uploaded(tmp_path):
+def test_a_page_without_a_build_is_an_error(tmp_path):
     with pytest.raises(StationError, match="not built"):
         files(TOLD, tmp_path)
 
 
 @mock_aws
-def test_the_bucket_then_holds_exactly_that(built):
+def test_the_bucket_holds_exactly_the_uploaded_files(built):
     s3 = boto3.client("s3", region_name="us-east-1", aws_access_key_id="x", aws_secret_access_key="x")
     s3.create_bucket(Bucket="page")
     s3.put_object(Bucket="page", Key="old.js", Body=b"old")

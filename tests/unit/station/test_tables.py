@@ -1,4 +1,4 @@
-"""Results as other programs read them, and the ranges that people ask for."""
+"""Results in the formats of other programs, and the ranges of queries."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def result(n=3):
     return Result("car", "vesc", times, columns)
 
 
-def test_csv_is_what_spreadsheets_and_grafana_read():
+def test_csv_has_the_form_that_spreadsheets_and_grafana_read():
     file = io.StringIO()
     tables.to_csv(result(), file)
     rows = list(csv.DictReader(io.StringIO(file.getvalue())))
@@ -45,7 +45,7 @@ def test_csv_is_what_spreadsheets_and_grafana_read():
 
 
 @pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1+2", "@SUM(1)", " =1", "\t=1", "\uff1d1"])
-def test_csv_has_no_formulas_but_where_they_are_asked_for(text):
+def test_csv_has_formulas_only_on_request(text):
     values = np.array([text, "a=b"], dtype=object)
     found = Result("car", "notes", np.arange(2, dtype=np.int64), {text: values, "x": np.array([-1.5, 2])})
     file = io.StringIO()
@@ -60,7 +60,7 @@ def test_csv_has_no_formulas_but_where_they_are_asked_for(text):
     assert (head[1], first[1]) == (text, text)
 
 
-def test_neither_csv_nor_a_table_has_what_a_terminal_obeys():
+def test_csv_and_tables_have_no_control_characters():
     escape = "\x1b]52;c;YQ==\x07"
     values = np.array([escape], dtype=object)
     found = Result("car", "notes", np.zeros(1, dtype=np.int64), {escape: values})
@@ -116,7 +116,7 @@ def test_a_terminal_shows_units_and_both_ends():
     ("width", "left_out"),
     [(80, []), (70, []), (60, []), (50, ["on"]), (48, ["name", "on"]), (36, ["current_motor", "name", "on"])],
 )
-def test_a_narrow_terminal_shows_whole_values_and_names_the_fields_that_it_lacks(width, left_out):
+def test_a_narrow_terminal_shows_whole_values_and_names_the_omitted_fields(width, left_out):
     found = result(50)
     found.columns["speed"] += 1000
     console = Console(width=width, file=io.StringIO())
@@ -129,7 +129,7 @@ def test_a_narrow_terminal_shows_whole_values_and_names_the_fields_that_it_lacks
     assert "\u2026" not in console.file.getvalue()
 
 
-def test_a_long_text_is_folded_and_leaves_room():
+def test_a_long_text_is_folded():
     found = result(1)
     found.columns["name"][0] = "x" * 100
     console = Console(width=110, file=io.StringIO())
@@ -139,7 +139,7 @@ def test_a_long_text_is_folded_and_leaves_room():
     assert console.file.getvalue().count("x") == 100
 
 
-def test_ranges(capsys):
+def test_ranges_are_parsed(capsys):
     assert Range.of(None, None, "all") == Range(None, None)
     found = Range.of(None, None, "2s")
     assert found.end_us - found.start_us == 2_000_000
@@ -154,7 +154,7 @@ def test_ranges(capsys):
 
 
 @pytest.mark.parametrize("options", [("-1m", None, "1m"), ("now", "-1m", None), (None, None, "soon")])
-def test_ranges_that_make_no_sense(options):
+def test_invalid_ranges_are_refused(options):
     with pytest.raises(StationError):
         Range.of(*options)
 
@@ -165,7 +165,7 @@ def written(to, found):
     return file.getvalue().splitlines()
 
 
-def test_integers_are_integers_and_fractions_keep_theirs():
+def test_integers_are_written_as_integers_and_fractions_as_fractions():
     mixed = np.empty(2, dtype=object)
     mixed[:] = [2**63 + 1, -127.0]
     columns = {"rssi": np.array([-127.0, np.nan]), "volts": np.array([12.0, 12.5]), "large": mixed}
@@ -180,7 +180,7 @@ def test_integers_are_integers_and_fractions_keep_theirs():
     assert '"rssi": null, "volts": 12.5, "large": -127' in second
     many = Result("car", "radio", np.arange(20_000), {"n": np.arange(20_000.0)})
     assert written(tables.to_csv, many)[-1].endswith(",19999")
-    # What is whole at first only, is written as what it is from the start.
+    # A column with a later fraction is written as fractions from the start.
     many.columns["n"][-1] = 0.5
     assert written(tables.to_csv, many)[1].endswith(",0.0")
 

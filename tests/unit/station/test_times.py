@@ -25,11 +25,11 @@ NOW = 1_700_000_000_123_456
         (datetime(1970, 1, 1, 0, 0, 1, tzinfo=timezone.utc), 1_000_000),
     ],
 )
-def test_reads(text, expected):
+def test_a_time_is_parsed(text, expected):
     assert time_us(text, NOW) == expected
 
 
-def test_without_a_zone_it_is_this_machines():
+def test_a_time_without_a_zone_is_in_this_machines_zone():
     assert time_us("2023-11-14T22:13:20", NOW) == datetime(2023, 11, 14, 22, 13, 20).timestamp() * 1e6  # noqa: DTZ001 - on purpose
     assert not has_zone("2023-11-14T22:13:20")
     assert not has_zone("2023-11-14")
@@ -39,12 +39,12 @@ def test_without_a_zone_it_is_this_machines():
 
 
 @pytest.mark.parametrize("text", ["", "soon", "-10", "2023-13-01", "10m"])
-def test_refuses(text):
+def test_an_invalid_time_is_refused(text):
     with pytest.raises(StationError, match=r"must be .*, got"):
         time_us(text, NOW)
 
 
-def test_lengths():
+def test_durations_are_parsed():
     assert [duration_us(text) for text in ("100ms", "1s", "1 min", "0.5h", "7d")] == [
         100_000, 1_000_000, 60_000_000, 1_800_000_000, 604_800_000_000,
     ]  # fmt: skip
@@ -52,7 +52,7 @@ def test_lengths():
         duration_us("0s")
 
 
-def test_written_times_are_read_back():
+def test_a_formatted_time_is_parsed_back():
     assert iso(NOW) == "2023-11-14T22:13:20.123456Z"
     assert time_us(iso(NOW), 0) == NOW
     assert iso_s(NOW) == "2023-11-14T22:13:20Z"

@@ -1,4 +1,4 @@
-"""The hops of an update, with clocks that are off by as much as a car's may be."""
+"""The hops of a live update are right with wrong clocks."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from iort_station.operations.trace import (
 )
 
 T_US = 1_750_000_000_000_000
-# What each hop takes, in microseconds of true time.
+# The true duration of each hop, in microseconds.
 TRUE = {CAR: 700, RULE: 30_500, LAMBDA: 12_000, PUBNUB: 20_000, HERE: 15_000}
 
 
 def _times(car_off_us, here_off_us, offset_us):
-    """An update whose car and receiver are off by so much from the cloud's clock."""
+    """An update with these errors of the car's and the receiver's clocks."""
     sent = T_US + TRUE[CAR]
     rule = sent + TRUE[RULE]
     lambda_us, pubnub = rule + TRUE[LAMBDA], rule + TRUE[LAMBDA] + TRUE[PUBNUB]
@@ -40,7 +40,7 @@ def _times(car_off_us, here_off_us, offset_us):
 @pytest.mark.parametrize(
     ("car_off_us", "here_off_us"), [(0, 0), (3_600_000_000, -250_000), (-90_000, 10_000)]
 )
-def test_hops_are_right_whatever_the_clocks(car_off_us, here_off_us):
+def test_hops_are_right_with_wrong_clocks(car_off_us, here_off_us):
     found = trace(
         [_times(car_off_us, here_off_us, car_off_us)] * 3,
         here_to_pubnub=ClockOffset(here_off_us, 400),
@@ -54,19 +54,19 @@ def test_hops_are_right_whatever_the_clocks(car_off_us, here_off_us):
     assert found.whole.uncertainty_ms == pytest.approx(1.9)
 
 
-def test_a_car_that_does_not_know_its_offset_says_so():
+def test_a_car_without_a_clock_offset_has_no_uncertainty():
     found = trace([_times(0, 0, None)], here_to_pubnub=ClockOffset(0, 0), car_uncertainty_ms=1.5)
     assert {hop.name: hop.uncertainty_ms for hop in found.hops}[RULE] is None
     assert found.whole.uncertainty_ms is None
 
 
-def test_the_fastest_answer_tells_the_clock():
+def test_the_fastest_answer_gives_the_clock_offset():
     ours = itertools.chain([0, 1000], [2000, 2100], [3000, 3800], itertools.count(10_000, 5000))
     clock = clock_of(lambda: 1_000_000, lambda: next(ours))
     assert clock == ClockOffset(1_000_000 - 2050, 50)
 
 
-def test_round_trips_are_the_medians_of_the_newest_batch():
+def test_round_trips_are_medians_of_the_newest_batch():
     columns = {
         "broker_ms": [1.0, None, 3.0, 2.0],
         "rule_ms": [None, 5.5, None, None],
@@ -83,6 +83,6 @@ def test_bars_stay_inside_their_column(begins, share):
     assert len(bar(begins, share, 8)) <= 8
 
 
-def test_bars_begin_where_the_last_ended():
+def test_bars_begin_at_the_end_of_the_last():
     assert bar(0.5, 0.25, 30).index("█") == 15
     assert bar(0.5, 0.25, 8) == "    ██"

@@ -1,4 +1,4 @@
-"""Units of fields, whoever they come from."""
+"""Units of fields, from any source."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from iort_station.data.units import unit
         ("lab", "linear.x", ""),
     ],
 )
-def test_a_field_has_the_unit_that_is_known_of_it(stream: str, name: str, expected: str) -> None:
+def test_a_field_has_its_known_unit(stream: str, name: str, expected: str) -> None:
     assert unit(stream, name) == expected
 
 
@@ -71,7 +71,7 @@ def test_the_unit_follows_from_the_type_of_the_messages(kind, definition, name, 
     assert unit("any", name, kind=MessageType("any", "/t", kind, "", definition)) == expected
 
 
-def test_the_ros_2_driver_has_units_of_its_own_in_any_stream():
+def test_the_ros_2_driver_has_its_own_units_in_any_stream():
     kind = MessageType("esc", "/t", "vesc_msgs/VescStateStamped", "", STAMPED_VESC)
     assert unit("esc", "charge_drawn", ros2=True, kind=kind) == "Ah"
 

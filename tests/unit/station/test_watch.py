@@ -1,4 +1,4 @@
-"""What `iort watch` makes of live updates."""
+"""`iort watch` shows live updates."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def text(fleet: FleetWatch, width: int = 120, now_us: int = NOW_US) -> str:
     return captured.get()
 
 
-def test_every_car_with_its_newest_values():
+def test_every_car_is_shown_with_its_newest_values():
     fleet = FleetWatch({"car1": Vehicle(4614.0)})
     fleet.take(update(speed=9228, voltage_input=11.72, temperature_pcb=28.4, fault_code=0), 0, NOW_US)
     fleet.take(update("car10", speed=500), 0, NOW_US)
@@ -39,13 +39,13 @@ def test_every_car_with_its_newest_values():
     assert "500 erpm" in lines[3]
 
 
-def test_speed_is_what_a_query_says_of_a_car_with_an_offset():
+def test_speed_uses_the_cars_gain_and_offset():
     fleet = FleetWatch({"car1": Vehicle(4614.0, 4614.0)})
     fleet.take(update(speed=9228), 0, NOW_US)
     assert "1.0 m/s" in text(fleet)
 
 
-def test_old_is_stale_and_silent_is_gone():
+def test_a_car_becomes_stale_and_then_gone():
     fleet = FleetWatch({})
     fleet.take(update(speed=1), 0, NOW_US)
     (car,) = fleet.cars()
@@ -54,13 +54,13 @@ def test_old_is_stale_and_silent_is_gone():
     assert GONE_S < 5
 
 
-def test_a_sample_that_was_long_under_way_is_stale():
+def test_a_delayed_sample_is_stale():
     fleet = FleetWatch({})
     fleet.take(update(), 0, NOW_US + 2_000_000)
     assert fleet.cars()[0].state(NOW_US + 2_000_000) == "stale"
 
 
-def test_the_delay_is_on_the_clouds_clock():
+def test_the_delay_is_measured_on_the_clouds_clock():
     fleet = FleetWatch({})
     behind = update()
     behind["hops"] |= {"sent_us": NOW_US - 3_600_000_000, "offset_us": 3_600_000_000 - 10_000}
@@ -70,7 +70,7 @@ def test_the_delay_is_on_the_clouds_clock():
     assert fleet.cars()[0].state(NOW_US) == "online"
 
 
-def test_it_fits_a_narrow_terminal():
+def test_the_table_fits_a_narrow_terminal():
     fleet = FleetWatch({"car1": Vehicle(4614.0)})
     fleet.take(update(speed=9228, voltage_input=11.7, fault_code=5), 0, NOW_US)
     for width in (40, 60, 100):
@@ -78,7 +78,7 @@ def test_it_fits_a_narrow_terminal():
     assert "2.0 m/s" in text(fleet, 40)
 
 
-def test_what_is_no_update_is_counted_and_does_no_harm():
+def test_an_invalid_update_is_counted():
     fleet = FleetWatch({})
     good = update()
     bad: list[Any] = [7, None, [], {}, {**good, "v": 9}, {**good, "robot": "[red]x"}, {**good, "hops": {}}]
@@ -89,7 +89,7 @@ def test_what_is_no_update_is_counted_and_does_no_harm():
     assert fleet.cars() == []
 
 
-def test_names_are_bounded():
+def test_the_number_of_robots_is_bounded():
     fleet = FleetWatch({})
     for i in range(MAX_ROBOTS + 3):
         fleet.take(update(f"car{i}"), 0, NOW_US + i)

@@ -1,4 +1,4 @@
-"""Questions differ where a cloud answers otherwise: some of them, against clouds that answer so or so."""
+"""The verdicts of some questions, with fake clouds that answer as assumed or differently."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUESTIONS = {question.name: question for question in ALL}
 
 
 class Cloud:
-    """Answers by what it is given: a function for each operation of whichever service."""
+    """A fake cloud that answers each operation with the given function."""
 
     namespace = "iort"
 
@@ -51,7 +51,7 @@ def refuse(code, **more):
         ({"batch", "online", "serial"}, Verdict.DIFFERS),
     ],
 )
-def test_reserved_words(reserved, expected):
+def test_reserved_words_are_compared_with_the_assumption(reserved, expected):
     def get_item(*, ProjectionExpression, **_):
         if ProjectionExpression in reserved:
             refuse("ValidationException")
@@ -59,13 +59,13 @@ def test_reserved_words(reserved, expected):
     assert verdict("dynamodb.reserved_words", Cloud(get_item=get_item))[0] is expected
 
 
-def test_another_error_than_asked_for_is_no_answer():
+def test_an_unexpected_error_is_a_failed_question():
     cloud = Cloud(get_item=lambda **_: refuse("AccessDeniedException"))
     assert verdict("dynamodb.reserved_words", cloud)[0] is Verdict.FAILED
 
 
 @pytest.mark.parametrize(("row", "expected"), [(True, Verdict.AS_ASSUMED), (False, Verdict.DIFFERS)])
-def test_a_failed_condition(row, expected):
+def test_the_answer_to_a_failed_condition_is_compared_with_the_assumption(row, expected):
     def update_item(*, Key, **_):
         refuse("ConditionalCheckFailedException", **({"Item": Key} if row else {}))
 
@@ -76,14 +76,14 @@ def test_a_failed_condition(row, expected):
     ("status", "expected"),
     [("ENABLED", Verdict.AS_ASSUMED), ("ENABLING", Verdict.AS_ASSUMED), ("DISABLED", Verdict.DIFFERS)],
 )
-def test_expiry(status, expected):
+def test_the_expiry_of_items_is_compared_with_the_assumption(status, expected):
     told = {"TimeToLiveDescription": {"TimeToLiveStatus": status, "AttributeName": "expires_s"}}
     cloud = Cloud(describe_time_to_live=lambda **_: told)
     assert verdict("dynamodb.expiry", cloud)[0] is expected
 
 
 def insights(code="Complete", count=4, **alarm):
-    """A CloudWatch with so many alarms that ask by Metrics Insights."""
+    """A fake CloudWatch with this number of Metrics Insights alarms."""
 
     def describe_alarms(*, AlarmNames):
         metrics = [{"Expression": 'SELECT SUM(ParseError) FROM "AWS/IoT"'}]
@@ -111,14 +111,14 @@ def insights(code="Complete", count=4, **alarm):
         (insights(count=3), Verdict.DIFFERS),
     ],
 )
-def test_metrics_insights(cloud, expected):
+def test_metrics_insights_alarms_are_compared_with_the_assumption(cloud, expected):
     assert verdict("alarms.metrics_insights", cloud)[0] is expected
 
 
 @pytest.mark.parametrize(
     ("runs", "expected"), [("python3.13", Verdict.AS_ASSUMED), ("python3.12", Verdict.DIFFERS)]
 )
-def test_the_runtime(runs, expected):
+def test_the_runtime_is_compared_with_the_assumption(runs, expected):
     deleted = []
     configuration = {"Runtime": "python3.13", "Role": "role"}
     cloud = Cloud(

@@ -1,4 +1,4 @@
-"""How a deployment of `make verify-aws` is made, and what its teardown does whatever went wrong before."""
+"""The deployment of `make verify-aws`, and its teardown after any failure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from verify.preflight.deployed import STACKS
 
 
 class Account:
-    """An account in which the stacks have these states, one a look, and these policies are."""
+    """A fake account with these policies; each look sees the next of these stack states."""
 
     namespace = "verify1"
 
@@ -41,7 +41,7 @@ class Account:
 
 
 class Commands:
-    """The CDK's command line, and how many states the account had left when it was called."""
+    """A fake of the CDK's command line; it records the number of states left at each call."""
 
     def __init__(self, account, fails=""):
         self.account, self.fails, self.said = account, fails, []
@@ -57,7 +57,7 @@ def deployment(account, tmp_path, fails=""):
     return Deployment(account, tmp_path, lambda _: None, run=commands, poll_s=0.0), commands
 
 
-def test_no_stack_is_deleted_while_cloudformation_changes_it(tmp_path):
+def test_a_stack_is_deleted_only_after_cloudformation_finished_its_change(tmp_path):
     account = Account("UPDATE_IN_PROGRESS", "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS")
     one, commands = deployment(account, tmp_path)
     assert one.destroy() == []
@@ -65,14 +65,14 @@ def test_no_stack_is_deleted_while_cloudformation_changes_it(tmp_path):
     assert (name, states_left) == ("cdk destroy", 0)
 
 
-def test_what_stays_is_told_and_the_rest_is_removed(tmp_path):
+def test_remaining_stacks_are_reported_and_the_rest_is_removed(tmp_path):
     account = Account(policies=["verify1-verify-policy-3f", "verify1-robots", "verify12-verify-policy-3f"])
     one, _ = deployment(account, tmp_path, fails="the stack stays")
     assert one.destroy() == ["stacks: the stack stays"]
     assert account.deleted == ["verify1-verify-policy-3f"]
 
 
-def test_what_cdk_json_says_for_another_deployment_does_not_count(tmp_path):
+def test_the_options_of_cdk_json_are_overridden(tmp_path):
     one, commands = deployment(Account(), tmp_path)
     one.deploy({"customer_key": "true"})
     ((_, command, _),) = commands.said
@@ -81,7 +81,7 @@ def test_what_cdk_json_says_for_another_deployment_does_not_count(tmp_path):
     assert (given["site"], given["old_telemetry"], given["customer_key"]) == ("false", "false", "true")
 
 
-def test_an_interrupt_does_not_end_the_putting_back():
+def test_an_interrupt_does_not_end_the_teardown():
     done = []
     with wound_up(Console(quiet=True)) as putting_back:
         putting_back()

@@ -1,4 +1,4 @@
-"""Every question can be answered otherwise. tests/local/gaps/test_verify_differs.py has clouds that do."""
+"""A different answer changes any verdict; tests/local/test_verify_differs.py has clouds that give one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from verify.questions import ALL
 
 @pytest.fixture
 def verdict(tmp_path):
-    """The verdict on an answer."""
+    """The verdict for an answer."""
 
     def judge(check, seen):
         asked = replace(check, ask=lambda _target: seen, not_embedded="")
@@ -25,7 +25,7 @@ def verdict(tmp_path):
 
 
 @pytest.mark.parametrize("check", ALL, ids=lambda check: check.name)
-def test_every_expected_value_decides_and_a_note_does_not(check, verdict):
+def test_every_expected_value_decides_the_verdict_and_a_note_does_not(check, verdict):
     assert check.expected
     assert compared(check.expected) == check.expected
     assert verdict(check, {**check.expected, f"{NOTE}beside": "whatever"}) is Verdict.AS_ASSUMED

@@ -1,4 +1,4 @@
-"""The preflight: every verdict of every item, on an account that answers as AWS does."""
+"""The preflight: every verdict of every item, with a fake account that answers like AWS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROLE = "arn:aws:iam::123456789012:role/somebody"
 
 
 class Refused(Exception):
-    """An answer that is an error: AWS' code, its text, the status."""
+    """An error as an answer: AWS' code, text and status."""
 
     def __init__(self, code, text="no", status=400):
         super().__init__(code)
@@ -62,7 +62,7 @@ QUOTAS = [
     quota("Rule evaluations per second per AWS account", 20_000),
     quota("Maximum number of rules per AWS account", 1000),
 ]
-# What a new account that is bootstrapped says.
+# The answers of a new, bootstrapped account.
 NEW = {
     "GetCallerIdentity": {
         "Account": "123456789012",
@@ -98,7 +98,7 @@ NEW = {
 
 
 class Account:
-    """botocore's own clients, which hold each request to AWS' model, with answers by operation."""
+    """botocore's own clients, which validate each request, with answers by operation."""
 
     def __init__(self, **answers):
         self.answers = {**NEW, **answers}
@@ -405,13 +405,13 @@ def function(name):
 
 
 @pytest.mark.parametrize(("name", "given", "answers", "verdict", "text"), CASES)
-def test_an_item_says_what_it_found(name, given, answers, verdict, text):
+def test_an_item_reports_its_finding(name, given, answers, verdict, text):
     finding = function(name)(Account(**answers), settings(**given))
     assert (finding.verdict, text in finding.found) == (verdict, True), finding
     assert bool(finding.do) == (verdict is not FINE)
 
 
-def test_every_item_is_tested_with_every_verdict_that_it_has():
+def test_every_item_is_tested_with_each_of_its_verdicts():
     verdicts = {}
     for name, _, _, verdict, _ in CASES:
         verdicts.setdefault(name, set()).add(verdict)
@@ -427,7 +427,7 @@ def test_every_item_is_tested_with_every_verdict_that_it_has():
         Refused("ExpiredToken", "The security token included in the request is expired", 403),
     ],
 )
-def test_without_credentials_nothing_else_is_asked(error):
+def test_only_the_credentials_are_asked_for_if_they_are_missing(error):
     account = Account(GetCallerIdentity=error)
     (finding,) = preflight.look(account, settings())
     assert (finding.item, finding.verdict) == ("credentials", STOPS)
@@ -435,7 +435,7 @@ def test_without_credentials_nothing_else_is_asked(error):
 
 
 @pytest.mark.parametrize("error", [NoCredentialsError(), StationError("no AWS client for sts: no region")])
-def test_without_a_client_neither(error):
+def test_an_error_of_the_client_stops_the_preflight(error):
     class Nothing:
         def client(self, service):
             raise error
@@ -448,7 +448,7 @@ def test_without_a_client_neither(error):
 EVERYTHING = {"site": True, "device_defender": True, "iot_log_level": "error", "stage": "prod"}
 
 
-def test_a_new_account_stops_nothing_and_nothing_is_changed_in_it():
+def test_a_new_account_passes_and_is_only_read():
     account = Account()
     findings = preflight.look(account, settings(**EVERYTHING))
     assert len({finding.item for finding in findings}) == len(findings) == 11
@@ -456,7 +456,7 @@ def test_a_new_account_stops_nothing_and_nothing_is_changed_in_it():
     assert all(name.startswith(("Get", "List", "Describe")) for name in account.asked)
 
 
-def test_a_permission_that_is_missing_is_a_warning_that_names_it():
+def test_a_missing_permission_is_a_warning_that_names_it():
     answers = {name: denied(f"service:{name}") for name in NEW if name != "GetCallerIdentity"}
     _, *findings = preflight.look(Account(**answers), settings(**EVERYTHING))
     assert len(findings) == 10
@@ -473,13 +473,13 @@ def test_a_permission_that_is_missing_is_a_warning_that_names_it():
         (Refused("InternalServerError", "try later", 500), "try later"),
     ],
 )
-def test_what_is_not_answered_stops_nothing(error, text):
+def test_an_unanswered_question_is_a_warning(error, text):
     finding = account.bootstrap(Account(GetParameter=error), settings())
     assert finding.verdict is WARNING
     assert text in finding.found
 
 
-def test_a_report_has_every_finding_and_a_line_what_to_do(capsys):
+def test_a_report_has_every_finding_with_its_advice(capsys):
     findings = preflight.look(Account(GetParameter=Refused("ParameterNotFound")), settings())
     assert preflight.stopped(findings)
     written = json.loads(json.dumps(preflight.as_json(findings)))

@@ -1,4 +1,4 @@
-"""The instrument itself: its verdicts, its report, and the page of assumptions."""
+"""The verdicts and reports of verify, and the page of assumptions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_an_answer_is_compared_with_the_assumption():
     assert verdict(check({"one": 1, "two": 2})).verdict is Verdict.DIFFERS
 
 
-def test_what_aws_has_answered_takes_the_assumptions_place():
+def test_an_answer_of_aws_replaces_the_assumption():
     assert verdict(check({"one": 2}), expected={"one": 2}).verdict is Verdict.AS_ASSUMED
     assert verdict(check({"one": 1}), expected={"one": 2}).verdict is Verdict.DIFFERS
 
@@ -59,20 +59,20 @@ def test_a_note_is_reported_and_not_compared(tmp_path):
 @pytest.mark.parametrize(
     "error", [VerifyError("no answer"), OSError("connection reset"), KeyError("another form")]
 )
-def test_an_error_is_an_answer(error):
+def test_an_error_is_reported_as_the_answer(error):
     answer = verdict(check(error))
     assert answer.verdict is Verdict.FAILED
     assert str(error) in answer.reason
 
 
-def test_what_cannot_be_asked_says_why():
+def test_a_question_that_cannot_be_asked_has_its_reason():
     assert verdict(check(CannotAskError("no keys"))).reason == "no keys"
     answer = verdict(check({"one": 1}, not_embedded="no KMS"), kind=EMBEDDED)
     assert (answer.verdict, answer.reason) == (Verdict.NOT_ASKED, "no KMS")
     assert verdict(check({"one": 1}, not_embedded="no KMS")).verdict is Verdict.AS_ASSUMED
 
 
-def test_a_kept_report_is_read_again(tmp_path):
+def test_a_kept_report_is_read_back(tmp_path):
     report.write(
         tmp_path, RUN, [verdict(check({"one": 2})), verdict(check(VerifyError("x"), name="b.question"))]
     )
@@ -83,7 +83,7 @@ def test_a_kept_report_is_read_again(tmp_path):
     assert "| one | 1 | 2 |" in text
 
 
-def test_a_file_of_another_form_is_refused(tmp_path):
+def test_an_invalid_report_file_is_refused(tmp_path):
     (tmp_path / "report.json").write_text("[]")
     with pytest.raises(VerifyError, match="must be a report of verify"):
         report.load(tmp_path / "report.json")
@@ -99,7 +99,7 @@ def test_a_file_of_another_form_is_refused(tmp_path):
         "X-Amz-Signature=0123abcd",
     ],
 )
-def test_no_report_has_a_secret(tmp_path, secret):
+def test_a_report_contains_no_secret(tmp_path, secret):
     answers = [verdict(check({"one": f"a {secret} b"})), verdict(check(VerifyError(f"a {secret} b")))]
     report.write(tmp_path, RUN, answers)
     for name in ("report.json", "report.md"):
@@ -108,7 +108,7 @@ def test_no_report_has_a_secret(tmp_path, secret):
         assert json.dumps(secret)[1:-1] not in text
 
 
-def test_names_are_unique_and_every_file_is_there():
+def test_names_are_unique_and_every_named_file_exists():
     rows = page.rows(page.PAGE.read_text())
     names = [name for name, *_ in rows]
     assert len(names) == len(set(names)) > len(ALL)
@@ -127,12 +127,12 @@ def test_every_gap_of_the_emulator_is_an_assumption():
     assert {str(path.relative_to(ROOT)) for path in files - others} <= relied
 
 
-def test_the_page_is_of_these_assumptions():
+def test_the_page_lists_the_current_assumptions():
     written = page.PAGE.read_text()
     assert written == page.text(report.load(), written), "run `python -m verify.page`"
 
 
-def test_the_page_says_who_has_measured():
+def test_the_page_names_the_person_who_measured():
     known = report.Measured(
         by="B", date="2026-02-02", region="eu-west-1", seen={ALL[0].name: ALL[0].expected}
     )

@@ -1,4 +1,4 @@
-"""What a batch may cost to read: the largest is read, a dearer one is refused before its JSON is."""
+"""The complexity guard: the largest allowed batch is read; a more expensive one is refused before parsing."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ def full(fields, value):
         (512, "a,b"),
     ],
 )
-def test_as_many_values_as_are_allowed_are_read(fields, value):
+def test_the_largest_allowed_number_of_values_is_read(fields, value):
     batch = full(fields, value)
     assert decode_batch(encode_batch(batch)).columns == batch.columns
 
 
-def test_the_longest_texts_are_read_whatever_they_hold():
+def test_the_longest_texts_are_read_with_any_characters():
     texts = ["," * 4096, '"' * 4096, "\\" * 4096, '\\"' * 2048, "[" * 4096, "{" * 4096, "é" * 4096]
     batch = Batch(BOOT, 0, range(7 * 20), {"a": texts * 20})
     assert decode_batch(encode_batch(batch)).columns == batch.columns
 
 
-def test_columns_that_somebody_spaces_out_are_read():
+def test_columns_with_extra_spaces_are_read():
     columns = {"dt": [0] + [1] * 9_999, "fields": {"a.b": [0.5] * 10_000, "c": ["x", None] * 5_000}}
     body = json.dumps(columns, separators=("," + " " * 9, ": ")).encode()
     assert len(body) > 2 * MOST
     assert len(decode_batch(enveloped(body, 10_000)).times_us) == 10_000
-    # On one line: behind that is what makes messages of them.
+    # The columns are one line; the lines after it describe messages.
     with pytest.raises(ContractError, match="not JSON"):
         decode_batch(enveloped(json.dumps(columns, indent=8).encode(), 10_000))
 
 
 @pytest.mark.parametrize(("samples", "fields"), [(MOST // 2 + 1, 2), (98, 512)])
-def test_more_values_are_refused_on_either_side(samples, fields):
+def test_encoder_and_decoder_refuse_too_many_values(samples, fields):
     said = f"at most {MOST} values, got {samples} samples of {fields} fields"
     with pytest.raises(ContractError, match=said):
         encode_batch(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
@@ -67,7 +67,7 @@ def test_more_values_are_refused_on_either_side(samples, fields):
         decode_batch(enveloped(body, samples))
 
 
-DEAR = {
+EXPENSIVE = {
     "values": b'{"dt":[0],"fields":{"a":[' + b"0," * 2_000_000 + b"0]}}",
     "columns": b'{"dt":[0],"fields":{' + b",".join(b'"f%d":[0]' % i for i in range(20_000)) + b"}}",
     "names": b'{"dt":[0],"fields":{' + b",".join(b'"f%d":0' % i for i in range(200_000)) + b"}}",
@@ -83,15 +83,15 @@ DEAR = {
 }
 
 
-@pytest.mark.parametrize("body", DEAR.values(), ids=DEAR)
-def test_what_is_dear_to_read_is_refused_before_it_is_read(body):
+@pytest.mark.parametrize("body", EXPENSIVE.values(), ids=EXPENSIVE)
+def test_an_expensive_body_is_refused_before_it_is_parsed(body):
     with pytest.raises(ContractError, match=r"samples must (be columns|hold at most)"):
         check_effort(body)
     with pytest.raises(ContractError, match="samples must"):
         decode_batch(enveloped(body, 1))
 
 
-def test_names_are_no_place_for_megabytes():
+def test_a_field_name_has_at_most_1024_characters():
     longest = "a" + ".b" * 511 + "c"
     batch = Batch(BOOT, 0, [0], {longest: [1]})
     assert decode_batch(encode_batch(batch)) == batch
@@ -103,7 +103,7 @@ def test_names_are_no_place_for_megabytes():
 
 
 def enveloped(body, n):
-    """A good envelope around any body, in the codec whose columns are their values alone."""
+    """A valid envelope with any body, in the codec that stores plain values."""
     good = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
     packed = base64.b64encode(zlib.compress(body)).decode()
     return {**good, "n": n, "codec": PLAIN_CODEC, "samples": packed}
