@@ -38,7 +38,7 @@ from iort_agent.spool.interface import (
     Spool,
 )
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.spool.salvage import is_damage, rebuild, rebuilt
+from iort_agent.spool.salvage import is_damage, put_in_place, rebuild, rebuilt
 from iort_contract.messages.batch import RunEnd
 
 _log = logging.getLogger(__name__)
@@ -416,7 +416,9 @@ class SqliteSpool:
         if self._queue_lock is None:
             self._queue_lock = QueueLock(self._path)
         if not self._path.exists() and rebuilt(self._path).exists():
-            rebuilt(self._path).replace(self._path)
+            # A kill may have left what is in it in its log.
+            self._connect(rebuilt(self._path)).close()
+            put_in_place(self._path)
         is_gone = self._queue_lock.ours and not self._path.exists()
         try:
             file = self._connect(self._path)
