@@ -290,7 +290,10 @@ class SqliteSpool:
             fresh = self._connect(self._path)
             self._file.abandon()
             self._file = fresh
-        while self._write_group():
+        with self._lock:
+            last_id = self._memory.last_id
+        # What is put meanwhile waits for the next pass: on a slow disk, `_read` would never have its turn.
+        while self._write_group(last_id):
             pass
         assert self._file is not None
         if not self.backlog().batches and self._file.shrink():
@@ -302,8 +305,8 @@ class SqliteSpool:
         if recovered:
             _log.info("%s: the disk works again, everything is written", self._path)
 
-    def _write_group(self) -> bool:
-        """One transaction; whether there is more to write."""
+    def _write_group(self, last_id: int) -> bool:
+        """One transaction; whether there is more to write, up to that batch."""
         assert self._file is not None
         self._trim(self._file)
         with self._lock:
@@ -319,7 +322,8 @@ class SqliteSpool:
             self._ends = {stream: end for stream, end in self._ends.items() if ends.get(stream) != end}
             if entries:
                 self._move_to_file(entries)
-            return len(self._memory) > 0
+            left = self._memory.next(0)
+            return left is not None and left.id <= last_id
 
     def _move_to_file(self, entries: list[Entry]) -> None:
         """Batches are in the file now: they leave the memory spool, but for those that may be wanted soon."""

@@ -213,6 +213,24 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
     assert len(commits) < 10
 
 
+def test_a_disk_that_is_slower_than_the_puts_does_not_hold_up_what_is_written(path: Path) -> None:
+    puts = iter(range(1, 100))
+
+    class Slow(SpoolFile):
+        def commit(self, *arguments: Any, **more: Any) -> None:
+            super().commit(*arguments, **more)
+            # More comes while the disk is busy, again and again.
+            for seq in puts:
+                fill(spool, 1, first=seq)
+                break
+
+    with running(path, open_file=Slow) as spool:
+        fill(spool, 1)
+        spool.work()
+        assert next(puts) == 2, "one transaction, and then `next` has its turn"
+        assert spool.next(0) is not None
+
+
 def test_the_file_is_given_back_and_read_piece_by_piece(path: Path) -> None:
     with running(path, max_bytes=50 * MB, memory_bytes=50 * MB) as spool:
         for seq in range(300):
