@@ -434,7 +434,8 @@ def test_kill_9_at_random_moments_loses_no_published_batch_and_names_the_last_of
                 break
             first, second, *rest = line.split()
             if second == "before":
-                named[first] |= {boot: int(seq) for boot, _, seq in (each.partition(":") for each in rest)}
+                ends = (each.partition(":") for each in rest)
+                named[first].update((boot, int(seq)) for boot, _, seq in ends)
                 continue
             numbers = arrived[second].setdefault(first, [])
             if int(rest[0]) not in numbers[-2000:]:
