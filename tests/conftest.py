@@ -60,13 +60,13 @@ def group(nodeid: str) -> str:
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
 
 
-@pytest.hookimpl(optionalhook=True)
 def pytest_configure() -> None:
     """Tests import the ministack that the embedded cloud runs: the installed one with local/patches/."""
     if find_spec("ministack"):
         patched.use()
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under `make test`, groups are spread over the workers. (Marks cannot say it: of xdist 3.8, they
     no longer reach the scheduler under pytest 9.)"""
