@@ -345,23 +345,24 @@ class SqliteSpool:
 
     def _trim(self, file: SpoolFile) -> None:
         """Drop the oldest batches in the file while there are more than ``max_bytes``."""
-        with self._lock:
-            excess = self._in_file.payload_bytes + self._memory.payload_bytes - self._max_bytes
         after = 0
-        while self._overwrite and excess > 0:
+        while self._overwrite and self._excess() > 0:
             oldest = file.oldest(after, _TRIM_ENTRIES)
             if not oldest:
                 raise sqlite3.DatabaseError("batches are missing")
             after = oldest[-1][0]
             with self._lock:
                 for entry_id, samples, size in oldest:
-                    if excess <= 0 or entry_id in self._gone:
+                    # Acknowledgements make room meanwhile.
+                    if self._excess() <= 0 or entry_id in self._gone:
                         continue
-                    excess -= size
                     self._gone.add(entry_id)
                     self._page.pop(entry_id, None)
                     self._in_file = _changed(self._in_file, -1, -samples, -size)
                     self._drop(1, samples)
+
+    def _excess(self) -> int:
+        return self._in_file.payload_bytes + self._memory.payload_bytes - self._max_bytes
 
     def _read(self) -> None:
         """Read on in the file, if `next` has come to the end of what was read."""

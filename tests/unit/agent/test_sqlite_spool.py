@@ -213,6 +213,25 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
     assert len(commits) < 10
 
 
+def test_room_that_acknowledgements_make_while_the_oldest_are_dropped_counts(path: Path) -> None:
+    on_their_way: list[Entry] = []
+
+    class Acknowledged(SpoolFile):
+        def oldest(self, after: int, max_batches: int) -> Any:
+            found = super().oldest(after, max_batches)
+            while on_their_way:
+                spool.ack(on_their_way.pop().id)
+            return found
+
+    with running(path, max_bytes=100_000, open_file=Acknowledged) as spool:
+        fill(spool, 100, size=1000)
+        on_their_way += all_kept(spool)[:50]
+        fill(spool, 60, size=1000, first=100)
+        spool.work()
+        assert (spool.dropped().batches, spool.alarm) == (10, None)
+        assert kept(spool) == list(range(60, 160))
+
+
 def test_a_disk_that_is_slower_than_the_puts_does_not_hold_up_what_is_written(path: Path) -> None:
     puts = iter(range(1, 100))
 
