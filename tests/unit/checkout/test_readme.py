@@ -26,7 +26,7 @@ def test_every_make_target_it_names_is_there():
 
 
 def test_every_file_it_links_to_is_there():
-    for link in re.findall(r"\]\(([^)h][^)]*)\)", README):
+    for link in re.findall(r"\]\(([^)h#][^)#]*)(?:#[^)]*)?\)", README):
         assert (ROOT / link).exists(), link
 
 
