@@ -51,13 +51,13 @@ def group(nodeid: str) -> str:
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
 
 
-@pytest.hookimpl(optionalhook=True)
 def pytest_configure() -> None:
     """Let tests import the ministack of the embedded cloud: the installed one with local/patches/."""
     if find_spec("ministack"):
         patched.use()
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under `make test`, spread the groups over the workers. (Marks cannot do this: xdist 3.8's marks no
     longer reach the scheduler under pytest 9.)

@@ -54,7 +54,7 @@ def rebuild(
         if damaged is None:
             source.close()
     aside = _set_aside(path, now_us) if path.exists() else None
-    new.replace(path)
+    put_in_place(path)
     return Salvage(aside, saved, lost)
 
 
@@ -63,12 +63,21 @@ def rebuilt(path: Path) -> Path:
     return path.with_name(f"{path.name}.new")
 
 
+def put_in_place(path: Path) -> None:
+    """Give the new file its name. The log of a file that was removed must not stay: SQLite would write it
+    into the new one."""
+    for suffix in SUFFIXES[1:]:
+        with contextlib.suppress(FileNotFoundError):
+            Path(f"{path}{suffix}").unlink()
+    rebuilt(path).replace(path)
+
+
 def _set_aside(path: Path, now_us: int) -> Path:
     """Rename the file, with its log; only the newest few of those set aside are kept."""
     now = dt.datetime.fromtimestamp(now_us / 1_000_000, dt.timezone.utc)
     aside = path.with_name(f"{path.name}.corrupt-{now:%Y%m%dT%H%M%S.%fZ}")
-    # The log first: alone, the database is still one, while the new one must not find this log.
-    for suffix in reversed(SUFFIXES):
+    # The log last: without it the database may lack batches, and a kill would leave it in its place.
+    for suffix in SUFFIXES:
         with contextlib.suppress(FileNotFoundError):
             Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
     files = [str(file) for file in path.parent.glob(f"{path.name}.corrupt-*")]

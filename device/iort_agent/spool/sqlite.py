@@ -38,7 +38,7 @@ from iort_agent.spool.interface import (
     Spool,
 )
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.spool.salvage import is_damage, rebuild, rebuilt
+from iort_agent.spool.salvage import is_damage, put_in_place, rebuild, rebuilt
 from iort_contract.messages.batch import RunEnd
 
 _log = logging.getLogger(__name__)
@@ -290,7 +290,10 @@ class SqliteSpool:
             fresh = self._connect(self._path)
             self._file.abandon()
             self._file = fresh
-        while self._write_group():
+        with self._lock:
+            last_id = self._memory.last_id
+        # What is put meanwhile waits for the next pass: on a slow disk, `_read` would never have its turn.
+        while self._write_group(last_id):
             pass
         assert self._file is not None
         if not self.backlog().batches and self._file.shrink():
@@ -302,8 +305,8 @@ class SqliteSpool:
         if recovered:
             _log.info("%s: the disk works again, everything is written", self._path)
 
-    def _write_group(self) -> bool:
-        """One transaction; whether there is more to write."""
+    def _write_group(self, last_id: int) -> bool:
+        """One transaction; whether there is more to write, up to that batch."""
         assert self._file is not None
         self._trim(self._file)
         with self._lock:
@@ -319,7 +322,8 @@ class SqliteSpool:
             self._ends = {stream: end for stream, end in self._ends.items() if ends.get(stream) != end}
             if entries:
                 self._move_to_file(entries)
-            return len(self._memory) > 0
+            left = self._memory.next(0)
+            return left is not None and left.id <= last_id
 
     def _move_to_file(self, entries: list[Entry]) -> None:
         """Batches are in the file now: they leave the memory spool, but for those that may be wanted soon."""
@@ -341,23 +345,24 @@ class SqliteSpool:
 
     def _trim(self, file: SpoolFile) -> None:
         """Drop the oldest batches in the file while there are more than ``max_bytes``."""
-        with self._lock:
-            excess = self._in_file.payload_bytes + self._memory.payload_bytes - self._max_bytes
         after = 0
-        while self._overwrite and excess > 0:
+        while self._overwrite and self._excess() > 0:
             oldest = file.oldest(after, _TRIM_ENTRIES)
             if not oldest:
                 raise sqlite3.DatabaseError("batches are missing")
             after = oldest[-1][0]
             with self._lock:
                 for entry_id, samples, size in oldest:
-                    if excess <= 0 or entry_id in self._gone:
+                    # Acknowledgements make room meanwhile.
+                    if self._excess() <= 0 or entry_id in self._gone:
                         continue
-                    excess -= size
                     self._gone.add(entry_id)
                     self._page.pop(entry_id, None)
                     self._in_file = _changed(self._in_file, -1, -samples, -size)
                     self._drop(1, samples)
+
+    def _excess(self) -> int:
+        return self._in_file.payload_bytes + self._memory.payload_bytes - self._max_bytes
 
     def _read(self) -> None:
         """Read on in the file, if `next` has come to the end of what was read."""
@@ -416,7 +421,9 @@ class SqliteSpool:
         if self._queue_lock is None:
             self._queue_lock = QueueLock(self._path)
         if not self._path.exists() and rebuilt(self._path).exists():
-            rebuilt(self._path).replace(self._path)
+            # A kill may have left what is in it in its log.
+            self._connect(rebuilt(self._path)).close()
+            put_in_place(self._path)
         is_gone = self._queue_lock.ours and not self._path.exists()
         try:
             file = self._connect(self._path)

@@ -392,6 +392,31 @@ def test_a_kill_while_a_new_file_is_made_loses_nothing(path: Path, at: str) -> N
         assert kept(again) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
 
 
+@pytest.mark.parametrize("renames", range(4))
+def test_a_kill_between_two_renames_loses_nothing(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renames: int
+) -> None:
+    spool = spool_at(path)
+    fill(spool, 10)
+    spool.work()
+    assert spool._file is not None
+    spool._file.connection.execute("UPDATE batches SET crc = 0 WHERE seq = 4")
+    left, replace = iter(range(renames)), Path.replace
+
+    def killed(self: Path, target: Any) -> Path:
+        if next(left, None) is None:
+            raise SystemExit
+        return replace(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", killed)
+        with pytest.raises(SystemExit):
+            spool._replace(sqlite3.DatabaseError("batch 5 is not as it was written"))
+    with running(crash(spool, tmp_path)) as again:
+        retry(again)
+        assert sorted({*kept(again)}) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+
+
 def test_a_damaged_file_on_a_full_disk_waits_for_room(path: Path) -> None:
     with running(path) as spool:
         for i in range(10):
@@ -430,6 +455,26 @@ def test_a_file_removed_while_it_is_in_use_is_written_anew(path: Path, tmp_path:
     with running(crash(spool, tmp_path)) as again:
         assert sorted(kept(again)) == list(range(12))
         assert again.previous("vesc") == ((BOOT, 11),)
+
+
+def test_the_log_of_a_removed_file_is_not_written_into_the_new_one(path: Path) -> None:
+    spool = spool_at(path, max_bytes=8 * MB)
+    arrived = set()
+    for first in range(0, 1600, 20):
+        fill(spool, 20, size=1500, first=first)
+        spool.work()
+        # SQLite has begun its log anew meanwhile, so the log has a part of the pages only.
+        for entry in all_kept(spool)[:15]:
+            spool.ack(entry.id)
+            arrived.add(entry.seq)
+    path.unlink()
+    fill(spool, 1, first=1600)
+    for _ in range(3):
+        spool.work()
+    assert spool.dropped() == (0, 0)
+    assert spool.damaged == 1
+    assert sorted(kept(spool)) == sorted(set(range(1601)) - arrived)
+    spool.close()
 
 
 def test_a_file_removed_between_two_runs_is_told(path: Path) -> None:

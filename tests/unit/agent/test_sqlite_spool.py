@@ -213,6 +213,43 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
     assert len(commits) < 10
 
 
+def test_room_that_acknowledgements_make_while_the_oldest_are_dropped_counts(path: Path) -> None:
+    on_their_way: list[Entry] = []
+
+    class Acknowledged(SpoolFile):
+        def oldest(self, after: int, max_batches: int) -> Any:
+            found = super().oldest(after, max_batches)
+            while on_their_way:
+                spool.ack(on_their_way.pop().id)
+            return found
+
+    with running(path, max_bytes=100_000, open_file=Acknowledged) as spool:
+        fill(spool, 100, size=1000)
+        on_their_way += all_kept(spool)[:50]
+        fill(spool, 60, size=1000, first=100)
+        spool.work()
+        assert (spool.dropped().batches, spool.alarm) == (10, None)
+        assert kept(spool) == list(range(60, 160))
+
+
+def test_a_disk_that_is_slower_than_the_puts_does_not_hold_up_what_is_written(path: Path) -> None:
+    puts = iter(range(1, 100))
+
+    class Slow(SpoolFile):
+        def commit(self, *arguments: Any, **more: Any) -> None:
+            super().commit(*arguments, **more)
+            # More comes while the disk is busy, again and again.
+            for seq in puts:
+                fill(spool, 1, first=seq)
+                break
+
+    with running(path, open_file=Slow) as spool:
+        fill(spool, 1)
+        spool.work()
+        assert next(puts) == 2, "one transaction, and then `next` has its turn"
+        assert spool.next(0) is not None
+
+
 def test_the_file_is_given_back_and_read_piece_by_piece(path: Path) -> None:
     with running(path, max_bytes=50 * MB, memory_bytes=50 * MB) as spool:
         for seq in range(300):
@@ -416,7 +453,8 @@ def test_kill_9_at_random_moments_loses_no_published_batch_and_names_the_last_of
                 break
             first, second, *rest = line.split()
             if second == "before":
-                named[first] |= {boot: int(seq) for boot, _, seq in (each.partition(":") for each in rest)}
+                ends = (each.partition(":") for each in rest)
+                named[first].update((boot, int(seq)) for boot, _, seq in ends)
                 continue
             numbers = arrived[second].setdefault(first, [])
             if int(rest[0]) not in numbers[-2000:]:

@@ -6,7 +6,7 @@ recorded, only its sample.
 
 from __future__ import annotations
 
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import (
@@ -40,44 +40,54 @@ def infer(message: Mapping[str, Any]) -> tuple[Definition, dict[str, Any], bool]
     }
     header = message.get("header")
     if not isinstance(header, dict):
-        types[_KIND] = _fields(message, _KIND, types)
+        types[_KIND] = _fields([message], _KIND, types)
         return Definition(_KIND, types), dict(message), False
     rest = {name: value for name, value in message.items() if name != "header"}
-    types[_KIND] = (Field("header", HEADER_TYPE, None), *_fields(rest, _KIND, types))
+    types[_KIND] = (Field("header", HEADER_TYPE, None), *_fields([rest], _KIND, types))
     stamp = header.get("stamp")
     stamped = isinstance(stamp, dict) and stamp.keys() in _STAMP and set(map(type, stamp.values())) == {int}
     normal = {"stamp": stamp if stamped else {"sec": 0, "nanosec": 0}, "frame_id": ""}
     return Definition(_KIND, types), {"header": normal, **rest}, stamped
 
 
-def _fields(message: Mapping[str, Any], kind: str, types: dict[str, tuple[Field, ...]]) -> tuple[Field, ...]:
+def _fields(
+    messages: Sequence[Mapping[str, Any]], kind: str, types: dict[str, tuple[Field, ...]]
+) -> tuple[Field, ...]:
+    """The fields of messages of one type."""
     if kind.count(".") > _MAX_DEPTH:
         raise MessageError("the message is nested too deeply")
-    return tuple(_field(name, value, f"{kind}.{name}", types) for name, value in message.items())
+    names = messages[0].keys()
+    if any(message.keys() != names for message in messages):
+        raise MessageError("the elements of an array have different fields")
+    return tuple(_field(name, [one[name] for one in messages], f"{kind}.{name}", types) for name in names)
 
 
-def _field(name: str, value: Any, kind: str, types: dict[str, tuple[Field, ...]]) -> Field:
-    if not isinstance(value, list):
-        return Field(name, _kind(value, kind, types), None)
-    kinds = {_kind(item, f"{kind}.{i}", types) for i, item in enumerate(value)}
-    if kinds <= {"int64", "float64"}:
-        return Field(name, "int64" if kinds == {"int64"} else "float64", VARIABLE)
-    # Elements of an array are alike, but for nulls: the first stands for all.
-    return Field(name, _kind(value[0], f"{kind}.0", types), VARIABLE)
+def _field(name: str, values: list[Any], kind: str, types: dict[str, tuple[Field, ...]]) -> Field:
+    """A field with these values. In an array of messages it has many, and one may be more telling than the
+    first: an array that is not empty, a float among integers."""
+    if not all(isinstance(value, list) for value in values):
+        return Field(name, _kind(values, kind, types), None)
+    return Field(name, _kind([item for value in values for item in value], kind, types), VARIABLE)
 
 
-def _kind(value: Any, kind: str, types: dict[str, tuple[Field, ...]]) -> str:
-    if isinstance(value, bool):
-        return "bool"
-    if isinstance(value, int):
-        return "int64" if -(2**63) <= value < 2**63 else "uint64" if 0 < value < 2**64 else "float64"
-    if value is None or isinstance(value, float):
+def _kind(values: list[Any], kind: str, types: dict[str, tuple[Field, ...]]) -> str:
+    found = set(map(type, values))
+    if found <= {int} and found:
+        least, most = min(values), max(values)
+        if least >= -(2**63) and most < 2**63:
+            return "int64"
+        return "uint64" if least >= 0 and most < 2**64 else "float64"
+    if found <= {int, float, type(None)}:
         return "float64"
-    if isinstance(value, str):
+    if len(found) > 1:
+        raise MessageError("the elements of an array have different types")
+    if found == {bool}:
+        return "bool"
+    if found == {str}:
         return STRING
-    if not isinstance(value, dict):
+    if found != {dict}:
         raise MessageError("ROS has no arrays of arrays")
-    if value.keys() == {"secs", "nsecs"}:
+    if all(value.keys() == {"secs", "nsecs"} for value in values):
         return DURATION
-    types[kind] = _fields(value, kind, types)
+    types[kind] = _fields(values, kind, types)
     return kind
