@@ -6,10 +6,14 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _KEPT = 4
+# A folder that is still being made after this time was left by a process that ended.
+_LEFT_S = 3600
 
 
 def kept(folder: Path, key: str, sources: Iterable[Path], make: Callable[[Path], object]) -> Path:
@@ -33,7 +37,20 @@ def kept(folder: Path, key: str, sources: Iterable[Path], make: Callable[[Path],
     except OSError:
         # Another process has made the same one meanwhile.
         shutil.rmtree(making, ignore_errors=True)
-    by_age = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    for old in by_age[:-_KEPT]:
+    for old in _old(folder):
         shutil.rmtree(old, ignore_errors=True)
     return found
+
+
+def _old(folder: Path) -> Iterator[Path]:
+    """All folders but the newest ones, and but those that other processes are making."""
+    made: list[tuple[float, Path]] = []
+    for path in folder.iterdir():
+        # Another process may have renamed or removed it meanwhile.
+        with suppress(FileNotFoundError):
+            changed_s = path.stat().st_mtime
+            if not path.suffix:
+                made.append((changed_s, path))
+            elif time.time() - changed_s > _LEFT_S:
+                yield path
+    yield from (path for _, path in sorted(made)[:-_KEPT])

@@ -155,6 +155,8 @@ def run(step: Step, began: float) -> None:
         # A new environment has none of the packages that the other steps installed.
         shutil.rmtree(STAMPS, ignore_errors=True)
     STAMPS.mkdir(parents=True, exist_ok=True)
+    # If a command fails half-way, the inputs of the last success may come back, but not its result.
+    stamp.unlink(missing_ok=True)
     print(f"setup: {step.title} ...", end="", flush=True)
     step_began = time.monotonic()
     for command in step.commands:

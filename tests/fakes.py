@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -69,7 +69,7 @@ class FakeDynamoDB:
         page = [self.items[table][key] for key in found[:size]]
         self.calls["query"] += 1
         self.read += len(page)
-        answer = {"Items": page, "Count": len(page)}
+        answer = {"Items": _projected(page, query), "Count": len(page)}
         # DynamoDB stops at a limit without reading the next item.
         if len(found) > size or (page and len(page) == query.get("Limit")):
             answer["LastEvaluatedKey"] = {name: page[-1][name] for name in KEYS[table]}
@@ -85,12 +85,12 @@ class FakeDynamoDB:
         found = [key for key in self.items[table] if key[0] == topic and first <= key[1] <= last][::-1]
         if "ExclusiveStartKey" in scan:
             found = found[1 + found.index(_key(table, scan["ExclusiveStartKey"])) :]
-        return {"Items": [self.items[table][key] for key in found]}
+        return {"Items": _projected([self.items[table][key] for key in found], scan)}
 
-    def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:
+    def get_item(self, *, TableName: str, Key: dict[str, Any], **how: Any) -> dict[str, Any]:
         self.calls["get_item"] += 1
         item = self.items[TableName].get(_key(TableName, Key))
-        return {"Item": item} if item else {}
+        return {"Item": _projected([item], how)[0]} if item else {}
 
     def update_item(self, *, TableName: str, Key: dict[str, Any], **how: Any) -> dict[str, Any]:
         """Add to a string set of an existing item."""
@@ -130,6 +130,15 @@ def _comparable(value: dict[str, str]) -> Any:
     """Return a key attribute in DynamoDB's order: numbers by value, texts by bytes."""
     ((kind, content),) = value.items()
     return Decimal(content) if kind == "N" else content
+
+
+def _projected(items: Sequence[dict[str, Any]], request: dict[str, Any]) -> list[dict[str, Any]]:
+    """The items with the attributes that a request asks for; all of them without a projection."""
+    if "ProjectionExpression" not in request:
+        return list(items)
+    names = request.get("ExpressionAttributeNames", {})
+    wanted = [names.get(name, name) for name in request["ProjectionExpression"].split(", ")]
+    return [{name: item[name] for name in wanted if name in item} for item in items]
 
 
 class _Scans:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.tables import (
+    ENVELOPE,
     EXPIRES_S,
     RECEIVED_MS,
     RECOMPUTE_FROM_S,
@@ -20,7 +21,7 @@ from iort_contract.tables import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
-from iort_station.data.batches import ATTRIBUTES, Item, PageProgress, stored
+from iort_station.data.batches import Item, PageProgress, stored
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
@@ -28,7 +29,7 @@ from iort_station.operations.replay import summarize
 # Lambda 2 caches the old parameters for this long; the margin is for its running invocations.
 SETTLED_S = VEHICLE_CACHE_S + 5
 # The attributes of a batch that Lambda 2 would get from the table's stream.
-_IMAGE = tuple(dict.fromkeys((*ATTRIBUTES, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S)))
+_IMAGE = (*ENVELOPE, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S)
 # An event may have 6 MB, and takes a second or two.
 _AT_ONCE, _EVENT_BATCHES, _EVENT_BYTES = 4, 100, 2_000_000
 

@@ -195,7 +195,7 @@ def test_the_numpy_back_end_and_the_list_back_end_agree(data):
         n = data.draw(st.integers(1, 4))
         times = [seq * 1_000_000 + i for i in range(n)]
         written = {name: data.draw(written_columns(n)) for name in ("a", "b")}
-        run.append(Opened(BOOT, seq, times, 0, written, None, ""))
+        run.append(Opened(BOOT, seq, times, 0, written, None, "", None))
     refused = RefusedItems()
     expected = list(decode_each(run, refused, lambda _name: True))
     try:

@@ -9,7 +9,7 @@ import pytest
 
 from functions.shared.summary.processing import process
 from functions.shared.summary.processing import recompute as summarize_again
-from iort_contract.messages.batch import Batch
+from iort_contract.messages.batch import Batch, RunEnd
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import recompute
@@ -79,6 +79,17 @@ def test_seconds_before_the_start_time_stay(cloud):
 
 def test_other_values_of_a_second_stay(cloud):
     before = summary_of(cloud.table)
+    again(cloud)
+    assert summary_of(cloud.table) == before
+
+
+def test_what_is_missing_of_the_run_before_stays_missing():
+    # Of the run before, which had the numbers 0 to 22, the last three have not arrived.
+    started_us = START + 5_000_000
+    restarted = Batch("0badf00d", 0, [started_us], {"speed": [1]}, previous=(RunEnd("0badcafe", 22),))
+    cloud = Cloud(cloud_of(*ride(200), restarted, gain="10").table)
+    before = summary_of(cloud.table)
+    assert before[SECOND + 5]["missing_batches"] == 3
     again(cloud)
     assert summary_of(cloud.table) == before
 
