@@ -4,7 +4,7 @@ AWS: queues the event. A throttled event is tried again for up to six hours, a f
   function's settings say; then it goes to the destination for failures
   (https://docs.aws.amazon.com/lambda/latest/dg/invocation-async-error-handling.html).
 ministack: invokes the function at once in a new thread, and a throttled or failed event is lost.
-Test: tests/local/test_gaps.py::test_an_event_that_breaks_the_emulator_goes_to_its_destination
+Test: tests/local/gaps/test_gaps.py::test_an_event_that_breaks_the_emulator_goes_to_its_destination
 Patch: none; it needs a queue for each function, which is more than a small patch
 """
 

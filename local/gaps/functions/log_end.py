@@ -4,7 +4,7 @@ AWS: does not apply; an invocation's time does not depend on its log.
 ministack: reads the log from the worker's standard error and does not know where it ends. It waits 50 ms for
   a first line, ten times as long as a function runs that logs nothing. Here the worker prints a line at the
   end.
-Test: tests/local/test_log_gap.py::test_the_worker_marks_the_end_of_each_invocations_log
+Test: tests/local/gaps/test_log_gap.py::test_the_worker_marks_the_end_of_each_invocations_log
 Patch: none; the end has to be agreed for the workers of every runtime, not Python's alone
 """
 

@@ -6,7 +6,7 @@ ministack: invokes the function with the same batch until it succeeds, in the th
   queues. Each mapping has here a thread for each of its concurrent batches. After a restart of the emulator
   it reads the stream from its beginning again, which AWS too does after a lost acknowledgement.
 Test:
-  tests/local/test_stream_gap.py::test_only_the_failing_record_goes_to_the_destination
+  tests/local/gaps/test_stream_gap.py::test_only_the_failing_record_goes_to_the_destination
 Patch: none; it replaces the whole poller by local/gaps/parts/stream_mapping.py
 """
 

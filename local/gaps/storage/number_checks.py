@@ -4,7 +4,7 @@ AWS: does not apply; what it takes AWS to read a number does not show
   (https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/HowItWorks.NamingRulesDataTypes.html).
 ministack: takes every number of an item apart several times. A batch has hundreds of them. Here plain digits
   pass at once, and the others are read as before.
-Test: tests/local/test_table_gap.py::test_numbers_are_read_as_unpatched
+Test: tests/local/gaps/test_table_gap.py::test_numbers_are_read_as_unpatched
 Patch: none; it is about speed only, so that upstream should measure it with its own load
 """
 

@@ -4,7 +4,7 @@ AWS: stores a partition in the order of its sort key, so that a Query reads only
   (https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/Query.html).
 ministack: sorts the whole partition for every Query and parses the key condition again for each item. Each
   Query took longer with every minute of a drive. The answers are the same.
-Test: tests/local/test_table_gap.py::test_a_query_reads_only_the_requested_keys
+Test: tests/local/gaps/test_table_gap.py::test_a_query_reads_only_the_requested_keys
 Patch: none; it needs another data structure for the items of a table
 """
 
