@@ -82,7 +82,7 @@ def test_each_run_names_the_run_before_it(embedded, bundle):
     run_agent(car)
     run_agent(car)
     assert _run(embedded, car.robot, "--from-start").exit_code == 0
-    found = list(audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()))
+    found = list(audit.headers(embedded.cloud, car.robot, "wheels"))
     first = min(batch_id(item[BATCH]) for item in found).boot
     last = max(batch_id(item[BATCH]) for item in found if batch_id(item[BATCH]).boot == first)
     _delete(embedded, car.robot, "wheels", {BATCH: str(last)})

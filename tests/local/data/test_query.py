@@ -100,7 +100,7 @@ def test_the_command_writes_its_matches_and_their_number(embedded, noise, tmp_pa
     assert len((tmp_path / "f1.csv").read_text().splitlines()) == N + 1
     done = iort("query", ROBOT, "imu", "--last", "all", embedded=embedded)
     assert done.returncode == 1
-    assert "no robot asked" in done.stderr
+    assert "robot asked is not registered" in done.stderr
 
 
 @pytest.mark.usefixtures("noise")

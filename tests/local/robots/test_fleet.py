@@ -220,7 +220,7 @@ def test_a_revoked_claim_cannot_provision(embedded, tmp_path, iort):
         (("remove",), "give a robot's name, or --all"),
         (("remove", "x", "--all"), "give a robot's name, or --all"),
         (("claim",), "give the robot's name, or --lasting"),
-        (("register", "a", "b", "--serial", "s"), "--serial is of one machine"),
+        (("register", "a", "b", "--serial", "s"), "--serial is for one machine"),
         (("show", "nobody"), "robot nobody is not registered"),
         (("rotate", "nobody"), "robot nobody is not registered"),
         (("register", "a/b"), "got 'a/b'"),
