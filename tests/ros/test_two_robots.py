@@ -107,7 +107,10 @@ def test_two_robots_exchange_poses_and_receive_commands(
     assert sent.exit_code == 0, sent.output + str(sent.exception) + "\n".join(agents[0].errors)
     assert "has accepted drive" in sent.output
     driver.until(lambda: 2.5 in [m["data"] for m in messages(driver)], "command")
-    for message, said in (('{"data": "fast"}', "data: must be a number, got 'fast'"), ('{"data": 1}', "without lease")):
+    for message, said in (
+        ('{"data": "fast"}', "data: must be a number, got 'fast'"),
+        ('{"data": 1}', "without lease"),
+    ):
         refused = iort("send", cars[0].robot, "drive", message, "--valid-ms", "60000", "--seconds", "60")
         assert refused.exit_code == 1
         assert said in str(refused.exception)
