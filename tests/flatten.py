@@ -11,11 +11,10 @@ with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Callable, Mapping, Optional
 
 # Returns a message's fields without its constants; None for a value that is not a message.
-Members = Callable[[Any], Mapping[str, Any] | None]
+Members = Callable[[Any], Optional[Mapping[str, Any]]]
 
 HEADER = "header"
 

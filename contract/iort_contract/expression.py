@@ -16,8 +16,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Callable, FrozenSet, Mapping, NamedTuple, Sequence, Union
 
 from iort_contract.checks import check_field
 from iort_contract.limits import ContractError, Value
@@ -27,7 +26,7 @@ MAX_LENGTH = 1000
 _MAX_DEPTH = 40
 # The kind of a value for comparisons; a flag counts as 0 or 1.
 _NULL, _NUMBER, _TEXT = "null", "a number", "a text"
-_Kinds: TypeAlias = Mapping[str, frozenset[str]]
+_Kinds = Mapping[str, FrozenSet[str]]
 
 
 class MismatchError(ValueError):
@@ -100,7 +99,7 @@ class Not(NamedTuple):
     of: Node
 
 
-Node: TypeAlias = Field | Constant | Arithmetic | Magnitude | Comparison | IsNull | Every | Some | Not
+Node = Union[Field, Constant, Arithmetic, Magnitude, Comparison, IsNull, Every, Some, Not]
 
 ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
     "+": operator.add,

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from operator import sub
 from statistics import mean, median
-from typing import TypeGuard
+from typing import TYPE_CHECKING
 
 from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.catalog.vesc import ABSENT_FROM, absent
@@ -15,6 +15,9 @@ from iort_contract.codec.seconds import Statistics, packed_second
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
+
+if TYPE_CHECKING:
+    from typing import TypeGuard
 
 # A step this many times the median is a gap: one lost sample makes 2; the jitter of a loaded Jetson reached
 # 2.5 on a recorded drive at 50 Hz.
