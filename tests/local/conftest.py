@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,16 @@ def embedded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedCloud
     ports = {name: free_port() for name in ("gateway", "mqtt", "pubnub")}
     with EmbeddedCloud(tmp_path_factory.mktemp("cloud") / "local", ports=ports) as cloud:
         yield cloud
+
+
+@pytest.fixture(autouse=True, scope="module")
+def sockets_of_other_libraries() -> Iterator[None]:
+    """Some clients leave their sockets to the garbage collector. It runs here, because the warning would
+    fail an unrelated test."""
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
 
 
 @pytest.fixture
