@@ -126,7 +126,7 @@ def contrast(one: str, other: str) -> float:
 
 
 def test_text_and_lines_have_enough_contrast_in_both_themes() -> None:
-    style = (ROOT / "station" / "web" / "style.css").read_text()
+    style = (ROOT / "station" / "web" / "style" / "theme.css").read_text()
     pairs = re.findall(r"--([a-z0-9-]+): light-dark\((#\w{6}), (#\w{6})\)", style)
     colours = {name: (light, dark) for name, light, dark in pairs}
     lines = {"speed", "voltage", "motor", "battery", "duty", "delay", *(f"hue-{i}" for i in range(1, 7))}
