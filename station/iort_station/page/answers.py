@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from iort_contract.catalog.derived import SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer
 from iort_contract.messages.page import Column as PageColumn
@@ -18,6 +19,7 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.blocks import Column, values
+from iort_station.data.conditions import derive
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import cloudwatch, cloudwatch_logs
@@ -63,7 +65,9 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     robot, stream = _text(asked, "robot"), _text(asked, "stream")
     found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
     columns = (
-        _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
+        _by_statistic(found.columns)
+        if summary
+        else {name: (c, c, c) for name, c in _with_derived(cloud, robot, found.columns).items()}
     )
     claims = _claims(columns)
     n = len(found)
@@ -88,6 +92,13 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
         "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
     }
+
+
+def _with_derived(cloud: Cloud, robot: str, columns: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns and those derived of them, which the summary has too."""
+    if columns.keys().isdisjoint(name for sources in SOURCES.values() for name in sources):
+        return dict(columns)
+    return {**columns, **derive(columns, inventory.vehicle_of(cloud, robot))}
 
 
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
