@@ -81,7 +81,7 @@ class BackgroundServer:
 
 
 def _is_our_fault(record: logging.LogRecord) -> bool:
-    """aiohttp logs a traceback for each malformed request, beside its answer 400."""
+    """Whether a fault is ours: for a malformed request, which gets its answer 400, aiohttp logs a traceback."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
