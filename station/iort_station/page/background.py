@@ -81,7 +81,7 @@ class BackgroundServer:
 
 
 def _is_our_fault(record: logging.LogRecord) -> bool:
-    """Whether a fault is ours: for a malformed request, which gets its answer 400, aiohttp logs a traceback."""
+    """Whether a fault is ours: aiohttp logs a traceback for malformed requests too, after its answer 400."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
