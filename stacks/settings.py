@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_contract.topics import check_namespace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -118,7 +119,7 @@ class Settings(BaseModel):
         default={}, description="`team=lab,cost-centre=7`: on every resource, beside `project` and `stage`"
     )
     retention_days: Annotated[int, _whole(1, 3650)] = Field(
-        default=90, description="lifetime of telemetry and summaries"
+        default=DEFAULT_RETENTION_DAYS, description="lifetime of telemetry and summaries"
     )
     files_days: Annotated[int, _whole(0, 3650)] = Field(
         default=0, description="lifetime of uploaded files; 0: for good"

@@ -7,6 +7,8 @@ TOPIC, BATCH, SECOND = "topic", "batch", "second"
 # A time in a message, microseconds since the epoch.
 T_US = "t"
 RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
+# The lifetime of telemetry and summaries, unless a deployment sets its own.
+DEFAULT_RETENTION_DAYS = 90
 ROBOT = "robot"
 # Registry: the day (UTC) and the bytes of a robot's upload quota.
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
