@@ -1,4 +1,4 @@
-"""The tables of docs/cloud.md and docs/processing.md: settings, rules, metrics and alarms."""
+"""Tables of docs/: settings, rules, metrics and alarms."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Alarms(Construct):
             self,
             name,
             alarm_name=f"{self._settings.namespace}-{name}",
-            alarm_description=f"{alarm.meaning}. What to do: docs/cloud.md",
+            alarm_description=f"{alarm.meaning}. What to do: docs/how-to/alarms.md",
             metric=metric,
             threshold=limit * alarm.factor,
             comparison_operator=operator.LESS_THAN_THRESHOLD

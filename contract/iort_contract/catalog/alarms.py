@@ -31,9 +31,9 @@ WAITING = Alarm(
 # A car that empties its queue after an outage exceeds its share for some minutes.
 PUT_OFF_WAITING = Alarm(
     "a robot is over its share of Lambda 2, and its summaries are late",
-    "nothing is lost, and no other robot waits ([a robot's share](processing.md#a-robots-share)). Lambda 2's "
-    "log names the robot, `iort robots show` says how many batches wait; mend what it sends, or "
-    "`iort robots remove`",
+    "nothing is lost, and no other robot waits "
+    "([a robot's share](../explanation/processing.md#a-robots-share)). Lambda 2's log names the robot, "
+    "`iort robots show` says how many batches wait; mend what it sends, or `iort robots remove`",
     periods=15,
 )
 ERRORS = Alarm(

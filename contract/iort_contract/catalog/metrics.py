@@ -1,6 +1,6 @@
 """The metrics that the functions write, each with its unit, chart and alarm.
 
-Log lines, dashboards, alarms and the tables of docs/cloud.md are made from these entries, in this order.
+Log lines, dashboards, alarms and the tables of docs/ are made from these entries, in this order.
 """
 
 from __future__ import annotations
@@ -120,7 +120,8 @@ METRICS = {
             GAPS_CHART,
             alarm=Alarm(
                 "batches of a car are missing",
-                "[`iort audit`](audit.md) says which; a late one fills the hole, a dropped one does not",
+                "[`iort audit`](../reference/audit.md) says which; a late one fills the hole, a "
+                "dropped one does not",
             ),
         ),
         Metric(

@@ -111,7 +111,7 @@ def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Colu
 
 
 def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
-    """The fields of attachments (docs/files.md), each with the field of its attachment's key."""
+    """The fields of attachments (docs/how-to/files.md), each with the field of its attachment's key."""
     fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
     return {
         f"{field}.{part}": f"{field}.key"
