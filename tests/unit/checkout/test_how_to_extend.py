@@ -1,4 +1,4 @@
-"""docs/how-to-extend.md works: the page's own blocks are applied to a copy of the checkout."""
+"""docs/how-to/extend.md works: the page's own blocks are applied to a copy of the checkout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scripts.docs_parts import ROOT
 
 pytestmark = pytest.mark.slow
 
-PAGE = (ROOT / "docs" / "how-to-extend.md").read_text()
+PAGE = (ROOT / "docs/how-to/extend.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FOLDERS = (
@@ -187,7 +187,10 @@ def test_the_way_to_add_a_rule_works(copy: Copy) -> None:
     )
     assert json.loads(copy.run("-c", handler))["HornsSounded"] == 1
     copy.run("-m", "scripts.docs_parts")
-    assert "| `horn` | counts who sounds the horn |" in (copy.root / "docs/processing.md").read_text()
+    assert (
+        "| `horn` | counts who sounds the horn |"
+        in (copy.root / "docs/explanation/processing.md").read_text()
+    )
 
 
 def test_the_way_to_add_a_function_works(copy: Copy) -> None:
