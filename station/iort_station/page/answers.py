@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract.catalog.derived import SOURCES
+from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
@@ -29,6 +29,8 @@ from iort_station.operations import cloudwatch, cloudwatch_logs
 MAX_ROWS = 5_000
 # Longer ranges are read from the summary of each second, not from samples.
 _SAMPLES_US = 3_600_000_000
+# The fields that a derived field needs, where it needs nothing else. The page makes the speed itself.
+_DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PARAMETERS[name]]
 _MOST_RUNS = 200
 
 
@@ -77,7 +79,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     columns = (
         _by_statistic(found.columns)
         if summary
-        else {name: (c, c, c) for name, c in _with_derived(cloud, robot, found.columns).items()}
+        else {name: (c, c, c) for name, c in _with_derived(found.columns).items()}
     )
     claims = _claims(columns)
     n = len(found)
@@ -104,11 +106,11 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     }
 
 
-def _with_derived(cloud: Cloud, robot: str, columns: Mapping[str, Column]) -> dict[str, Column]:
-    """The columns and those derived of them, which the summary has too."""
-    if columns.keys().isdisjoint(name for sources in SOURCES.values() for name in sources):
+def _with_derived(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns and those derived of them alone, which the summary has too."""
+    if not any(columns.keys() >= sources for sources in _DERIVED_OF):
         return dict(columns)
-    return {**columns, **derive(columns, inventory.vehicle_of(cloud, robot))}
+    return {**columns, **derive(columns, None)}
 
 
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
