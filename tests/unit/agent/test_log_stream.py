@@ -135,4 +135,5 @@ def test_lines_are_recorded_and_live_and_a_failing_link_adds_few(working: bool) 
         assert [text for batch in stored for text in batch.columns["text"]] == [
             "source failed: failing: the device is gone"
         ]
-    assert agent.streams.counts()[LOG_STREAM].samples < 10
+    # Each refusal of a batch of lines is a warning, too.
+    assert agent.streams.counts()[LOG_STREAM].samples < 30
