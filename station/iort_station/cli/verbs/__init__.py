@@ -17,6 +17,7 @@ COMMANDS = (
     "operations.trace",
     "page.watch",
     "page.site",
+    "operations.alarms",
     "operations.errors",
     "operations.adopt",
     "fleet.send",
