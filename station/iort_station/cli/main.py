@@ -14,9 +14,9 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cli import verbs
 from iort_station.cli.cloud_options import CloudOptions
-from iort_station.cli.console import visible
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError
+from iort_station.texts import visible
 
 app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
 for _name in verbs.COMMANDS:

@@ -9,8 +9,9 @@ from contextlib import contextmanager
 
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
-from iort_station.cli.console import errors, visible
+from iort_station.cli.console import errors
 from iort_station.data.batches import PageProgress
+from iort_station.texts import visible
 
 # A bar that would be gone sooner is not shown.
 _PATIENCE_S = 1.0

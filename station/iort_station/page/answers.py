@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Acknowledged, Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
@@ -18,6 +19,7 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.blocks import Column, values
+from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -27,6 +29,8 @@ from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
 MAX_ROWS = 5_000
 # Longer ranges are read from the summary of each second, not from samples.
 _SAMPLES_US = 3_600_000_000
+# The fields that a derived field needs, where it needs nothing else. The page makes the speed itself.
+_DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PARAMETERS[name]]
 _MOST_RUNS = 200
 
 
@@ -84,7 +88,9 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     robot, stream = _text(asked, "robot"), _text(asked, "stream")
     found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
     columns = (
-        _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
+        _by_statistic(found.columns)
+        if summary
+        else {name: (c, c, c) for name, c in _with_derived(found.columns).items()}
     )
     claims = _claims(columns)
     n = len(found)
@@ -109,6 +115,13 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
         "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
     }
+
+
+def _with_derived(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns and those derived of them alone, which the summary has too."""
+    if not any(columns.keys() >= sources for sources in _DERIVED_OF):
+        return dict(columns)
+    return {**columns, **derive(columns, None)}
 
 
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:

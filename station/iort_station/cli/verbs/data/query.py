@@ -116,19 +116,20 @@ def query(
 
 def _write(result: Result, form: Format, output: Path | None, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
+    from iort_station.recordings import tabular  # noqa: PLC0415 - as above
 
     if form is Format.parquet:
         if output is None:
-            tables.to_parquet(result, sys.stdout.buffer)
+            tabular.to_parquet(result, sys.stdout.buffer)
         else:
             with output.open("wb") as file:
-                tables.to_parquet(result, file)
+                tabular.to_parquet(result, file)
         return
     with output.open("w", encoding="utf-8", newline="") if output else nullcontext(sys.stdout) as text:
         if form is Format.csv:
-            tables.to_csv(result, text, raw=raw)
+            tabular.to_csv(result, text, raw=raw)
         elif form is Format.jsonl:
-            tables.to_json_lines(result, text)
+            tabular.to_json_lines(result, text)
         else:
             # In a file, every column fits.
             width = None if text.isatty() else 32 + 24 * len(result.columns)
