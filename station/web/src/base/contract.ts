@@ -280,6 +280,37 @@ export interface StreamsAnswer {
   readonly streams: readonly string[];
 }
 
+/** From the first sample to the time just after the last one, in microseconds since the epoch. */
+export interface Extent {
+  readonly from_us: number;
+  readonly to_us: number;
+}
+
+/** What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent counted, up to its last report; null without a report. */
+export interface RunPart {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly batches: number;
+  readonly samples: number | null;
+}
+
+/** A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is "cut off" if it did not end properly, and "unknown" without a report of the agent. ``lost`` counts the messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was recorded. */
+export interface Run {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly run: string;
+  readonly state: "running" | "ended" | "cut off" | "unknown";
+  readonly lost: number;
+  readonly streams: Readonly<Record<string, RunPart>>;
+}
+
+/** Answers ``runs``: the runs of a robot's agent, newest first. ``older`` tells whether there are more; ask for those before the last one's ``from_us``. ``streams`` has the extent of all that is stored. */
+export interface RunsAnswer {
+  readonly runs: readonly Run[];
+  readonly older: boolean;
+  readonly streams: Readonly<Record<string, Extent>>;
+}
+
 /** Answers ``dashboards``: their names. */
 export interface DashboardsAnswer {
   readonly dashboards: readonly string[];
