@@ -2,7 +2,7 @@
 
 import type { FieldTable, Value } from "../base/contract";
 import { claim, claimed, type Claim } from "./attachments";
-import { BOUNDS, DEEP_S, WINDOW_S } from "./bounds";
+import { BOUNDS, DEEP_S, deepRows, WINDOW_S } from "./bounds";
 import { Ring } from "./ring";
 import type { Hops, Update } from "./update";
 

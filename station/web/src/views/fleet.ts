@@ -1,7 +1,7 @@
 // Every car: one card each. Only the cards on the screen are updated, so that hundreds cost little more than a few.
 
 import type { Config, FieldTable } from "../base/contract";
-import { byName, el } from "../base/dom";
+import { byName, el, Text } from "../base/dom";
 import type { Query } from "../base/route";
 import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
@@ -21,6 +21,7 @@ export class FleetView {
   private readonly tools: FleetTools;
   private readonly offline: OfflineCars;
   private readonly cards = new Map<string, Card>();
+  private readonly headings = new Map<string, { readonly node: HTMLElement; readonly count: Text }>();
   private readonly seen = new Set<string>();
   private readonly nothing = el("p", { class: "note", role: "status", hidden: "" }, "No car has this name or tag.");
   private placedAt = -Infinity;
@@ -105,7 +106,7 @@ export class FleetView {
     const folded = (robot: Robot): boolean => now - robot.heardAt > FOLD_S;
     const nodes: HTMLElement[] = [];
     for (const [heading, robots] of this.tools.arrange(found.filter((robot) => !folded(robot)), now)) {
-      if (heading !== "") nodes.push(el("h2", { class: "group" }, heading, el("span", { class: "note" }, String(robots.length))));
+      if (heading !== "") nodes.push(this.heading(heading, robots.length));
       nodes.push(...robots.map(({ name }) => this.card(name).node));
     }
     let next = this.nav.firstElementChild;
@@ -124,6 +125,17 @@ export class FleetView {
     this.nothing.hidden = nodes.length > 0 || away.length > 0 || this.fleet.robots.size === 0;
     // A page without cars has nothing to search.
     this.tools.node.hidden = this.fleet.robots.size === 0 && registered.length === 0 && this.nothing.hidden;
+  }
+
+  private heading(name: string, cars: number): HTMLElement {
+    let heading = this.headings.get(name);
+    if (!heading) {
+      heading = { node: el("h2", { class: "group" }, name), count: new Text("note") };
+      heading.node.append(heading.count.node);
+      this.headings.set(name, heading);
+    }
+    heading.count.set(String(cars));
+    return heading.node;
   }
 
   private card(name: string): Card {
