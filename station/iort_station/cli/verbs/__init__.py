@@ -11,6 +11,8 @@ COMMANDS = (
     "page.dashboard",
     "operations.cost",
     "operations.audit",
+    "data.streams",
+    "data.runs",
     "data.query",
     "data.export",
     "data.plot",

@@ -17,9 +17,8 @@ from iort_station.cli.console import errors, out
 from iort_station.cli.options import AsJson, bounds
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
-from iort_station.data.inventory import check_registered
-from iort_station.errors import StationError
-from iort_station.fleet import files
+from iort_station.errors import StationError, unknown
+from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
 from iort_station.times import iso_s
 
@@ -110,13 +109,12 @@ def _chosen(
         if fnmatch.fnmatch(one.name, name):
             yield one
     if one is None and next(files.listed(cloud, robot), None) is None:
-        check_registered(cloud, robot)
+        registry.get(cloud, robot)
 
 
 def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:
     for one in reversed(found):
         if which in (one.name, one.key):
             return one
-    raise StationError(
-        f"{robot} has no file {which} in this range; `iort files list {robot}` shows its files"
-    )
+    problem = f"{robot} has no file {which} in this range"
+    raise unknown(problem, [which], (one.name for one in found), f"iort files list {robot}")
