@@ -1,14 +1,8 @@
-"""Prints texts that may come from robots: a terminal obeys no character of them.
-
-An escape sequence in a name or a value could move the cursor, hide a line or write the operator's clipboard
-(OSC 52). So every control character except new line and tab is shown as the text of its code. Characters
-that change the direction of a line are shown so too, and no text is rich's markup.
-"""
+"""rich's console for texts that may come from robots: no text of theirs is obeyed, or rich's markup."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,15 +10,7 @@ from rich import console
 from rich.segment import Segment
 from rich.text import Text
 
-# C0 except tab and new line, DEL and C1, Unicode's line ends and directions, and halves of characters, which
-# no output can write.
-_OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-
-
-def visible(text: str) -> str:
-    """Replace each character that a terminal would obey by its code, as JSON spells it."""
-    # JSON's spelling, so that JSON stays JSON.
-    return _OBEYED.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+from iort_station.cli.words import visible
 
 
 class Console(console.Console):

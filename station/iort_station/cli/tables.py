@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from iort_contract.codec.columns import EXACT
-from iort_station.cli.console import visible
+from iort_station.cli.words import visible
 from iort_station.data import Result
 from iort_station.data.blocks import Column, values
 from iort_station.data.positions import in_degrees
