@@ -48,11 +48,13 @@ FILES = tuple(
     ROOT / name
     for name in (
         "README.md",
-        "docs/cloud.md",
-        "docs/cost.md",
-        "docs/iort.md",
-        "docs/messages.md",
-        "docs/processing.md",
+        "docs/how-to/alarms.md",
+        "docs/reference/deployment.md",
+        "docs/reference/metrics.md",
+        "docs/explanation/cost.md",
+        "docs/reference/iort.md",
+        "docs/reference/messages.md",
+        "docs/explanation/processing.md",
     )
 )
 PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"

@@ -8,6 +8,7 @@ import json
 import socket
 import threading
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,7 +17,7 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, config
-from iort_station.page.server import PageServer
+from iort_station.page.server import MOST_ANSWERS, PageServer
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -129,6 +130,68 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> No
             assert waiting.recv(1) == b""
     finally:
         done.set()
+
+
+def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> None:
+    working, done = threading.Semaphore(0), threading.Event()
+
+    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
+        working.release()
+        done.wait()
+        return {}
+
+    def threads() -> int:
+        return sum(thread.name == "page answer" for thread in threading.enumerate())
+
+    answers = {"slow": slow}
+    with PageServer(**TOLD, built=built, answers=answers) as page, ExitStack() as viewers:
+        try:
+            for _ in range(2):
+                for _ in range(MOST_ANSWERS):
+                    viewer = socket.create_connection((page.host, page.port))
+                    viewers.enter_context(viewer).sendall(
+                        b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n"
+                    )
+                for _ in range(MOST_ANSWERS - threads()):
+                    assert working.acquire(timeout=60)
+                assert ask(page, "/page.js")[0].status == 200
+                assert threads() == MOST_ANSWERS
+                viewers.close()
+        finally:
+            done.set()
+        assert ask(page, "/slow.json")[0].status == 200
+
+
+def test_a_malformed_request_is_answered_without_a_traceback(
+    built: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        with socket.create_connection((page.host, page.port)) as sender:
+            sender.sendall(b"GET / HTTP/1.1\r\nBad Header\r\n\r\n")
+            assert sender.recv(100).startswith(b"HTTP/1.0 400 ")
+        assert not caplog.records
+        # A fault of our own is still logged.
+        monkeypatch.setattr(page, "_accepts", None)
+        assert ask(page, "/")[0].status == 500
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+
+
+@pytest.mark.parametrize(
+    ("accepted", "packed"),
+    [
+        ("gzip", True),
+        ("br;q=1.0, GZIP; q=0.001", True),
+        ("*", True),
+        ("gzip;q=0", False),
+        ("gzip; q=0.000, *", False),
+        ("identity, *;q=0", False),
+        ("xgzip", False),
+    ],
+)
+def test_gzip_is_sent_only_if_it_is_accepted(built: Path, accepted: str, *, packed: bool) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        answer, _ = ask(page, "/page.js", headers={"Accept-Encoding": accepted})
+    assert (answer.headers["Content-Encoding"] == "gzip") is packed
 
 
 def test_other_methods_are_rejected(built: Path) -> None:

@@ -49,6 +49,45 @@ class StreamsAnswer(TypedDict):
     streams: list[str]
 
 
+class Extent(TypedDict):
+    """From the first sample to the time just after the last one, in microseconds since the epoch."""
+
+    from_us: int
+    to_us: int
+
+
+class RunPart(Extent):
+    """What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent
+    counted, up to its last report; null without a report."""
+
+    batches: int
+    samples: int | None
+
+
+RunState = Literal["running", "ended", "cut off", "unknown"]
+
+
+class Run(Extent):
+    """A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is
+    "cut off" if it did not end properly, and "unknown" without a report of the agent. ``lost`` counts the
+    messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was
+    recorded."""
+
+    run: str
+    state: RunState
+    lost: int
+    streams: dict[str, RunPart]
+
+
+class RunsAnswer(TypedDict):
+    """Answers ``runs``: the runs of a robot's agent, newest first. ``older`` tells whether there are more;
+    ask for those before the last one's ``from_us``. ``streams`` has the extent of all that is stored."""
+
+    runs: list[Run]
+    older: bool
+    streams: dict[str, Extent]
+
+
 class DashboardsAnswer(TypedDict):
     """Answers ``dashboards``: their names."""
 
@@ -134,4 +173,13 @@ class Logs(TypedDict):
     to_s: int
 
 
-Answer = Union[RobotsAnswer, VehiclesAnswer, StreamsAnswer, HistoryAnswer, DashboardsAnswer, Dashboard, Logs]
+Answer = Union[
+    RobotsAnswer,
+    VehiclesAnswer,
+    StreamsAnswer,
+    RunsAnswer,
+    HistoryAnswer,
+    DashboardsAnswer,
+    Dashboard,
+    Logs,
+]

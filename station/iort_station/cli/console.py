@@ -1,4 +1,9 @@
-"""rich's console for texts that may come from robots: no text of theirs is obeyed, or rich's markup."""
+"""Prints texts that may come from robots: a terminal obeys no character of them.
+
+An escape sequence in a name or a value could move the cursor, hide a line or write the operator's clipboard
+(OSC 52). So every control character except new line and tab is shown as the text of its code. Characters
+that change the direction of a line are shown so too, and no text is rich's markup.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from rich import console
 from rich.segment import Segment
 from rich.text import Text
 
-from iort_station.cli.words import visible
+from iort_station.texts import visible
 
 
 class Console(console.Console):

@@ -102,22 +102,38 @@ def types_of(cloud: Cloud, robot: str) -> Iterator[tuple[int, MessageType]]:
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
-    """The robot's `known` streams that have stored batches."""
-    return [name for name in known(cloud, robot) if _has_batches(cloud, robot, name)]
+    """The robot's streams that have stored batches."""
+    seen = _seen(cloud, robot)
+    # The agent's reports of a year take seconds to read. The newest one names what Lambda 2 may not have
+    # seen yet; the registry has forgotten a removed robot.
+    names = {*seen, *_announced(cloud, robot, newest=True)} if seen else known(cloud, robot)
+    return [name for name in sorted({VESC_STREAM, *OWN_STREAMS, *names}) if _has_batches(cloud, robot, name)]
 
 
 def known(cloud: Cloud, robot: str) -> list[str]:
     """The streams that the robot's agent has announced, that Lambda 2 has seen, or that every robot has."""
+    announced = _announced(cloud, robot, newest=False)
+    return sorted({VESC_STREAM, *OWN_STREAMS, *_seen(cloud, robot), *announced})
+
+
+def _seen(cloud: Cloud, robot: str) -> set[str]:
     row = registry.find(cloud, robot) or {}
-    seen = {str(name) for name in row.get(STREAMS, ())}
-    announced = {
-        name
-        for own in (TYPES_STREAM, ACCOUNT_STREAM)
-        for block in _blocks(cloud, robot, own)
-        for name in block.columns.get("stream", ())
-        if isinstance(name, str)
-    }
-    return sorted({VESC_STREAM, *OWN_STREAMS, *seen, *announced})
+    return {str(name) for name in row.get(STREAMS, ())}
+
+
+def _announced(cloud: Cloud, robot: str, *, newest: bool) -> set[str]:
+    """The streams that the agent has named in its types and accounts, or in the newest second of each."""
+    names: set[str] = set()
+    for own in (TYPES_STREAM, ACCOUNT_STREAM):
+        start_us = None
+        if newest:
+            item = telemetry_table(cloud).first(topic_of(cloud, robot, own), newest=True, attributes=(BATCH,))
+            if item is None:
+                continue
+            start_us = batch_id(item[BATCH]["S"]).t_us
+        for block in _blocks(cloud, robot, own, start_us):
+            names |= {name for name in block.columns.get("stream", ()) if isinstance(name, str)}
+    return names
 
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:
@@ -132,8 +148,9 @@ def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
     return telemetry_table(cloud).first(topic_of(cloud, robot, stream), attributes=(BATCH,)) is not None
 
 
-def _blocks(cloud: Cloud, robot: str, stream: str) -> Iterator[Block]:
-    return blocks(stored(cloud, Selection(robot=robot, stream=stream)), RefusedItems())
+def _blocks(cloud: Cloud, robot: str, stream: str, start_us: int | None = None) -> Iterator[Block]:
+    selection = Selection(robot=robot, stream=stream, start_us=start_us)
+    return blocks(stored(cloud, selection), RefusedItems())
 
 
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:

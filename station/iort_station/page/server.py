@@ -19,6 +19,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +37,11 @@ Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
+# The most answers that are worked on at a time; further requests wait.
+MOST_ANSWERS = 16
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
+# A coding of Accept-Encoding and its weight.
+_CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
 
 
 class _Body(NamedTuple):
@@ -72,6 +77,7 @@ class PageServer(BackgroundServer):
     ) -> None:
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
+        self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
             namespace=namespace,
@@ -126,7 +132,7 @@ class PageServer(BackgroundServer):
         answer = self._answers.get(path)
         if answer is not None:
             parameters = dict(request.query)
-            status, body = await _off_the_loop(lambda: _answered(answer, parameters))
+            status, body = await self._off_the_loop(lambda: _answered(answer, parameters))
             return self._response(request, body, status)
         file = self._files.get(path)
         if file is None:
@@ -138,6 +144,25 @@ class PageServer(BackgroundServer):
             response.set_status(304)
             response.body = None
         return response
+
+    async def _off_the_loop(self, work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
+        """Run ``work`` in a daemon thread, so that a slow answer delays neither a file nor the exit."""
+        await self._free.acquire()
+        loop = asyncio.get_running_loop()
+        done: Future[tuple[int, _Body]] = Future()
+        done.set_running_or_notify_cancel()
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
+                done.set_exception(error)
+            # Not where the answer is awaited: a viewer who leaves does not end the thread.
+            with suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(self._free.release)
+
+        threading.Thread(target=run, name="page answer", daemon=True).start()
+        return await asyncio.wrap_future(done)
 
     def _accepts(self, host: str) -> bool:
         """Whether a request's Host is ours.
@@ -156,26 +181,18 @@ class PageServer(BackgroundServer):
 
     def _response(self, request: web.BaseRequest, body: _Body, status: int) -> web.Response:
         headers = {**self._headers, "Content-Type": body.kind}
-        if "gzip" in request.headers.get("Accept-Encoding", ""):
+        if _takes_gzip(request.headers.get("Accept-Encoding", "")):
             return web.Response(
                 body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
             )
         return web.Response(body=body.plain, status=status, headers=headers)
 
 
-async def _off_the_loop(work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
-    """Run ``work`` in a daemon thread, so that a slow answer delays neither other requests nor the exit."""
-    done: Future[tuple[int, _Body]] = Future()
-    done.set_running_or_notify_cancel()
-
-    def run() -> None:
-        try:
-            done.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
-            done.set_exception(error)
-
-    threading.Thread(target=run, name="page answer", daemon=True).start()
-    return await asyncio.wrap_future(done)
+def _takes_gzip(accepted: str) -> bool:
+    """Whether an Accept-Encoding allows gzip: RFC 9110, 12.5.3. A weight of 0 refuses a coding."""
+    weights: dict[str, str] = dict(_CODING.findall(accepted.lower()))
+    weight = weights.get("gzip", weights.get("*", "0"))
+    return weight == "" or weight.strip("0.") != ""
 
 
 def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:

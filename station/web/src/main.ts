@@ -72,7 +72,8 @@ class Page {
       if (view === name) byId(id).setAttribute("aria-current", "page");
       else byId(id).removeAttribute("aria-current");
     }
-    this.historyView.show(view === "history" ? robot : undefined);
+    if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
+    else this.historyView.show(undefined);
     this.cloudWatchView.show(view === "cloudwatch");
     this.fleetView.show(view === "fleet");
     this.arrange();

@@ -116,7 +116,7 @@ def _look_back(page, url, robot, samples, newest):
         return False
 
     until(loaded, "the samples in the table")
-    assert page.locator("section.panel[aria-label='Voltage input'] .plot canvas").count() == 1
+    assert page.locator("section.panel[aria-label='Battery voltage'] .plot canvas").count() == 1
     row = page.locator("tr[data-field=voltage_input] td")
     until(lambda: plain(row.nth(1).inner_text()) == f"{newest['voltage_input']:.2f}", "the value now")
     counted = page.locator("tr[data-field=displacement] td")

@@ -1,4 +1,4 @@
-"""A robot with a foreign client, written from docs/messages.md alone, on the embedded cloud."""
+"""A robot with a foreign client, written from docs/reference/messages.md alone, on the embedded cloud."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def test_every_file_linked_in_the_readme_exists():
 
 
 def test_every_decision_has_its_own_number():
-    records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    records = sorted((ROOT / "docs" / "decisions").glob("*/*.md"), key=lambda path: path.name)
     numbers = [int(path.name[:4]) for path in records]
     assert numbers == sorted(set(numbers))
     for path, number in zip(records, numbers, strict=True):

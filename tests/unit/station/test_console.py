@@ -13,7 +13,7 @@ from rich.text import Text
 
 import iort_station
 from iort_station.cli.console import Console
-from iort_station.cli.words import visible
+from iort_station.texts import visible
 
 # Write the clipboard; the same with C1; move the cursor and ring the bell; reverse a line.
 HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]

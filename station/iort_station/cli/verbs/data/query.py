@@ -132,13 +132,14 @@ def query(
 
 def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
+    from iort_station.recordings import tabular  # noqa: PLC0415 - as above
 
     if form is Format.parquet:
-        tables.to_parquet(result, file.buffer)
+        tabular.to_parquet(result, file.buffer)
     elif form is Format.csv:
-        tables.to_csv(result, file, raw=raw)
+        tabular.to_csv(result, file, raw=raw)
     elif form is Format.jsonl:
-        tables.to_json_lines(result, file)
+        tabular.to_json_lines(result, file)
     else:
         # In a file, every column fits.
         width = None if file.isatty() else 32 + 24 * len(result.columns)

@@ -42,7 +42,7 @@ def adopt_(
     """Copy batches from an old telemetry table, or from one restored from a backup, into the deployment's.
 
     The other table stays as it is, and a second run changes nothing. Lambda 2 makes the summaries again. Exit
-    status 1 if some items cannot be adopted; each is printed with its reason. See docs/upgrading.md.
+    status 1 if some items cannot be adopted; each is printed with its reason. See docs/how-to/upgrading.md.
     """
     cloud = context.obj.cloud()
     try:
