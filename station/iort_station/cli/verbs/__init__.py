@@ -18,6 +18,7 @@ VERBS = {
     "operations.trace": "Measure the delay of live updates, hop by hop.",
     "page.watch": "Show every car in the terminal, live, until Ctrl-C.",
     "page.site": "Upload the page to the stack iort-site, which serves it.",
+    "operations.alarms": "List the alarms with what to do, or acknowledge them.",
     "operations.errors": "List rejected messages, or show one.",
     "operations.replay_errors": "Put rejected messages back.",
     "operations.adopt": "Copy batches of an old telemetry table.",

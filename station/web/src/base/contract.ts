@@ -360,6 +360,52 @@ export interface Alarm {
   readonly since_s: number;
 }
 
+/** Who has seen an alarm, and when. */
+export interface Acknowledged {
+  readonly by: string;
+  readonly at_s: number;
+}
+
+/** An alarm with its entry in the catalogue. ``robots`` are the cars that it may be about; ``named`` says whether an alert has named them. ``acknowledged`` is null unless it is raised and somebody has seen it since. */
+export interface AlarmEntry {
+  readonly name: string;
+  readonly about: string;
+  readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
+  readonly reason: string;
+  readonly since_s: number;
+  readonly key: string;
+  readonly meaning: string;
+  readonly advice: string;
+  readonly evidence: "quarantine" | "logs" | "cars";
+  readonly threshold: number | null;
+  readonly robots: readonly string[];
+  readonly named: boolean;
+  readonly acknowledged: Acknowledged | null;
+}
+
+/** Answers ``alarms``, the raised ones first; ``user`` is who acknowledges if the viewer gives no name. */
+export interface AlarmsAnswer {
+  readonly alarms: readonly AlarmEntry[];
+  readonly user: string;
+}
+
+/** A message in quarantine; ``robot`` is "-" if it is unknown. */
+export interface Rejected {
+  readonly id: string;
+  readonly robot: string;
+  readonly source: string;
+  readonly topic: string;
+  readonly reason: string;
+  readonly last_s: number;
+  readonly seen: number;
+}
+
+/** Answers ``rejected``: the newest messages in quarantine; ``found`` may exceed their number. */
+export interface RejectedAnswer {
+  readonly rejected: readonly Rejected[];
+  readonly found: number;
+}
+
 /** A dashboard's widget; ``number`` is its place in the dashboard's body. */
 export interface Widget {
   readonly x: number;
