@@ -12,6 +12,10 @@ class StationError(Exception):
     """The station cannot do what was asked; the text says why and, where it can, what helps."""
 
 
+class UsageError(StationError):
+    """Nobody could do what was asked: a text that is no time, or options that contradict one another."""
+
+
 def unknown(problem: str, names: Iterable[str], known: Iterable[str], all_of: str) -> StationError:
     """The error for names that do not exist, with the nearest of the ``known`` ones.
 

@@ -26,7 +26,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     shown = iort("robots", "list").stdout
     assert f"{'cli-car':<8}" in shown
     assert "speed_to_erpm_gain 3000" in shown
-    assert iort("robots", "remove", "cli-car").exit_code == 0
+    assert iort("robots", "remove", "cli-car", "--yes").exit_code == 0
     assert "cli-car" not in iort("robots", "list").output
 
 

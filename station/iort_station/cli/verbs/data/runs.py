@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from datetime import timedelta
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
+from iort_contract.messages.page import Run
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, Robot, bounds
-from iort_station.cli.progress import say
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.words import say
+from iort_station.cloud import Cloud
+from iort_station.data.runs import runs as find
+from iort_station.operations import audit
+from iort_station.operations.audit import Missing
 from iort_station.times import between, iso, iso_s
 
-if TYPE_CHECKING:
-    from iort_contract.messages.page import Run
-    from iort_station.cloud import Cloud
-    from iort_station.operations.audit import Missing
-
 commands = typer.Typer()
-# A gap of a run that is listed by itself.
-Gaps = dict[tuple[str, str], "list[Missing]"]
+# The missing batches of a run and stream.
+Gaps = dict[tuple[str, str], list[Missing]]
 
 
 @commands.command(
@@ -30,11 +29,9 @@ Gaps = dict[tuple[str, str], "list[Missing]"]
 def runs(
     context: typer.Context,
     robot: Robot,
-    start: Annotated[
-        str | None, typer.Option("--from", help="Start time: -10m, 2026-05-04T10:00:00Z.")
-    ] = None,
-    end: Annotated[str | None, typer.Option("--to", help="End time (exclusive).")] = None,
-    last: Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d.")] = None,
+    start: From = None,
+    end: To = None,
+    last: Last = None,
     count: Annotated[int, typer.Option(min=1, max=1000, help="The most runs to list; the newest.")] = 20,
     with_gaps: Annotated[
         bool, typer.Option("--gaps", help="Count missing batches; reads every batch of the listed runs.")
@@ -47,14 +44,10 @@ def runs(
     agent, up to its last report (every 30 s, and at a proper end). Lost is what the agent says it could not
     record.
     """
-    # numpy takes longer to load than most commands to run.
-    from iort_station.data.runs import runs as find  # noqa: PLC0415 - see above
-
-    start_us, end_us = bounds(start, end, last, time.time_ns() // 1000)
-    cloud = context.obj.cloud()
+    within, cloud = Range.of(start, end, last), context.obj.cloud()
     gaps: Gaps = {}
     with errors.status("reading") as status:
-        found = find(cloud, robot, start_us=start_us, end_us=end_us, count=count)
+        found = find(cloud, robot, start_us=within.start_us, end_us=within.end_us, count=count)
         for run in found["runs"] if with_gaps else ():
             status.update(f"counting the batches of {run['run'][:8]}")
             gaps |= _gaps(cloud, robot, run)
@@ -76,8 +69,6 @@ def runs(
 
 
 def _gaps(cloud: Cloud, robot: str, run: Run) -> Gaps:
-    from iort_station.operations import audit  # noqa: PLC0415 - as above
-
     return {
         (run["run"], stream): one.missing
         for stream, part in run["streams"].items()

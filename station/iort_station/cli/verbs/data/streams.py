@@ -10,6 +10,7 @@ from rich.table import Table
 
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.data.overview import StreamOverview, overview
 from iort_station.times import between, iso_s
 
 commands = typer.Typer()
@@ -24,19 +25,11 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
 
     The command reads some batches of each run, never all samples. The fields are those of the newest batch.
     """
-    # numpy takes longer to load than most commands to run.
-    from iort_station.data.overview import StreamOverview, overview  # noqa: PLC0415 - see above
-
-    def described(one: StreamOverview) -> dict[str, Any]:
-        fields = [{"name": name, "unit": unit or None} for name, unit in one.fields.items()]
-        counted = {"runs": one.runs, "more_runs": one.older}
-        return {"stream": one.stream, **between(one.extent), **counted, "fields": fields}
-
     cloud = context.obj.cloud()
     with errors.status("reading"):
         found = overview(cloud, robot)
     if as_json:
-        print_json({"robot": robot, "streams": [described(one) for one in found]})
+        print_json({"robot": robot, "streams": [_as_json(one) for one in found]})
         return
     if not found:
         errors.print(f"{robot} has sent nothing yet")
@@ -48,3 +41,9 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
         extent = f"{iso_s(one.extent['from_us'])} to {iso_s(one.extent['to_us'])}"
         out.print(f"{one.stream}: {counted}, {extent}", style="bold", soft_wrap=True)
         out.print(Padding(table, (0, 0, 1, 2)))
+
+
+def _as_json(one: StreamOverview) -> dict[str, Any]:
+    fields = [{"name": name, "unit": unit or None} for name, unit in one.fields.items()]
+    counted = {"runs": one.runs, "more_runs": one.older}
+    return {"stream": one.stream, **between(one.extent), **counted, "fields": fields}
