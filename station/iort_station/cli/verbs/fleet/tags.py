@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.fleet import tags
 
 commands = typer.Typer()
@@ -31,5 +31,5 @@ def tag(
 def _change(text: str) -> tuple[str, str | None]:
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise StationError(f"must be TAG=VALUE, for example lab=north, got {text}")
+        raise UsageError(f"must be TAG=VALUE, for example lab=north, got {text}")
     return name, value
