@@ -295,6 +295,11 @@ export interface RobotsAnswer {
   readonly robots: Readonly<Record<string, RobotPresence>>;
 }
 
+/** Answers ``tags``: each robot's tags, which are the attributes of its thing. */
+export interface TagsAnswer {
+  readonly tags: Readonly<Record<string, Readonly<Record<string, string>>>>;
+}
+
 /** Answers ``vehicles``: as in `Config`. */
 export interface VehiclesAnswer {
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;

@@ -4,7 +4,8 @@ import { CAR_ALARMS, type AlarmEntry, type AlarmsAnswer, type Config, type Field
 import { number } from "../base/format";
 import { act, ask, AnswerError } from "../server/answers";
 import type { Fleet } from "./fleet";
-import { numeric, type Robot } from "./robot";
+import { hottest, type Robot } from "./robot";
+import { numeric } from "./stream";
 
 // CloudWatch evaluates alarms every minute.
 const AGAIN_S = 30;
@@ -43,7 +44,6 @@ export class Alarms {
     config: Config,
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
-    private readonly hottest: (newest: (field: string) => number) => number,
   ) {
     if (!config.answers) return;
     void this.load();
@@ -111,7 +111,7 @@ export class Alarms {
   private *texts(robot: Robot): Generator<[CarAlarm, string]> {
     const vesc = robot.vesc(this.table);
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
-    const [heat, volts, fault] = [this.hottest(newest), newest("voltage_input"), robot.fault(this.table)];
+    const [heat, volts, fault] = [hottest(newest), newest("voltage_input"), robot.fault(this.table)];
     const [hot, low] = [this.threshold("TemperatureDegC"), this.threshold("BatteryVolts")];
     if (fault !== undefined) yield ["FaultSamples", fault];
     if (heat > hot) yield ["TemperatureDegC", `above ${number(hot)} °C`];
