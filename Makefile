@@ -57,8 +57,8 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
 		$(if $(REPORT),--json "$(REPORT)")
 
-bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: SOAK=300 REPORT=figures.json
-	@$(BIN)/python -m bench.page $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
+bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
+	@$(BIN)/python -m bench.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")

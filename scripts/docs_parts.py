@@ -216,6 +216,7 @@ def decisions() -> None:
 def manual() -> None:
     """The command `iort`, as typer describes it."""
     root: Any = typer.main.get_command(app)
+    root.commands = {name: verb.load() for name, verb in root.commands.items()}
     _whole_sentences(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root), name="iort")
     # The page has a title of its own. The text is escaped for HTML; Markdown shows an apostrophe as it is.

@@ -93,9 +93,10 @@ def _fields() -> Iterator[Field | Derived]:
 
 
 def _described(field: Field | Derived) -> dict[str, str]:
-    ros2_unit = getattr(field, "ros2_unit", None)
-    described = {"unit": field.unit, "meaning": field.meaning}
-    return described | {"ros2_unit": ros2_unit} if ros2_unit else described
+    more = {"ros2_unit": getattr(field, "ros2_unit", None), "label": field.label}
+    return {"unit": field.unit, "meaning": field.meaning} | {
+        name: text for name, text in more.items() if text
+    }
 
 
 _FIELD_TABLE = """
@@ -103,6 +104,8 @@ export interface FieldEntry {
   readonly unit: string;
   readonly ros2_unit?: string;
   readonly meaning: string;
+  /** What the page calls it, unless its name says it. */
+  readonly label?: string;
 }
 
 export interface FieldTable {

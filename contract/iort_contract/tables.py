@@ -14,6 +14,8 @@ ROBOT = "robot"
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
 # Registry: the time of the last mail, one attribute per cause with this prefix.
 ALERT_PREFIX = "alert_"
+# The fault's code follows, or "unknown".
+ALERT_FAULT, ALERT_LOW_VOLTAGE = f"{ALERT_PREFIX}fault_", f"{ALERT_PREFIX}low_voltage"
 STATS = ("min", "mean", "max", "last")
 # A second in the summary: samples, their batches, batches missing before those, gaps between samples, values
 # that were not finite.

@@ -6,9 +6,11 @@ import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
+import { Registry } from "./live/registry";
 import { observer } from "./observer";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
+import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
 import { CarView } from "./views/car";
 import { CloudWatchView } from "./views/cloudwatch";
@@ -22,6 +24,8 @@ const VALUES_S = 0.04;
 class Page {
   private readonly fleet: Fleet;
   private readonly feed: Feed;
+  private readonly registry: Registry;
+  private readonly waiting: Waiting;
   private readonly bar: StatusBar;
   private readonly fleetView: FleetView;
   private readonly carView: CarView;
@@ -35,7 +39,7 @@ class Page {
   private valuesAt = -Infinity;
 
   constructor(
-    private readonly config: Config,
+    config: Config,
     table: FieldTable,
   ) {
     this.fleet = new Fleet(config, table);
@@ -43,8 +47,10 @@ class Page {
       this.bar.linked(state);
       this.clockAt = -Infinity;
     });
+    this.registry = new Registry(config);
+    this.waiting = new Waiting(config, this.registry);
     this.bar = new StatusBar(config, this.fleet, table);
-    this.fleetView = new FleetView(config, this.fleet, table);
+    this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(this.fleet, table, this.tools);
     this.historyView = new HistoryView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
@@ -75,7 +81,8 @@ class Page {
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
     this.cloudWatchView.show(view === "cloudwatch");
-    this.fleetView.show(view === "fleet");
+    this.registry.watch(view === "fleet" || view === "car");
+    if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
     this.arrange();
   }
 
@@ -97,9 +104,7 @@ class Page {
     // The view of a car waits for its car, as the fleet's view waits for the first.
     const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
     document.body.dataset["empty"] = String(waits);
-    byId("empty-name").textContent = robot ?? "a car";
-    byId("empty-past").hidden = robot === undefined || !this.config.answers;
-    if (robot !== undefined) byId("empty-past").setAttribute("href", route({ view: "history", robot }));
+    this.waiting.show(robot);
     this.clockAt = -Infinity;
   }
 
@@ -113,7 +118,9 @@ class Page {
   /** Left and right change the car; Escape leaves it. */
   private key(event: KeyboardEvent): void {
     const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
-    if (this.route.view === "fleet" || inField || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (this.route.view === "fleet") this.fleetView.key(event);
+    if (this.route.view === "fleet" || inField) return;
     if (event.key === "Escape") location.hash = "robot" in this.route && this.route.view === "history" ? route({ view: "car", robot: this.route.robot }) : route({ view: "fleet" });
     if (this.route.view !== "car") return;
     const [before, after] = this.neighbours(this.route.robot);
@@ -138,6 +145,7 @@ class Page {
     this.clockAt = at;
     const linked = this.feed.state.kind === "live";
     this.bar.clock(at, this.feed.state);
+    if (document.body.dataset["empty"] === "true") this.waiting.show("robot" in this.route ? this.route.robot : undefined);
     if (view === "fleet") this.fleetView.clock(at, linked);
     if (view === "car") this.carView.clock(at, linked);
     if (view === "history") this.historyView.clock(at);

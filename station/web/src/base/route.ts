@@ -3,14 +3,14 @@
 
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
-  fleet: [],
+  fleet: ["find", "sort", "group"],
   car: [],
   history: ["stream"],
   cloudwatch: [],
 } as const;
 
 type View = keyof typeof PARAMETERS;
-export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string>>>;
+export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string | undefined>>>;
 
 interface Address<V extends View> {
   readonly view: V;

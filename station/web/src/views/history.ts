@@ -213,6 +213,8 @@ export class HistoryView {
     }
     this.pictures.replaceChildren(...[...this.kept.values()].map(({ picture }) => picture.node));
     const claims = new Set(ofBytes.flatMap(partsOf));
+    // The car's speed, where the motor's is not shown as it already.
+    if (this.spec("speed").unit === "m/s" && all.has("speed")) claims.add("speed_mps");
     return [...all.keys()].filter((field) => !claims.has(field));
   }
 

@@ -14,7 +14,7 @@ from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS, Command,
 from iort_contract.topics import ACCEPTED, CMD, build_topic
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
 from iort_station.fleet.shadow import Shadow, outcome
 
 commands = typer.Typer()
@@ -82,7 +82,7 @@ def _message(text: str) -> dict[str, Any]:
     try:
         message = json.loads(text)
     except ValueError as error:
-        raise StationError(f"MESSAGE must be JSON, got {text}: {error}") from error
+        raise UsageError(f"MESSAGE must be JSON, got {text}: {error}") from error
     if not isinstance(message, dict):
-        raise StationError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
+        raise UsageError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
     return message

@@ -15,8 +15,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson
-from iort_station.data.inventory import check_registered
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener
@@ -37,7 +37,7 @@ def trace_(
 ) -> None:
     """Measure the delay of a robot's live updates, hop by hop, from the sample in the car to this machine."""
     cloud = context.obj.cloud()
-    check_registered(cloud, robot)
+    registry.get(cloud, robot)
     found: list[trace.Times] = []
     enough = threading.Event()
 
