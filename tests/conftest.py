@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from tests.browser import browser, open_page  # noqa: F401 - fixtures
 # The duration of an example depends only on the machine.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("iort")
-# `make test-fast`; CI generates the usual number.
+# `make test-fast`; CI generates the usual number. tests/examples.py scales a test's own number with it.
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
@@ -69,6 +70,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return group(nodeid)
 
     return Groups(config, log)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def services_read_once() -> Iterator[None]:
+    """botocore reads megabytes of JSON about its services for each new session; in tests all share it."""
+    if not find_spec("botocore"):
+        yield
+        return
+    import botocore.session
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(botocore.session, "create_loader", cache(botocore.session.create_loader))
+        yield
 
 
 def skips_fail() -> bool:

@@ -10,13 +10,14 @@ import tracemalloc
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.limits import MAX_FIELDS, MessageError
 from iort_contract.ros1 import decode
 from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder, stamp_ns
 from iort_contract.ros1.definition import VARIABLE, parse
+from tests.examples import examples
 from tests.flatten import flatten
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
@@ -323,7 +324,7 @@ def messages(draw: st.DrawFn) -> tuple[str, list[Any], list[Any]]:
     return definition, content(a), [array, [content(b) for _ in range(count)]]
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(messages())
 def test_any_message_decodes_to_the_values_that_rosbags_serialized(
     case: tuple[str, list[Any], list[Any]],
