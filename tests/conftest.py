@@ -23,22 +23,22 @@ settings.load_profile("iort")
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
-# starts its own cloud, the synthesized app, the browser. The longest groups start first, because their
-# folders are collected first. A node id's beginning decides, and the first that fits.
+# starts its own cloud, the synthesized app, the browser. They start first, in this order: a long group that
+# starts last runs alone. A node id's beginning decides, and the first that fits.
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
     "tests/local/data/": "cloud of the data",
+    "tests/ros/test_two_robots.py": "cloud of the data",
     "tests/local/faults/": "cloud of the faults",
-    "tests/local/gaps/": "cloud of the robots",
-    "tests/local/pubnub/": "PubNub",
-    "tests/local/robots/": "cloud of the robots",
     "tests/ros/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
-    "tests/ros/test_two_robots.py": "cloud of the data",
+    "tests/local/gaps/": "cloud of the robots",
+    "tests/local/robots/": "cloud of the robots",
+    "tests/web/": "page",
     "tests/stacks/": "app",
     "tests/unit/functions/test_admit.py": "app",
-    "tests/web/": "page",
+    "tests/local/pubnub/": "PubNub",
 }
 
 
@@ -50,6 +50,12 @@ def group(nodeid: str) -> str:
         if nodeid.startswith(path):
             return name
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests of the groups first."""
+    order = {name: i for i, name in enumerate(dict.fromkeys(GROUPS.values()))}
+    items.sort(key=lambda item: order.get(group(item.nodeid), len(order)))
 
 
 def pytest_configure() -> None:

@@ -187,23 +187,23 @@ def test_nested_types_give_a_bounded_view(length: str, leaf: str) -> None:
         raise AssertionError("1000 bytes are no such message")
 
 
-@pytest.mark.parametrize(("n", "fields"), [(60, 512), (0, 0)], ids=["full", "empty"])
+@pytest.mark.parametrize(("n", "fields"), [(40, 512), (0, 0)], ids=["full", "empty"])
 def test_nested_arrays_give_a_bounded_view(n: int, fields: int) -> None:
-    """A message of megabytes may hold millions of values, or a quarter of a million empty arrays."""
+    """A message of megabytes may hold millions of values, or tens of thousands of empty arrays."""
     kinds = ["T0", "T1", "T2"]
     definition = "T0[] a\n"
     for kind, inner in zip(kinds, [*kinds[1:], "int8"]):
         definition += f"{LINE}MSG: a_msgs/{kind}\n{inner}[] a\n"
     data = u32(n) + bytes(n)
     for _ in kinds:
-        data = u32(60) + data * 60
+        data = u32(40) + data * 40
     decoder = Decoder(parse("a_msgs/A", definition))
     named_before = decode._element_names.cache_info().misses
     tracemalloc.start()
     try:
         assert len(decoder.decode(data)) == fields
         assert decode._element_names.cache_info().misses - named_before <= MAX_FIELDS + 1
-        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
         tracemalloc.stop()
 
