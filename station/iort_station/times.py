@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timedelta, timezone
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+from iort_contract.messages.page import Extent
 from iort_station.errors import UsageError
 
 Time: TypeAlias = int | str | datetime
@@ -74,6 +75,17 @@ def iso(t_us: int) -> str:
 def iso_s(t_us: int) -> str:
     """The time as ISO 8601 in UTC, cut to the second."""
     return _iso(t_us, "seconds")
+
+
+def between(extent: Extent) -> dict[str, Any]:
+    """An extent for JSON: its times as ISO 8601 and in milliseconds."""
+    start_us, end_us = extent["from_us"], extent["to_us"]
+    return {
+        "from": iso(start_us),
+        "from_ms": start_us // 1000,
+        "to": iso(end_us),
+        "to_ms": -(-end_us // 1000),
+    }
 
 
 def _iso(t_us: int, to: str) -> str:

@@ -37,6 +37,12 @@ class RobotsAnswer(TypedDict):
     robots: dict[str, RobotPresence]
 
 
+class TagsAnswer(TypedDict):
+    """Answers ``tags``: each robot's tags, which are the attributes of its thing."""
+
+    tags: dict[str, dict[str, str]]
+
+
 class VehiclesAnswer(TypedDict):
     """Answers ``vehicles``: as in `Config`."""
 
@@ -223,6 +229,7 @@ class Logs(TypedDict):
 
 Answer = Union[
     RobotsAnswer,
+    TagsAnswer,
     VehiclesAnswer,
     StreamsAnswer,
     HistoryAnswer,

@@ -22,7 +22,7 @@ from iort_station.data.blocks import Column, values
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
-from iort_station.fleet import registry
+from iort_station.fleet import registry, tags
 from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
 
 # No chart is wider, in points.
@@ -38,6 +38,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer, by its name."""
     return {
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
+        "tags": lambda _asked: {"tags": tags.listed(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
         "runs": lambda asked: _runs(cloud, asked),

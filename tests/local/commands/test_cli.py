@@ -31,6 +31,9 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     shown = iort("robots", "list").stdout
     assert f"{'cli-car':<8}" in shown
     assert "speed_to_erpm_gain 3000" in shown
+    assert iort("robots", "tag", "cli-car", "lab=north", "team=blue").exit_code == 0
+    assert iort("robots", "tag", "cli-car", "--remove", "team").output == "lab=north\nvehicle=vesc\n"
+    assert "a tag's value must be" in str(iort("robots", "tag", "cli-car", "lab=two words").exception)
     assert iort("robots", "remove", "cli-car", "--yes").exit_code == 0
     assert "cli-car" not in iort("robots", "list").output
 
@@ -40,7 +43,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "robot nobody is not registered; registered are: "),
+        (("files", "list", "nobody"), "robot nobody is not registered; the nearest: "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
         (("files", "get", "nobody"), "robot nobody is not registered"),
         (("trace", "nobody"), "robot nobody is not registered"),

@@ -12,6 +12,8 @@ VERBS = {
     "page.dashboard": "Serve the live page until Ctrl-C.",
     "operations.cost": "Print the cost of a fleet, at list prices.",
     "operations.audit": "Prove that every sample of a robot arrived.",
+    "data.streams": "List a robot's streams: fields, runs, times.",
+    "data.runs": "List the runs of a robot's agent.",
     "data.query": "Print recorded samples.",
     "data.export": "Write a recording: MCAP or a ROS 1 bag.",
     "data.plot": "Draw recorded samples.",

@@ -10,6 +10,20 @@ export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+export const CAR_ALARMS = {
+  "FaultSamples": {
+    "meaning": "a car reports a fault",
+    "advice": "stop it and look; `iort query` with a condition on `fault_code` finds the car"
+  },
+  "TemperatureDegC": {
+    "meaning": "a car's controller is hot",
+    "advice": "let it cool; a VESC throttles by itself from 85 degC"
+  },
+  "BatteryVolts": {
+    "meaning": "a car's battery is low",
+    "advice": "change it: a lithium cell below 3 V is damaged"
+  }
+} as const;
 /** speed of the car, m/s */
 export const speed_mps = (speed: number, speed_to_erpm_gain: number, speed_to_erpm_offset: number): number => (speed - speed_to_erpm_offset) / speed_to_erpm_gain;
 /** electrical power from the battery, negative while regenerating, W */
@@ -279,6 +293,11 @@ export interface RobotPresence {
 /** Answers ``robots``. */
 export interface RobotsAnswer {
   readonly robots: Readonly<Record<string, RobotPresence>>;
+}
+
+/** Answers ``tags``: each robot's tags, which are the attributes of its thing. */
+export interface TagsAnswer {
+  readonly tags: Readonly<Record<string, Readonly<Record<string, string>>>>;
 }
 
 /** Answers ``vehicles``: as in `Config`. */

@@ -34,7 +34,8 @@ def export(
     fields. For CSV and Parquet, use iort query.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data.selection import select  # noqa: PLC0415 - see above
+    from iort_station.data.inventory import check_there  # noqa: PLC0415 - see above
+    from iort_station.data.selection import select  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
     from iort_station.recordings.export import write  # noqa: PLC0415 - as above
 
@@ -51,4 +52,6 @@ def export(
             with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
                 written += write(cloud, selection, file, say=say, progress=progress)
         if not written:
+            for stream in streams:
+                check_there(cloud, robot, stream)
             raise StationError(f"there are no samples to export; {out} is not written")

@@ -17,9 +17,8 @@ from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
-from iort_station.data.inventory import check_registered
-from iort_station.errors import StationError
-from iort_station.fleet import files
+from iort_station.errors import StationError, unknown
+from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
 from iort_station.times import iso_s
 
@@ -107,13 +106,12 @@ def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[Stored
         if fnmatch.fnmatch(one.name, name):
             yield one
     if one is None and next(files.listed(cloud, robot), None) is None:
-        check_registered(cloud, robot)
+        registry.get(cloud, robot)
 
 
 def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:
     for one in reversed(found):
         if which in (one.name, one.key):
             return one
-    raise StationError(
-        f"{robot} has no file {which} in this range; `iort files list {robot}` shows its files"
-    )
+    problem = f"{robot} has no file {which} in this range"
+    raise unknown(problem, [which], (one.name for one in found), f"iort files list {robot}")

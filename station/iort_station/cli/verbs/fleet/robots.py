@@ -30,7 +30,7 @@ from iort_station.cli import completion
 from iort_station.cli.console import Console, errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
 from iort_station.cli.progress import reading
-from iort_station.cli.verbs.fleet import provisioning
+from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
@@ -38,6 +38,7 @@ from iort_station.times import iso_s, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
 commands.add_typer(provisioning.commands)
+commands.add_typer(tags.commands)
 # A pipe has no width at which a line must end.
 _PIPE_WIDTH = 10_000
 

@@ -77,6 +77,8 @@ def audit_(
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
+    if not found:
+        inventory.check_recorded(cloud, robot)
     if as_json:
         print_json({"streams": [_as_json(one) for one in found], "not_recorded": causes})
     elif not found:

@@ -16,8 +16,8 @@ from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
-from iort_station.data.inventory import check_registered
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener
@@ -40,7 +40,7 @@ def trace_(
 ) -> None:
     """Measure the delay of a robot's live updates, hop by hop, from the sample in the car to this machine."""
     cloud = context.obj.cloud()
-    check_registered(cloud, robot)
+    registry.get(cloud, robot)
     found: list[trace.Times] = []
     enough = threading.Event()
 
