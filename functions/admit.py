@@ -3,7 +3,7 @@ thing; it must answer within 5 s, cold start included.
 
 The operator opens a name for one certificate and a limited time (`iort robots claim`, `register`). Every
 other request is refused, and so is every request during a failure here. A certificate that was admitted but
-never registered gives way to another (docs/decisions/0039).
+never registered gives way to another (decision 39).
 """
 
 from __future__ import annotations

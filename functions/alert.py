@@ -19,7 +19,7 @@ from functions.shared.environment import variables
 from functions.shared.metrics import emit
 from iort_contract.catalog.environments import AlertEnvironment
 from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
-from iort_contract.tables import ALERT_PREFIX, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.tables import ALERT_FAULT, ALERT_LOW_VOLTAGE, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import parse_topic
 
 if TYPE_CHECKING:
@@ -46,11 +46,10 @@ def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
         # All unknown codes are one cause: a car with invented codes may neither send a mail for each nor fill
         # its row of the registry.
         meaning = FAULTS[int(code)] if code in FAULTS else None
-        key = f"{ALERT_PREFIX}fault_{'unknown' if meaning is None else int(code)}"
+        key = f"{ALERT_FAULT}{'unknown' if meaning is None else int(code)}"
         found.append(Cause(key, f"fault {code:g}, {meaning or 'a code that the contract does not know'}"))
     if _is_number(volts) and 0 < volts < low_voltage_v:
-        key = f"{ALERT_PREFIX}low_voltage"
-        found.append(Cause(key, f"battery at {volts:.1f} V, below {low_voltage_v:g} V"))
+        found.append(Cause(ALERT_LOW_VOLTAGE, f"battery at {volts:.1f} V, below {low_voltage_v:g} V"))
     return found
 
 

@@ -26,7 +26,9 @@ def kept(folder: Path, key: str, sources: Iterable[Path], make: Callable[[Path],
         digest.update(f"{source}\0".encode() + source.read_bytes())
     found = folder / digest.hexdigest()[:16]
     if found.is_dir():
-        found.touch()
+        # A read-only checkout keeps what it has.
+        with suppress(OSError):
+            found.touch()
         return found
     folder.mkdir(parents=True, exist_ok=True)
     making = found.with_suffix(f".{os.getpid()}")

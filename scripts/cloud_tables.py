@@ -1,4 +1,4 @@
-"""The tables of docs/cloud.md and docs/processing.md: settings, rules, metrics and alarms."""
+"""Tables of docs/: settings, rules, metrics and alarms."""
 
 from __future__ import annotations
 
@@ -11,14 +11,6 @@ from iort_contract.catalog.rules import RULES, Call, Store
 from stacks.settings import CONTEXT_KEYS, ROOT, Settings
 
 Row = tuple[str, ...]
-# The resource's name stands before these.
-_OF_RESOURCES = {
-    "...Waiting": alarms.WAITING,
-    "PutOffWaiting": alarms.PUT_OFF_WAITING,
-    "...Errors": alarms.ERRORS,
-    "...Throttled": alarms.THROTTLED,
-    "...Behind": alarms.BEHIND,
-}
 
 
 def settings_rows() -> Iterator[Row]:
@@ -55,7 +47,9 @@ def alarm_rows() -> Iterator[Row]:
     """A row for each alarm: what happened, when, and what to do."""
     ours = {metric.name: metric.alarm for metric in METRICS.values() if metric.alarm}
     account = {name: alarm for (_, name), alarm in alarms.OF_THE_ACCOUNT.items()}
-    for name, alarm in {**ours, **_OF_RESOURCES, **account}.items():
+    # The resource's name stands before these.
+    resources = {f"...{ending}": alarm for ending, alarm in alarms.OF_RESOURCES.items()}
+    for name, alarm in {**ours, **resources, **alarms.OF_ONE_RESOURCE, **account}.items():
         yield f"`{name}`", alarm.meaning, _condition(alarm), alarm.action
 
 

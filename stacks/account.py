@@ -41,7 +41,7 @@ _AUDIT_READS = (
     "ListCertificates",
     "ListPolicies",
 )
-# AWS IoT creates this log group and never expires it; docs/cloud.md, "AWS IoT's own log", sets the retention.
+# AWS IoT creates this log group and never expires it; docs/how-to/alarms.md says how to set the retention.
 _LOG_GROUP = "AWSIotLogsV2"
 
 

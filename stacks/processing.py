@@ -115,7 +115,7 @@ class Processing(PlatformStack):
                 batch_size=500,
                 max_batching_window=Duration.seconds(2),
                 # With more, two batches of a robot could be summarised at once, and the one that read the
-                # table first could write last: docs/processing.md.
+                # table first could write last: docs/explanation/processing.md.
                 parallelization_factor=1,
                 bisect_batch_on_error=True,
                 report_batch_item_failures=True,

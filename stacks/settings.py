@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_contract.topics import check_namespace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -99,7 +100,7 @@ Positive = Annotated[float, BeforeValidator(_above_zero)]
 class Settings(BaseModel):
     """Settings that may differ between two deployments of the same stacks; each is a context key.
 
-    docs/cloud.md has a table of the descriptions.
+    docs/reference/deployment.md has a table of the descriptions.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -118,7 +119,7 @@ class Settings(BaseModel):
         default={}, description="`team=lab,cost-centre=7`: on every resource, beside `project` and `stage`"
     )
     retention_days: Annotated[int, _whole(1, 3650)] = Field(
-        default=90, description="lifetime of telemetry and summaries"
+        default=DEFAULT_RETENTION_DAYS, description="lifetime of telemetry and summaries"
     )
     files_days: Annotated[int, _whole(0, 3650)] = Field(
         default=0, description="lifetime of uploaded files; 0: for good"
@@ -129,13 +130,13 @@ class Settings(BaseModel):
     live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
-        "in `prod`, nothing in `dev` ([why](#lambdas-limit-in-a-new-account))",
+        "in `prod`, nothing in `dev` ([why](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
     )
     customer_key: Flag = Field(
         default=False,
         description="one key of the account's own, rotated every year, for tables, queues, files, topic and "
-        "logs ([decision 11](decisions/0011-one-key-through-services.md)): $1 a month and $0.03 per 10,000 "
-        "requests. It goes in two steps: [below](#a-key-of-ones-own)",
+        "logs ([decision 11](../decisions/security/0011-one-key-through-services.md)): $1 a month and $0.03 "
+        "per 10,000 requests. It goes in two steps: [how](../how-to/deploy.md#a-key-of-ones-own)",
     )
     keep_customer_key: Flag = Field(
         default=False, description="keeps that key without using it, for data that it has encrypted"
@@ -143,7 +144,7 @@ class Settings(BaseModel):
     old_telemetry: Flag = Field(
         default=False,
         description="keeps the telemetry table of a deployment from before batches had ids, in every stage, "
-        "beside the new one: [upgrading](upgrading.md)",
+        "beside the new one: [upgrading](../how-to/upgrading.md)",
     )
     alarm_email: Annotated[str | None, BeforeValidator(_email)] = Field(
         default=None,
@@ -177,9 +178,10 @@ class Settings(BaseModel):
         AfterValidator(lambda level: level.replace("off", "")),
     ] = Field(
         default="",
-        description="AWS IoT's own log: `error`, `warn`, `info` or `debug` ([below](#aws-iots-own-log))",
+        description="AWS IoT's own log: `error`, `warn`, `info` or `debug` "
+        "([how](../how-to/alarms.md#aws-iots-own-log))",
     )
-    site: Flag = Field(default=False, description="the page on the web: [page.md](page.md)")
+    site: Flag = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
     embedded: Flag = Field(
         default=False, description="for the embedded cloud, with the caller's own credentials"
     )

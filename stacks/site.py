@@ -2,7 +2,7 @@
 
 The template creates only the resources; the operator's `iort site` uploads the content. PubNub's subscribe
 key is in Parameter Store, which no template can read, and no function with rights to the bucket is deployed
-(docs/decisions/0012).
+(decision 12).
 """
 
 from __future__ import annotations

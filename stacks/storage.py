@@ -32,7 +32,7 @@ class Storage(PlatformStack):
     def __init__(self, app: App, settings: Settings) -> None:
         super().__init__(app, "storage", settings)
         self.encryption = Encryption.of(self, settings)
-        # Not the old table's name, which had the time alone as its key: see docs/upgrading.md.
+        # Not the old table's name, which had the time alone as its key: see docs/how-to/upgrading.md.
         self.telemetry = self._table(
             "Batches",
             output="TelemetryTable",

@@ -1,4 +1,4 @@
-"""Reads docs/messages.md: its examples by name, and its tables."""
+"""Reads docs/reference/messages.md: its examples by name, and its tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from scripts.docs_parts import ROOT
 
-PAGE = (ROOT / "docs" / "messages.md").read_text()
+PAGE = (ROOT / "docs/reference/messages.md").read_text()
 _EXAMPLE = re.compile(r"<!-- example: (\w+) -->\n```json\n(.*?)```\n(.*?)(?=<!-- example|\Z)", re.DOTALL)
 _TABLE = re.compile(r"^\|.*\|\n\|[-|:]+\|\n((?:\|.*\|\n)+)", re.MULTILINE)
 

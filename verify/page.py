@@ -1,4 +1,4 @@
-"""Writes the table of the questions into docs/assumptions.md: `python -m verify.page`.
+"""Writes the table of the questions into docs/explanation/assumptions.md: `python -m verify.page`.
 
 The page's second table, of the behaviours that no program asks, is written by hand and stays as it is.
 """
@@ -14,7 +14,7 @@ from verify.question import Question, compared
 from verify.questions import ALL
 from verify.report import Measured
 
-PAGE = ROOT / "docs" / "assumptions.md"
+PAGE = ROOT / "docs" / "explanation" / "assumptions.md"
 BY_HAND = "## Not asked\n"
 _HEAD = ["behaviour", "what we rely on", "basis", "relied on by", "embedded cloud"]
 _INTRODUCTION = """\
@@ -23,8 +23,8 @@ _INTRODUCTION = """\
 Each row is a behaviour of AWS that the code relies on and that the embedded cloud imitates. *Documented*
 names AWS' page. *Assumed* means that AWS does not document it. *Measured* means that `make verify-aws` has
 seen it in an account; tests/local/gaps/test_verify.py then expects the same answer from the embedded cloud.
-How to ask your own account: [cloud.md](cloud.md#ask-your-account). `python -m verify.page` writes the first
-table from verify/questions/; the second is written by hand.
+How to ask your own account: [deploy](../how-to/deploy.md#ask-your-account). `python -m verify.page`
+writes the first table from verify/questions/; the second is written by hand.
 """
 
 

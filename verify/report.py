@@ -1,7 +1,7 @@
 """The report of a run, as JSON and as Markdown, without account numbers and secrets.
 
 `make verify-aws KEEP=1` keeps AWS' answers in the repository: tests compare the embedded cloud with them, and
-docs/assumptions.md names who measured them and when.
+docs/explanation/assumptions.md names who measured them and when.
 """
 
 from __future__ import annotations

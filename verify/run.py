@@ -126,7 +126,8 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
     if options.keep:
         shutil.copyfile(options.out / "report.json", report.KEPT)
         console.print(
-            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.page` writes docs/assumptions.md"
+            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.page` writes "
+            "docs/explanation/assumptions.md"
         )
     verdicts = {answer.verdict for answer in answers}
     return 2 if Verdict.FAILED in verdicts or leftovers else int(Verdict.DIFFERS in verdicts)

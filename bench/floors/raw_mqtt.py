@@ -5,7 +5,7 @@
         took_s = client.round_trip("ping/iort/car/broker", payload)
 
 MQTT 3.1.1 is the OASIS standard of 2014; its chapters 3.1 to 3.13 define the packets. paho-mqtt is slower
-(docs/decisions/0046-the-floor-is-our-own-mqtt-client.md).
+(docs/decisions/developing/0046-the-floor-is-our-own-mqtt-client.md).
 """
 
 from __future__ import annotations

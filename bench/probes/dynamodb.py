@@ -9,7 +9,7 @@ from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture, equal,
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH
-from iort_contract.topics import build_topic
+from iort_contract.topics import RECORD, build_topic
 from iort_station.operations import delivery
 
 WRITERS = 8
@@ -42,7 +42,7 @@ def range_of_time(fixture: ProbeFixture) -> str:
         # A reserved word of DynamoDB.
         ExpressionAttributeNames={"#batch": BATCH},
         ExpressionAttributeValues={
-            ":topic": {"S": build_topic("dt", fixture.a, VESC_STREAM, fixture.namespace)},
+            ":topic": {"S": build_topic(RECORD, fixture.a, VESC_STREAM, fixture.namespace)},
             ":a": {"S": first},
             ":b": {"S": last},
         },

@@ -55,8 +55,8 @@ class Ratio:
 
     With ``at_least`` larger is better and ``target`` is the least. None means no target. The guard accepts a
     figure that is ``tolerance`` times worse than in the kept report; this exceeds the variation of one tree
-    on a machine with other work (docs/bench.md). ``by_machine`` marks a ratio to a constant, which a slower
-    machine makes larger.
+    on a machine with other work (docs/explanation/benchmark.md). ``by_machine`` marks a ratio to a constant,
+    which a slower machine makes larger.
     """
 
     name: str

@@ -7,11 +7,15 @@ TOPIC, BATCH, SECOND = "topic", "batch", "second"
 # A time in a message, microseconds since the epoch.
 T_US = "t"
 RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
+# The lifetime of telemetry and summaries, unless a deployment sets its own.
+DEFAULT_RETENTION_DAYS = 90
 ROBOT = "robot"
 # Registry: the day (UTC) and the bytes of a robot's upload quota.
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
 # Registry: the time of the last mail, one attribute per cause with this prefix.
 ALERT_PREFIX = "alert_"
+# The fault's code follows, or "unknown".
+ALERT_FAULT, ALERT_LOW_VOLTAGE = f"{ALERT_PREFIX}fault_", f"{ALERT_PREFIX}low_voltage"
 STATS = ("min", "mean", "max", "last")
 # A second in the summary: samples, their batches, batches missing before those, gaps between samples, values
 # that were not finite.

@@ -1,4 +1,4 @@
-"""A robot written from docs/messages.md alone: Python's standard library and paho-mqtt 2, no code of iort.
+"""A robot written from the message reference alone, with Python's standard library and paho-mqtt 2.
 
 python docs/examples/python_client.py car7    # the folder that `iort robots add car7` wrote
 """

@@ -1,4 +1,4 @@
-"""From a claim to a certificate, written from docs/messages.md alone; the openssl command makes the key.
+"""From a claim to a certificate, written from the message reference alone; the openssl command makes the key.
 
 python docs/examples/python_provision.py claim car7    # the folder that `iort robots claim car7` wrote
 """

@@ -8,9 +8,8 @@ from aws_cdk import aws_cloudwatch_actions as actions
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from iort_contract.catalog import alarms as catalog
-from iort_contract.catalog.alarms import Alarm
-from iort_contract.catalog.metrics import METRICS
+from iort_contract.catalog.alarms import OF_THE_ACCOUNT
+from iort_contract.catalog.metrics import METRICS, alarm_of
 from stacks.monitoring import metrics
 from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
@@ -28,25 +27,26 @@ class Alarms(Construct):
         self._settings = settings
         self._tell = actions.SnsAction(topic)
         for name, queue in watched.queues.items():
-            waiting = catalog.PUT_OFF_WAITING if name == "PutOff" else catalog.WAITING
-            self._add(f"{name}Waiting", waiting, metrics.waiting(queue))
+            self._add(f"{name}Waiting", metrics.waiting(queue))
         for name, function in watched.functions.items():
-            failed = metrics.function("Errors", function).with_(period=_FIVE_MINUTES)
-            self._add(f"{name}Errors", catalog.ERRORS, failed)
+            self._add(f"{name}Errors", metrics.function("Errors", function).with_(period=_FIVE_MINUTES))
         for name, table in watched.tables.items():
             throttled = metrics.table("WriteThrottleEvents", table).with_(period=_FIVE_MINUTES)
-            self._add(f"{name}Throttled", catalog.THROTTLED, throttled)
+            self._add(f"{name}Throttled", throttled)
         for name, reader in watched.readers.items():
-            self._add(f"{name}Behind", catalog.BEHIND, metrics.function("IteratorAge", reader))
+            self._add(f"{name}Behind", metrics.function("IteratorAge", reader))
         for metric in METRICS.values():
             if metric.alarm:
-                self._add(metric.name, metric.alarm, metrics.ours(metric, settings.namespace))
+                self._add(metric.name, metrics.ours(metric, settings.namespace))
         # The embedded cloud has no Metrics Insights.
         if not settings.embedded:
-            for (namespace, name), alarm in catalog.OF_THE_ACCOUNT.items():
-                self._add(name, alarm, metrics.of_the_account(namespace, name))
+            for namespace, name in OF_THE_ACCOUNT:
+                self._add(name, metrics.of_the_account(namespace, name))
 
-    def _add(self, name: str, alarm: Alarm, metric: cloudwatch.IMetric) -> None:
+    def _add(self, name: str, metric: cloudwatch.IMetric) -> None:
+        alarm = alarm_of(name)
+        if alarm is None:
+            raise ValueError(f"the catalogue has no alarm for {name}")
         limit = alarm.threshold
         if isinstance(limit, str):
             limit = getattr(self._settings, limit)
@@ -55,7 +55,7 @@ class Alarms(Construct):
             self,
             name,
             alarm_name=f"{self._settings.namespace}-{name}",
-            alarm_description=f"{alarm.meaning}. What to do: docs/cloud.md",
+            alarm_description=f"{alarm.meaning}. What to do: {alarm.advice}",
             metric=metric,
             threshold=limit * alarm.factor,
             comparison_operator=operator.LESS_THAN_THRESHOLD

@@ -1,7 +1,7 @@
 """The two dashboards: the platform, a row per service in the order of a message's path, and the robots.
 
 A dashboard of up to fifty metrics is free, three per account. A metric with an alarm that is normally zero is
-therefore not drawn again, and no widget uses SEARCH (docs/decisions/0034-dashboards-of-fifty-metrics.md).
+therefore not drawn again, and no widget uses SEARCH (decision 34).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from aws_cdk import aws_sqs as sqs
 
 from stacks.settings import Settings
 
-# A principal that may use the service's resource may use the key through these: docs/decisions/0011.
+# A principal that may use the service's resource may use the key through these: decision 11.
 SERVICES = ("dynamodb", "s3", "sns", "sqs")
 
 

@@ -53,12 +53,19 @@ def test_the_cost_model_counts_every_alarm(synthesized, alarms):
 
 
 def test_every_alarm_notifies_the_topic_and_is_documented(alarms, reader):
-    text = (ROOT / "docs" / "cloud.md").read_text()
+    text = (ROOT / "docs/how-to/alarms.md").read_text()
     for alarm, properties in alarms.items():
         assert reader.texts(properties["AlarmActions"]) == ["Alarms"]
         assert properties["TreatMissingData"] == "notBreaching"
+        # It is shown in AWS' console and in its mail, where docs/ is not.
+        description = properties["AlarmDescription"]
+        assert re.fullmatch(r"\w.*\. What to do: .*", description)
+        assert "](" not in description
+        assert len(description) <= 1024
         generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind)$", r"\1", alarm)
-        assert f"`{generic}`" in text or f"`...{generic}`" in text, f"docs/cloud.md says nothing of {alarm}"
+        assert f"`{generic}`" in text or f"`...{generic}`" in text, (
+            f"docs/how-to/alarms.md says nothing of {alarm}"
+        )
 
 
 def test_the_thresholds_come_from_the_settings(production, synthesized):

@@ -1,4 +1,4 @@
-"""docs/messages.md names the contract's topics and the permissions of the policies."""
+"""docs/reference/messages.md names the contract's topics and the permissions of the policies."""
 
 from __future__ import annotations
 

@@ -192,7 +192,7 @@ def test_the_stream_never_blocks_for_good(synthesized, reader):
     assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
     assert mapping["BisectBatchOnFunctionError"] is True
     assert mapping["MaximumRetryAttempts"] == 5
-    # More, and two batches of one robot could be summarised at once: docs/processing.md.
+    # More, and two batches of one robot could be summarised at once: docs/explanation/processing.md.
     assert mapping["ParallelizationFactor"] == 1
     # The cost model uses this value.
     assert (mapping["MaximumBatchingWindowInSeconds"], mapping["BatchSize"]) == (WINDOW_S, RECORDS_A_CALL)

@@ -8,6 +8,7 @@ import json
 import socket
 import threading
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,7 +17,7 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, config
-from iort_station.page.server import PageServer
+from iort_station.page.server import MOST_ANSWERS, PageServer
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -39,15 +40,19 @@ def built(tmp_path: Path) -> Path:
 
 
 def ask(
-    page: PageServer, path: str, method: str = "GET", headers: dict[str, str] | None = None
+    page: PageServer,
+    path: str,
+    method: str = "GET",
+    headers: dict[str, str] | None = None,
+    body: str | None = None,
 ) -> tuple[http.client.HTTPResponse, bytes]:
     address = urlsplit(page.url)
     connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
-    connection.request(method, path, headers=headers or {})
+    connection.request(method, path, body and body.encode(errors="surrogatepass"), headers or {})
     answer = connection.getresponse()
-    body = answer.read()
+    content = answer.read()
     connection.close()
-    return answer, body
+    return answer, content
 
 
 @pytest.mark.parametrize(
@@ -131,9 +136,98 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> No
         done.set()
 
 
+def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> None:
+    working, done = threading.Semaphore(0), threading.Event()
+
+    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
+        working.release()
+        done.wait()
+        return {}
+
+    def threads() -> int:
+        return sum(thread.name == "page answer" for thread in threading.enumerate())
+
+    answers = {"slow": slow}
+    with PageServer(**TOLD, built=built, answers=answers) as page, ExitStack() as viewers:
+        try:
+            for _ in range(2):
+                for _ in range(MOST_ANSWERS):
+                    viewer = socket.create_connection((page.host, page.port))
+                    viewers.enter_context(viewer).sendall(
+                        b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n"
+                    )
+                for _ in range(MOST_ANSWERS - threads()):
+                    assert working.acquire(timeout=60)
+                assert ask(page, "/page.js")[0].status == 200
+                assert threads() == MOST_ANSWERS
+                viewers.close()
+        finally:
+            done.set()
+        assert ask(page, "/slow.json")[0].status == 200
+
+
+def test_a_malformed_request_is_answered_without_a_traceback(
+    built: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        with socket.create_connection((page.host, page.port)) as sender:
+            sender.sendall(b"GET / HTTP/1.1\r\nBad Header\r\n\r\n")
+            assert sender.recv(100).startswith(b"HTTP/1.0 400 ")
+        assert not caplog.records
+        # A fault of our own is still logged.
+        monkeypatch.setattr(page, "_accepts", None)
+        assert ask(page, "/")[0].status == 500
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+
+
+@pytest.mark.parametrize(
+    ("accepted", "packed"),
+    [
+        ("gzip", True),
+        ("br;q=1.0, GZIP; q=0.001", True),
+        ("*", True),
+        ("gzip;q=0", False),
+        ("gzip; q=0.000, *", False),
+        ("identity, *;q=0", False),
+        ("xgzip", False),
+    ],
+)
+def test_gzip_is_sent_only_if_it_is_accepted(built: Path, accepted: str, *, packed: bool) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        answer, _ = ask(page, "/page.js", headers={"Accept-Encoding": accepted})
+    assert (answer.headers["Content-Encoding"] == "gzip") is packed
+
+
 def test_other_methods_are_rejected(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         assert ask(page, "/", "POST")[0].status == 405
+
+
+def test_an_action_needs_a_post_of_json(built: Path) -> None:
+    """A page elsewhere can send neither this method by a link, nor this type by a form."""
+    done: list[Mapping[str, str]] = []
+
+    def act(asked: Mapping[str, str]) -> dict[str, Any]:
+        done.append(asked)
+        if not asked:
+            raise StationError("nothing was asked")
+        return {"done": True}
+
+    def post(page: PageServer, body: str, kind: str = "application/json", host: str = "localhost") -> Any:
+        headers = {"Content-Type": kind, "Host": host}
+        answer, body_ = ask(page, "/act.json", "POST", headers, body)
+        return answer.status, json.loads(body_)
+
+    with PageServer(**TOLD, actions={"act": act}, built=built) as page:
+        assert ask(page, "/act.json")[0].status == 404
+        assert post(page, '{"a": "b"}', "text/plain")[0] == 415
+        assert post(page, '{"a": "b"}', host="evil.example")[0] == 403
+        for wrong in ("", "[]", '{"a": 1}', "\ud800"):
+            assert post(page, wrong)[0] == 400
+        assert not done
+        assert post(page, "{}") == (400, {"error": "nothing was asked"})
+        assert post(page, '{"a": "b"}') == (200, {"done": True})
+    assert done == [{}, {"a": "b"}]
 
 
 def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:

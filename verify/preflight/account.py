@@ -121,7 +121,7 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
             "ask for more ('Service Quotas', AWS Lambda, 'Concurrent executions'), or -c live_concurrency=0",
         )
     if total < UNRESERVED:
-        return warning(text, "ask for more before the fleet grows: docs/cloud.md, Lambda's limit")
+        return warning(text, "ask for more before the fleet grows: docs/how-to/deploy.md, Lambda's limit")
     return fine(text)
 
 

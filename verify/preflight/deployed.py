@@ -181,12 +181,12 @@ def changes(clients: Clients, settings: Settings) -> Found:
         return stops(
             f"customer_key was true and is false now: {_used_by(used['Key'])} the key, whose "
             "export CloudFormation does not remove, and what is encrypted already would have no key",
-            "in two steps: first -c keep_customer_key=true, later without it (docs/cloud.md)",
+            "in two steps: first -c keep_customer_key=true, later without it (docs/how-to/deploy.md)",
         )
     if used[OLD_TELEMETRY] and not settings.old_telemetry:
         return stops(
             f"deployed is the telemetry table of before batches had ids: {_used_by(used[OLD_TELEMETRY])} it",
-            "in two steps: deploy with -c old_telemetry=true, then `iort adopt` (docs/upgrading.md)",
+            "in two steps: deploy with -c old_telemetry=true, then `iort adopt` (docs/how-to/upgrading.md)",
         )
     tags = {tag["Key"]: tag["Value"] for tag in deployed.get("Tags", [])}
     if tags.get("stage") == PROD != settings.stage:

@@ -104,7 +104,7 @@ def document(target: Target) -> Seen:
     "rule_errors.star_beside_a_key",
     expected={"other_keys_stay": True},
     source=f"{_GUIDE}/iot-sql-select.html",
-    relied_on_by=("docs/decisions/0033-no-star-beside-a-key.md",),
+    relied_on_by=("docs/decisions/security/0033-no-mixed-keys.md",),
 )
 def star_beside_a_key(target: Target) -> Seen:
     """SELECT * with a key beside it adds the key to the payload. AWS does not document which one stays if

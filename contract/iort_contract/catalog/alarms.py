@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -10,7 +12,9 @@ class Alarm:
     """It goes off above the threshold, or ``below`` it: for ``periods`` in a row, or of ``within``.
 
     A ``threshold`` that is a text names the setting that holds it, in units of ``factor``. ``meaning`` says
-    what happened, and ``action`` what the operator does.
+    what happened, and ``action`` what the operator does, in Markdown. ``evidence`` says where more is known:
+    in the quarantine, in the functions' logs, or in the past of cars. ``alert`` begins the attributes of the
+    registry that name these cars.
     """
 
     meaning: str
@@ -20,6 +24,13 @@ class Alarm:
     within: int = 0
     below: bool = False
     factor: float = 1
+    evidence: Literal["quarantine", "logs", "cars"] = "logs"
+    alert: str = ""
+
+    @property
+    def advice(self) -> str:
+        """The action without links, which lead nowhere outside of docs/."""
+        return re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", self.action)
 
 
 # One for each queue, function, table and stream reader: the resource's name stands before the alarm's.
@@ -27,13 +38,14 @@ WAITING = Alarm(
     "messages are in quarantine",
     "they wait for a minute in a burst, or for good because the quarantine's function fails (`Last` after "
     "five attempts): look at that function's log group. They are kept for 14 days",
+    evidence="quarantine",
 )
 # A car that empties its queue after an outage exceeds its share for some minutes.
 PUT_OFF_WAITING = Alarm(
     "a robot is over its share of Lambda 2, and its summaries are late",
-    "nothing is lost, and no other robot waits ([a robot's share](processing.md#a-robots-share)). Lambda 2's "
-    "log names the robot, `iort robots show` says how many batches wait; mend what it sends, or "
-    "`iort robots remove`",
+    "nothing is lost, and no other robot waits "
+    "(see [a robot's share](../explanation/processing.md#a-robots-share)). Lambda 2's log names the robot, "
+    "`iort robots show` says how many batches wait; mend what it sends, or `iort robots remove`",
     periods=15,
 )
 ERRORS = Alarm(
@@ -52,6 +64,10 @@ BEHIND = Alarm(
     factor=1000,
     periods=3,
 )
+# By the ends of their names.
+OF_RESOURCES = {"Waiting": WAITING, "Errors": ERRORS, "Throttled": THROTTLED, "Behind": BEHIND}
+# By their names.
+OF_ONE_RESOURCE = {"PutOffWaiting": PUT_OFF_WAITING}
 # Messages that can be lost without being in quarantine, by AWS' namespace and metric. Account-wide, since AWS
 # documents no values for some of the dimensions.
 OF_THE_ACCOUNT = {

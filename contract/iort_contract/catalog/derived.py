@@ -35,12 +35,14 @@ DERIVED = {
             lambda speed, speed_to_erpm_gain, speed_to_erpm_offset: (
                 (speed - speed_to_erpm_offset) / speed_to_erpm_gain
             ),
+            label="Speed",
         ),
         Derived(
             "power_w",
             "W",
             "electrical power from the battery, negative while regenerating",
             lambda voltage_input, current_input: voltage_input * current_input,
+            label="Battery power",
         ),
     )
 }

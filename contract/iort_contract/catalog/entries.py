@@ -11,7 +11,8 @@ class Field:
     """A field of a stream.
 
     ``group`` joins fields of one kind. ``ros`` names the ROS drivers that report it (VESC only).
-    ``ros2_unit`` is the ROS 2 driver's unit if it differs.
+    ``ros2_unit`` is the ROS 2 driver's unit if it differs. ``label`` is what the page calls the field; empty
+    if its name says it.
     """
 
     name: str
@@ -20,6 +21,7 @@ class Field:
     group: str = ""
     ros: tuple[int, ...] = ()
     ros2_unit: str | None = None
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -27,13 +29,14 @@ class Derived:
     """A field that is calculated from others, in the summary, in queries and in notebooks.
 
     ``formula`` takes fields and vehicle parameters by their names. It uses + - * / alone, so the same code
-    calculates with numbers and with numpy's arrays.
+    calculates with numbers and with numpy's arrays. ``label`` is as in `Field`.
     """
 
     name: str
     unit: str
     meaning: str
     formula: Callable[..., Any]
+    label: str = ""
 
     @property
     def arguments(self) -> tuple[str, ...]:

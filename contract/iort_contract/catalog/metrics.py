@@ -1,6 +1,6 @@
 """The metrics that the functions write, each with its unit, chart and alarm.
 
-Log lines, dashboards, alarms and the tables of docs/cloud.md are made from these entries, in this order.
+Log lines, dashboards, alarms and the tables of docs/ are made from these entries, in this order.
 """
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from iort_contract.catalog.alarms import Alarm
+from iort_contract.catalog.alarms import OF_ONE_RESOURCE, OF_RESOURCES, OF_THE_ACCOUNT, Alarm
+from iort_contract.tables import ALERT_FAULT, ALERT_LOW_VOLTAGE
 
 METRIC_NAMESPACE = "iort"
 # The dimensions of every metric: the deployment's namespace and the function.
@@ -78,6 +79,7 @@ METRICS = {
             alarm=Alarm(
                 "messages that could not be processed are in quarantine",
                 "`iort errors` lists them with their reasons; remove the cause, then `iort replay-errors`",
+                evidence="quarantine",
             ),
         ),
         Metric("LivePublished", "live", LIVE_CHART),
@@ -111,6 +113,7 @@ METRICS = {
                 threshold="car_to_lambda_ms",
                 periods=3,
                 within=5,
+                evidence="cars",
             ),
         ),
         Metric("SampleGaps", "health", GAPS_CHART),
@@ -120,7 +123,9 @@ METRICS = {
             GAPS_CHART,
             alarm=Alarm(
                 "batches of a car are missing",
-                "[`iort audit`](audit.md) says which; a late one fills the hole, a dropped one does not",
+                "[`iort audit`](../reference/audit.md) says which; a late one fills the hole, a "
+                "dropped one does not",
+                evidence="cars",
             ),
         ),
         Metric(
@@ -130,6 +135,7 @@ METRICS = {
             alarm=Alarm(
                 "batches cannot be decoded",
                 "an agent of another version, or not ours: they are in quarantine with their bytes",
+                evidence="quarantine",
             ),
         ),
         Metric("BatchesPutOff", "summarize", GAPS_CHART),
@@ -146,6 +152,8 @@ METRICS = {
             alarm=Alarm(
                 "a car reports a fault",
                 "stop it and look; `iort query` with a condition on `fault_code` finds the car",
+                evidence="cars",
+                alert=ALERT_FAULT,
             ),
         ),
         Metric(
@@ -159,6 +167,7 @@ METRICS = {
                 "a car's controller is hot",
                 "let it cool; a VESC throttles by itself from 85 degC",
                 threshold="high_temperature_degc",
+                evidence="cars",
             ),
         ),
         Metric(
@@ -173,6 +182,8 @@ METRICS = {
                 "change it: a lithium cell below 3 V is damaged",
                 threshold="low_voltage_v",
                 below=True,
+                evidence="cars",
+                alert=ALERT_LOW_VOLTAGE,
             ),
         ),
         Metric("BacklogBatches", "health", BACKLOG_CHART, statistic="Maximum", of_a_robot=True),
@@ -198,3 +209,13 @@ METRICS = {
 def metrics_of(function: str) -> tuple[str, ...]:
     """The names of a function's metrics."""
     return tuple(metric.name for metric in METRICS.values() if metric.function == function)
+
+
+def alarm_of(name: str) -> Alarm | None:
+    """The entry of an alarm, by the alarm's name without the deployment's; None if it is not ours."""
+    metric = METRICS.get(name)
+    if metric is not None:
+        return metric.alarm
+    named = {**OF_ONE_RESOURCE, **{metric: alarm for (_, metric), alarm in OF_THE_ACCOUNT.items()}}
+    endings = (alarm for ending, alarm in OF_RESOURCES.items() if name.endswith(ending))
+    return named.get(name) or next(endings, None)

@@ -37,6 +37,12 @@ class RobotsAnswer(TypedDict):
     robots: dict[str, RobotPresence]
 
 
+class TagsAnswer(TypedDict):
+    """Answers ``tags``: each robot's tags, which are the attributes of its thing."""
+
+    tags: dict[str, dict[str, str]]
+
+
 class VehiclesAnswer(TypedDict):
     """Answers ``vehicles``: as in `Config`."""
 
@@ -47,6 +53,45 @@ class StreamsAnswer(TypedDict):
     """Answers ``streams``: the names of a robot's streams."""
 
     streams: list[str]
+
+
+class Extent(TypedDict):
+    """From the first sample to the time just after the last one, in microseconds since the epoch."""
+
+    from_us: int
+    to_us: int
+
+
+class RunPart(Extent):
+    """What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent
+    counted, up to its last report; null without a report."""
+
+    batches: int
+    samples: int | None
+
+
+RunState = Literal["running", "ended", "cut off", "unknown"]
+
+
+class Run(Extent):
+    """A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is
+    "cut off" if it did not end properly, and "unknown" without a report of the agent. ``lost`` counts the
+    messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was
+    recorded."""
+
+    run: str
+    state: RunState
+    lost: int
+    streams: dict[str, RunPart]
+
+
+class RunsAnswer(TypedDict):
+    """Answers ``runs``: the runs of a robot's agent, newest first. ``older`` tells whether there are more;
+    ask for those before the last one's ``from_us``. ``streams`` has the extent of all that is stored."""
+
+    runs: list[Run]
+    older: bool
+    streams: dict[str, Extent]
 
 
 class DashboardsAnswer(TypedDict):
@@ -96,6 +141,54 @@ class Alarm(TypedDict):
     since_s: float
 
 
+class Acknowledged(TypedDict):
+    """Who has seen an alarm, and when."""
+
+    by: str
+    at_s: float
+
+
+class AlarmEntry(Alarm):
+    """An alarm with its entry in the catalogue. ``robots`` are the cars that it may be about;
+    ``named`` says whether an alert has named them. ``acknowledged`` is null unless it is raised and
+    somebody has seen it since."""
+
+    key: str
+    meaning: str
+    advice: str
+    evidence: Literal["quarantine", "logs", "cars"]
+    threshold: float | None
+    robots: list[str]
+    named: bool
+    acknowledged: Acknowledged | None
+
+
+class AlarmsAnswer(TypedDict):
+    """Answers ``alarms``, the raised ones first; ``user`` is who acknowledges if the viewer gives no name."""
+
+    alarms: list[AlarmEntry]
+    user: str
+
+
+class Rejected(TypedDict):
+    """A message in quarantine; ``robot`` is "-" if it is unknown."""
+
+    id: str
+    robot: str
+    source: str
+    topic: str
+    reason: str
+    last_s: float
+    seen: int
+
+
+class RejectedAnswer(TypedDict):
+    """Answers ``rejected``: the newest messages in quarantine; ``found`` may exceed their number."""
+
+    rejected: list[Rejected]
+    found: int
+
+
 class _Drawn(TypedDict):
     x: int
     y: int
@@ -134,4 +227,16 @@ class Logs(TypedDict):
     to_s: int
 
 
-Answer = Union[RobotsAnswer, VehiclesAnswer, StreamsAnswer, HistoryAnswer, DashboardsAnswer, Dashboard, Logs]
+Answer = Union[
+    RobotsAnswer,
+    TagsAnswer,
+    VehiclesAnswer,
+    StreamsAnswer,
+    HistoryAnswer,
+    DashboardsAnswer,
+    Dashboard,
+    Logs,
+    AlarmsAnswer,
+    RejectedAnswer,
+    RunsAnswer,
+]

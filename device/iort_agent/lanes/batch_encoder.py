@@ -131,26 +131,33 @@ class BatchEncoder:
 
     def _put(self, batch: Batch) -> None:
         """Encode a batch, or its halves if it does not fit, down to the sample to refuse."""
-        n = len(batch.times_us)
         batch = replace(batch, seq=self._counts.batches, previous=self._spool.previous(self._stream))
-        try:
-            payload = encode_batch(batch)
-        except ContractError as error:
-            problem = str(error)
-        else:
-            if len(payload) <= MAX_MESSAGE_BYTES:
-                self._spool.put(self._stream, batch.boot, batch.seq, payload, samples=n)
-                self._counts.batches += 1
-                self._counts.stored += n
-                self._counts.nulled += _nonfinite(batch.columns)
-                return
-            problem = f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes"
-        if n == 1:
-            self._refuse(problem)
-        else:
+        problem = self._try(batch)
+        if problem and len(batch.times_us) > 1:
             # One bad value must not cost the others.
             for half in split_batch(batch):
                 self._put(half)
+            return
+        if problem and batch.previous:
+            # Other batches of the run name the runs before it.
+            problem = self._try(replace(batch, previous=()))
+        if problem:
+            self._refuse(problem)
+
+    def _try(self, batch: Batch) -> str:
+        """Put the batch into the spool; returns the problem of one that cannot be sent."""
+        try:
+            payload = encode_batch(batch)
+        except ContractError as error:
+            return str(error)
+        if len(payload) > MAX_MESSAGE_BYTES:
+            return f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes"
+        n = len(batch.times_us)
+        self._spool.put(self._stream, batch.boot, batch.seq, payload, samples=n)
+        self._counts.batches += 1
+        self._counts.stored += n
+        self._counts.nulled += _nonfinite(batch.columns)
+        return ""
 
     def _refuse(self, why: str) -> None:
         self._counts.refused += 1

@@ -8,7 +8,6 @@ that change the direction of a line are shown so too, and no text is rich's mark
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,15 +15,7 @@ from rich import console
 from rich.segment import Segment
 from rich.text import Text
 
-# C0 except tab and new line, DEL and C1, Unicode's line ends and directions, and halves of characters, which
-# no output can write.
-_OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-
-
-def visible(text: str) -> str:
-    """Replace each character that a terminal would obey by its code, as JSON spells it."""
-    # JSON's spelling, so that JSON stays JSON.
-    return _OBEYED.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+from iort_station.texts import visible
 
 
 class Console(console.Console):

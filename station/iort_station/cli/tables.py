@@ -1,21 +1,17 @@
-"""Results as a table, CSV, JSON Lines and Parquet."""
+"""Results as a table in a terminal."""
 
 from __future__ import annotations
 
-import csv
 import itertools
-import json
-from collections.abc import Iterator, Sequence
-from typing import IO, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-import numpy as np
 from rich.table import Table
 
-from iort_contract.codec.columns import EXACT
-from iort_station.cli.console import visible
 from iort_station.data import Result
-from iort_station.data.blocks import Column, values
 from iort_station.data.positions import in_degrees
+from iort_station.recordings.tabular import texts_of_time
+from iort_station.texts import visible
 
 # A terminal shows the beginning and the end of a long result.
 _SHOWN = 20
@@ -23,15 +19,6 @@ _TIME_WIDE = "2026-05-04 10:00:00.000000"
 _GAP = 2
 # Longer texts are folded.
 _TEXT_WIDE = 40
-_CHUNK = 10_000
-# Characters that begin a formula in a spreadsheet, also in full width: OWASP, "CSV Injection".
-_FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-
-
-def texts_of_time(result: Result) -> list[str]:
-    """The times as ISO 8601 in UTC, to the microsecond."""
-    times = result.times_us.astype("datetime64[us]")
-    return [f"{text}Z" for text in np.datetime_as_string(times, unit="us").tolist()]
 
 
 class Shown(NamedTuple):
@@ -90,76 +77,6 @@ class _Column(NamedTuple):
     @property
     def width(self) -> int:
         return min(_TEXT_WIDE, max(map(len, [*self.heading.split("\n"), *self.cells])))
-
-
-def to_csv(result: Result, file: IO[str], *, raw: bool = False) -> None:
-    """Write a header and a line for each sample; null is empty.
-
-    Names and texts are `harmless`, because a spreadsheet runs formulas. ``raw`` leaves them unchanged.
-    """
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["time", *(result.columns if raw else map(harmless, result.columns))])
-    for rows in _rows(result):
-        writer.writerows(rows if raw else ([harmless(value) for value in row] for row in rows))
-
-
-def harmless(value: Any) -> Any:
-    """A text without formulas and control sequences; other values unchanged."""
-    if not isinstance(value, str):
-        return value
-    text = visible(value)
-    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
-
-
-def to_json_lines(result: Result, file: IO[str]) -> None:
-    """Write an object a line: the time, the time in microseconds, and the fields."""
-    names = list(result.columns)
-    times = iter(result.times_us.tolist())
-    for rows in _rows(result):
-        for at, *row in rows:
-            sample = {"time": at, "t_us": next(times), **dict(zip(names, row, strict=True))}
-            file.write(json.dumps(sample) + "\n")
-
-
-def to_parquet(result: Result, file: IO[bytes]) -> None:
-    """Write ``time`` (microseconds, UTC) and a column for each field, with units in the metadata."""
-    # A third of a second of import.
-    import pyarrow as pa  # noqa: PLC0415 - see above
-    import pyarrow.parquet as pq  # noqa: PLC0415 - as above
-
-    arrays = [pa.array(result.times_us, type=pa.timestamp("us", tz="UTC"))]
-    fields = [pa.field("time", arrays[0].type, nullable=False)]
-    for name, column in result.columns.items():
-        array = pa.array(column, from_pandas=True)
-        unit = result.unit(name)
-        fields.append(pa.field(name, array.type, metadata={"unit": unit} if unit else None))
-        arrays.append(array)
-    schema = pa.schema(fields, metadata={"robot": result.robot, "stream": result.stream})
-    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
-
-
-def _rows(result: Result) -> Iterator[list[Sequence[Any]]]:
-    """Times and values in chunks: Python's values take ten times the memory of numpy's."""
-    whole = {name for name, column in result.columns.items() if _is_whole(column)}
-    for first in range(0, len(result), _CHUNK):
-        chunk = slice(first, first + _CHUNK)
-        part = Result(result.robot, result.stream, result.times_us[chunk], {})
-        columns = [
-            [int(value) if isinstance(value, float) else value for value in values(column[chunk])]
-            if name in whole
-            else values(column[chunk])
-            for name, column in result.columns.items()
-        ]
-        yield list(zip(texts_of_time(part), *columns, strict=True))
-
-
-def _is_whole(column: Column) -> bool:
-    """Whether all numbers of a column are integers, which arrive as float64."""
-    if column.dtype.kind == "f":
-        known = column[~np.isnan(column)]
-        return bool((known == np.floor(known)).all() and (np.abs(known) < EXACT).all())
-    floats = [value for value in column.tolist() if isinstance(value, float)]
-    return all(value.is_integer() and abs(value) < EXACT for value in floats)
 
 
 def _cell(value: Any, digits: int | None) -> str:

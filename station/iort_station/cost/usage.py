@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
+from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import StationError
 
@@ -43,7 +44,7 @@ class Usage:
     command_hz: float = 0.0
     hours_per_day: float = 2.0
     viewers: int = 1
-    retention_days: int = 90
+    retention_days: int = DEFAULT_RETENTION_DAYS
     live_memory_mb: int = 256
     live_ms: float = 20.0
     live_concurrency: int = 0

@@ -1,4 +1,4 @@
-"""Answers to the live page: the cars' parameters, a car's past, and CloudWatch's dashboards.
+"""Answers to the live page: the cars' parameters, a car's past, alarms, and CloudWatch's dashboards.
 
 Each answer is a function of the request's parameters; its type is in `iort_contract.messages.page`.
 """
@@ -10,30 +10,38 @@ from typing import Any
 
 import numpy as np
 
+from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.messages.page import Answer, HistoryAnswer
+from iort_contract.messages.page import Acknowledged, Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.blocks import Column, values
+from iort_station.data.conditions import derive
+from iort_station.data.runs import runs
 from iort_station.errors import StationError
-from iort_station.fleet import registry
-from iort_station.operations import cloudwatch, cloudwatch_logs
+from iort_station.fleet import registry, tags
+from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
 
 # No chart is wider, in points.
 MAX_ROWS = 5_000
 # Longer ranges are read from the summary of each second, not from samples.
 _SAMPLES_US = 3_600_000_000
+# The fields that a derived field needs, where it needs nothing else. The page makes the speed itself.
+_DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PARAMETERS[name]]
+_MOST_RUNS = 200
 
 
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer, by its name."""
     return {
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
+        "tags": lambda _asked: {"tags": tags.listed(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
+        "runs": lambda asked: _runs(cloud, asked),
         "history": lambda asked: history(cloud, asked),
         "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
         "dashboard": lambda asked: cloudwatch.dashboard(
@@ -45,7 +53,25 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
             _whole(asked, "widget", 0, 500),
             minutes=_whole(asked, "minutes", 1, 14 * 24 * 60),
         ),
+        "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
+        "rejected": lambda _asked: alarms.rejected(cloud),
     }
+
+
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Acknowledged]]:
+    """Every action, by its name."""
+    return {
+        "acknowledge": lambda asked: alarms.acknowledge(
+            cloud, _text(asked, "alarm"), _whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
+        )
+    }
+
+
+def _runs(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
+    """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
+    before_us = _whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
+    count = _whole(asked, "count", 1, _MOST_RUNS)
+    return runs(cloud, check_robot(_text(asked, "robot")), end_us=before_us, count=count)
 
 
 def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
@@ -63,7 +89,9 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     robot, stream = _text(asked, "robot"), _text(asked, "stream")
     found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
     columns = (
-        _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
+        _by_statistic(found.columns)
+        if summary
+        else {name: (c, c, c) for name, c in _with_derived(found.columns).items()}
     )
     claims = _claims(columns)
     n = len(found)
@@ -90,6 +118,13 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     }
 
 
+def _with_derived(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns and those derived of them alone, which the summary has too."""
+    if not any(columns.keys() >= sources for sources in _DERIVED_OF):
+        return dict(columns)
+    return {**columns, **derive(columns, None)}
+
+
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
     """The summary's columns for each field: mean, minimum, maximum."""
     names = [name.removesuffix("_mean") for name in columns if name.endswith("_mean")]
@@ -101,7 +136,7 @@ def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Colu
 
 
 def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
-    """The fields of attachments (docs/files.md), each with the field of its attachment's key."""
+    """The fields of attachments (docs/how-to/files.md), each with the field of its attachment's key."""
     fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
     return {
         f"{field}.{part}": f"{field}.key"

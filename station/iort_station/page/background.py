@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import threading
 from types import TracebackType
 from typing import Any
 
 from aiohttp import web
+from aiohttp.http import HttpProcessingError
 from typing_extensions import Self
 
 
@@ -62,7 +64,11 @@ class BackgroundServer:
 
     async def _serve(self, listening: socket.socket, started: threading.Event) -> None:
         self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
-        server = web.Server(self.handle, handler_cancellation=True, access_log=None, **self._options)
+        logger = logging.getLogger(f"aiohttp.server.{type(self).__name__}")
+        logger.addFilter(_is_our_fault)
+        server = web.Server(
+            self.handle, handler_cancellation=True, access_log=None, logger=logger, **self._options
+        )
         runner = web.ServerRunner(server, shutdown_timeout=1)
         await runner.setup()
         await web.SockSite(runner, listening).start()
@@ -72,6 +78,11 @@ class BackgroundServer:
         self._loop.remove_reader(listening)
         await _drop_connections(server)
         await runner.cleanup()
+
+
+def _is_our_fault(record: logging.LogRecord) -> bool:
+    """Whether a fault is ours: aiohttp logs a traceback for malformed requests too, after its answer 400."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
 async def _drop_connections(server: web.Server) -> None:

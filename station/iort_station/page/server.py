@@ -19,6 +19,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +37,11 @@ Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
+# The most answers that are worked on at a time; further requests wait.
+MOST_ANSWERS = 16
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
+# A coding of Accept-Encoding and its weight.
+_CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
 
 
 class _Body(NamedTuple):
@@ -50,9 +55,10 @@ class PageServer(BackgroundServer):
     """The page's web server, in threads of its own.
 
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
-    from the parameters of the request. The server accepts a Host that is localhost, an address or one of
-    ``names``, and no other. Raises `StationError` if the page is not built, if the port is in use, and for a
-    configuration that it must not serve.
+    from the parameters of the request. ``actions`` are those that change something: they need a POST. The
+    server accepts a Host that is localhost, an address or one of ``names``, and no other. Raises
+    `StationError` if the page is not built, if the port is in use, and for a configuration that it must not
+    serve.
     """
 
     def __init__(
@@ -65,6 +71,7 @@ class PageServer(BackgroundServer):
         vehicles: Mapping[str, Mapping[str, float]] | None = None,
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
+        actions: Mapping[str, Answer] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         names: Iterable[str] = (),
@@ -72,6 +79,8 @@ class PageServer(BackgroundServer):
     ) -> None:
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
+        self._actions = {f"/{name}.json": action for name, action in (actions or {}).items()}
+        self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
             namespace=namespace,
@@ -120,13 +129,15 @@ class PageServer(BackgroundServer):
         if not self._accepts(request.headers.get("Host", "")):
             refused = "this server answers to localhost, to addresses and to what --name says"
             return self._response(request, _json({"error": refused}), 403)
+        path = request.raw_path.partition("?")[0]
+        if request.method == "POST" and path in self._actions:
+            return await self._act(request, self._actions[path])
         if request.method not in {"GET", "HEAD"}:
             return self._response(request, _body(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
-        path = request.raw_path.partition("?")[0]
         answer = self._answers.get(path)
         if answer is not None:
             parameters = dict(request.query)
-            status, body = await _off_the_loop(lambda: _answered(answer, parameters))
+            status, body = await self._off_the_loop(lambda: _answered(answer, parameters))
             return self._response(request, body, status)
         file = self._files.get(path)
         if file is None:
@@ -138,6 +149,41 @@ class PageServer(BackgroundServer):
             response.set_status(304)
             response.body = None
         return response
+
+    async def _off_the_loop(self, work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
+        """Run ``work`` in a daemon thread, so that a slow answer delays neither a file nor the exit."""
+        await self._free.acquire()
+        loop = asyncio.get_running_loop()
+        done: Future[tuple[int, _Body]] = Future()
+        done.set_running_or_notify_cancel()
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
+                done.set_exception(error)
+            # Not where the answer is awaited: a viewer who leaves does not end the thread.
+            with suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(self._free.release)
+
+        threading.Thread(target=run, name="page answer", daemon=True).start()
+        return await asyncio.wrap_future(done)
+
+    async def _act(self, request: web.BaseRequest, action: Answer) -> web.StreamResponse:
+        """Answer with the result of an action; its parameters are texts in a JSON object."""
+        # A browser sends this type to another origin only after a question that is never answered here.
+        if request.content_type != TYPES[".json"]:
+            return self._response(
+                request, _json({"error": "an action needs a body of application/json"}), 415
+            )
+        try:
+            asked = json.loads(await request.text())
+        except ValueError:
+            asked = None
+        if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
+            return self._response(request, _json({"error": "the body must be an object of texts"}), 400)
+        status, body = await self._off_the_loop(lambda: _answered(action, asked))
+        return self._response(request, body, status)
 
     def _accepts(self, host: str) -> bool:
         """Whether a request's Host is ours.
@@ -156,26 +202,18 @@ class PageServer(BackgroundServer):
 
     def _response(self, request: web.BaseRequest, body: _Body, status: int) -> web.Response:
         headers = {**self._headers, "Content-Type": body.kind}
-        if "gzip" in request.headers.get("Accept-Encoding", ""):
+        if _takes_gzip(request.headers.get("Accept-Encoding", "")):
             return web.Response(
                 body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
             )
         return web.Response(body=body.plain, status=status, headers=headers)
 
 
-async def _off_the_loop(work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
-    """Run ``work`` in a daemon thread, so that a slow answer delays neither other requests nor the exit."""
-    done: Future[tuple[int, _Body]] = Future()
-    done.set_running_or_notify_cancel()
-
-    def run() -> None:
-        try:
-            done.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
-            done.set_exception(error)
-
-    threading.Thread(target=run, name="page answer", daemon=True).start()
-    return await asyncio.wrap_future(done)
+def _takes_gzip(accepted: str) -> bool:
+    """Whether an Accept-Encoding allows gzip: RFC 9110, 12.5.3. A weight of 0 refuses a coding."""
+    weights: dict[str, str] = dict(_CODING.findall(accepted.lower()))
+    weight = weights.get("gzip", weights.get("*", "0"))
+    return weight == "" or weight.strip("0.") != ""
 
 
 def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:

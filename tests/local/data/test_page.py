@@ -13,7 +13,7 @@ from pathlib import Path
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
-from iort_station.page.answers import answers
+from iort_station.page.answers import actions, answers
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
@@ -45,6 +45,7 @@ def served(embedded: EmbeddedCloud) -> PageServer:
         namespace=embedded.namespace,
         **embedded.keys.reading(),
         answers=answers(embedded.cloud),
+        actions=actions(embedded.cloud),
     )
 
 
@@ -116,7 +117,7 @@ def _look_back(page, url, robot, samples, newest):
         return False
 
     until(loaded, "the samples in the table")
-    assert page.locator("section.panel[aria-label='Voltage input'] .plot canvas").count() == 1
+    assert page.locator("section.panel[aria-label='Battery voltage'] .plot canvas").count() == 1
     row = page.locator("tr[data-field=voltage_input] td")
     until(lambda: plain(row.nth(1).inner_text()) == f"{newest['voltage_input']:.2f}", "the value now")
     counted = page.locator("tr[data-field=displacement] td")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from iort_agent.lanes.batch_encoder import MAX_VALUES, BatchEncoder, StreamCounts, _Open
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
-from iort_contract.messages.batch import Batch, decode_batch, messages_of
+from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of
 from iort_contract.ros1.message import RosMessage, RosType
 from tests.agent_fakes import ManualClock
 from tests.examples import examples
@@ -28,9 +28,9 @@ BOOT = "0123456789abcdef"
 class Line:
     """An encoder and a spool in a row, as the agent wires them."""
 
-    def __init__(self, *, batch_s: float = 1.0) -> None:
+    def __init__(self, spool: MemorySpool | None = None, *, batch_s: float = 1.0) -> None:
         self.clock = ManualClock(now_us=T0)
-        self.spool = MemorySpool(max_bytes=2**40)
+        self.spool = MemorySpool(max_bytes=2**40) if spool is None else spool
         self.encoder = BatchEncoder("vesc", boot=BOOT, batch_s=batch_s, spool=self.spool, clock=self.clock)
 
     @property
@@ -287,6 +287,23 @@ def test_a_batch_of_messages_closes_near_the_limit_of_a_message(size: int) -> No
     assert line.counts.refused == 0
     # Not one a message, where they are small.
     assert len(line.messages()) <= max(len(raws), 1) if size > 10_000 else 8
+
+
+def test_a_sample_that_nearly_fills_a_message_goes_without_the_runs_before() -> None:
+    # As after sixteen restarts without a connection: 330 bytes of names.
+    runs = tuple(RunEnd(f"{number:016x}", number) for number in range(16))
+
+    class Restarted(MemorySpool):
+        def previous(self, stream: str) -> tuple[RunEnd, ...]:
+            return runs
+
+    line, noise = Line(Restarted(max_bytes=2**40)), random.Random(1)
+    for i, size in enumerate((10, (MAX_MESSAGE_BYTES - 500) * 3 // 4)):
+        line.encoder.add(T0 + i * 1_000_000, RosMessage(random_bytes(noise, size), A))
+    line.encoder.flush()
+    found = [messages_of(payload, {}) for payload in line.messages()]
+    assert [batch.previous for batch, _ in found] == [runs, ()]
+    assert line.counts.refused == 0
 
 
 def test_a_message_that_is_too_large_is_refused_alone() -> None:

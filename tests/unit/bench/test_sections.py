@@ -262,5 +262,5 @@ def test_the_target_of_summaries_beside_worst_case_batches_is_twice_the_delay_of
 def test_the_documentation_lists_every_section():
     from bench import ROOT
 
-    text = (ROOT / "docs" / "bench.md").read_text()
+    text = (ROOT / "docs/explanation/benchmark.md").read_text()
     assert {key for key in SECTIONS if f"| `{key}` |" in text} == set(SECTIONS)

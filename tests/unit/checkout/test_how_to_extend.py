@@ -1,4 +1,4 @@
-"""docs/how-to-extend.md works: the page's own blocks are applied to a copy of the checkout."""
+"""docs/how-to/extend.md works: the page's own blocks are applied to a copy of the checkout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scripts.docs_parts import ROOT
 
 pytestmark = pytest.mark.slow
 
-PAGE = (ROOT / "docs" / "how-to-extend.md").read_text()
+PAGE = (ROOT / "docs/how-to/extend.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FOLDERS = (
@@ -74,7 +74,7 @@ class Copy:
 
     def _insert(self, file: Path, lines: list[str]) -> None:
         before = "".join(f"{line[1:]}\n" for line in lines if not line.startswith("+"))
-        after = "".join(f"{line[1:]}\n" for line in lines)
+        after = "".join(f"{line[1:]}\n" for line in lines if not line.startswith("-"))
         text = file.read_text()
         assert text.count(before) == 1, f"{file} must have once:\n{before}"
         file.write_text(text.replace(before, after))
@@ -86,6 +86,8 @@ class Copy:
             **os.environ,
             "PYTHONPATH": os.pathsep.join(path),
             "AWS_DEFAULT_REGION": "eu-central-1",
+            # As the CDK's command does.
+            "CDK_CONTEXT_JSON": json.dumps(json.loads((self.root / "cdk.json").read_text())["context"]),
         }
         done = subprocess.run(
             [sys.executable, *command],
@@ -120,7 +122,7 @@ def test_the_way_to_add_a_field_works(copy: Copy) -> None:
     hottest = "from iort_contract.catalog.vesc import hottest_degc"
     assert copy.show("hottest_degc({'temp_battery': 81.5, 'temp_fet': 40})", hottest) == 81.5
     copy.run("-m", "scripts.docs_parts")
-    assert "| `temp_battery` | degC |" in (copy.root / "README.md").read_text()
+    assert "| `temp_battery` | degC |" in (copy.root / "docs/reference/fields.md").read_text()
     assert '"temp_battery"' in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
@@ -146,7 +148,7 @@ def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
     assert copy.show(needs, "from iort_station.data.selection import select") is True
     copy.run("-m", "scripts.docs_parts")
     formula = "`duty_cycle * voltage_input * current_motor`"
-    assert f"| {formula} |" in (copy.root / "README.md").read_text()
+    assert f"| {formula} |" in (copy.root / "docs/reference/fields.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
@@ -185,7 +187,10 @@ def test_the_way_to_add_a_rule_works(copy: Copy) -> None:
     )
     assert json.loads(copy.run("-c", handler))["HornsSounded"] == 1
     copy.run("-m", "scripts.docs_parts")
-    assert "| `horn` | counts who sounds the horn |" in (copy.root / "docs/processing.md").read_text()
+    assert (
+        "| `horn` | counts who sounds the horn |"
+        in (copy.root / "docs/explanation/processing.md").read_text()
+    )
 
 
 def test_the_way_to_add_a_function_works(copy: Copy) -> None:
@@ -229,3 +234,36 @@ def test_the_way_to_add_a_source_works(copy: Copy, tmp_path: Path) -> None:
         "    return samples",
     )
     assert found == [["clock", ["second_of_day"]]]
+
+
+def test_each_way_to_change_a_thing_works(copy: Copy) -> None:
+    files = {
+        name: set(copy.follow(name))
+        for name in ("A topic", "A retention", "An alarm", "A chart", "A price", "A policy")
+    }
+    assert all(len(found) == 1 for name, found in files.items() if name != "A chart")
+    assert len(files["A chart"]) == 2
+    stacks = templates(copy)
+    rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Record")
+    assert "FROM 'record/iort/+/+'" in rule["TopicRulePayload"]["Sql"]
+    policy = json.dumps(of_type(stacks["iort-fleet"], "AWS::IoT::Policy", "RobotPolicy"))
+    assert "_record/record/iort/" in policy
+    assert "topic/news/iort" in policy
+    quarantine = of_type(stacks["iort-quarantine"], "AWS::Lambda::Function", "Quarantine")
+    assert quarantine["Environment"]["Variables"]["RETENTION_S"] == str(30 * 86_400)
+    alarms = [one for one in stacks["iort-monitoring"].values() if one["Type"] == "AWS::CloudWatch::Alarm"]
+    assert 30 in {one["Properties"]["EvaluationPeriods"] for one in alarms}
+    assert "Weakest battery, V" in json.dumps(
+        of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Dashboard", "DashboardsRobots")
+    )
+    prices = "from iort_station.cost.prices import PRICES"
+    assert copy.show("PRICES['rule'].usd", prices) == 0.16
+    (copy.root / "node_modules").symlink_to(ROOT / "node_modules")
+    compiler = copy.root / "node_modules" / "typescript" / "bin" / "tsc"
+    types = subprocess.run(
+        [Path(sys.executable).with_name("node"), compiler, "--project", copy.root / "station" / "web"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert types.returncode == 0, types.stdout

@@ -1,4 +1,4 @@
-"""docs/messages.md has every limit of the contract with its value, and its internal links are valid."""
+"""The message reference has every limit of the contract with its value, and its internal links are valid."""
 
 from __future__ import annotations
 

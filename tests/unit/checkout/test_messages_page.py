@@ -1,4 +1,4 @@
-"""docs/messages.md says what the code does: each side reads what the other writes."""
+"""docs/reference/messages.md says what the code does: each side reads what the other writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The examples and tables of keys in docs/messages.md agree with the code."""
+"""The examples and tables of keys in docs/reference/messages.md agree with the code."""
 
 from __future__ import annotations
 

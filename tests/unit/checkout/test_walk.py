@@ -1,4 +1,4 @@
-"""One sample's walk from the ROS callback to the history chart, as docs/architecture.md lists its modules."""
+"""One sample's walk from the ROS callback to the history chart, as the architecture page lists it."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_the_walk_passes_the_documented_modules(tmp_path: Path) -> None:
         chart = history(cloud, asked)
     assert chart["fields"] == {"speed": {"mean": [0.0]}}
     assert len(lambda_2.summary("dt/iort/car/speed")) == 1
-    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
     (walk,) = re.findall(r"^## One sample's walk\n(.+?)^## ", page, re.DOTALL | re.MULTILINE)
     aside, way = set(), set()
     for row in walk.splitlines():

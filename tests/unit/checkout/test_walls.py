@@ -124,7 +124,7 @@ def test_the_documentation_and_the_walls_list_the_same_rooms(contract: str) -> N
     (layers,) = (one["layers"] for one in contracts if one["id"] == contract)
     # A layer in parentheses is optional.
     rows = [set(re.findall(r"(?<!\()\b\w+\b(?!\))", layer)) for layer in layers]
-    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
     _, table = page.split(f"**{contract.capitalize()}**", 1)
     first = [line.split("|")[1] for line in table.split("\n\n")[1].splitlines()[2:]]
     assert [set(re.findall(r"`(\w+)`", cell)) for cell in first] == [row for row in rows if row]

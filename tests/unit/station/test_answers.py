@@ -30,6 +30,11 @@ def test_few_samples_are_returned_unchanged():
     assert found["fields"] == {"speed": {"mean": list(range(40))}}
 
 
+def test_short_ranges_have_the_derived_fields_of_the_summary():
+    found = history(cloud_of(*ride(3, fields=("voltage_input", "current_input"))), ASKED)
+    assert found["fields"]["power_w"] == {"mean": [0, 1, 4]}
+
+
 def test_many_samples_are_returned_as_mean_least_and_most():
     found = history(cloud_of(*ride(500)), ASKED)
     speed = found["fields"]["speed"]

@@ -12,7 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 import iort_station
-from iort_station.cli.console import Console, visible
+from iort_station.cli.console import Console
+from iort_station.texts import visible
 
 # Write the clipboard; the same with C1; move the cursor and ring the bell; reverse a line.
 HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]
@@ -71,6 +72,6 @@ def test_every_command_prints_by_the_console():
                 printing.add((name, ast.unparse(node.args[0])))
     assert printing == {
         ("cli/main.py", "f\"iort {version('iort-station')}\""),
-        ("cli/progress.py", "visible(f'iort: {text}')"),
+        ("cli/words.py", "visible(f'iort: {text}')"),
         ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': live.sample})"),
     }

@@ -209,7 +209,7 @@ def test_the_quota_that_breaks_first_needs_the_fewest_robots():
 
 
 def test_the_documents_and_the_model_count_the_same_monitoring():
-    text = (ROOT / "docs" / "cloud.md").read_text()
+    text = (ROOT / "docs/reference/metrics.md").read_text()
     platform, robots = _ONE.dashboards
     for line in (
         f"| {len(METRICS)} | $0.30 each | {FREE_METRICS} |",

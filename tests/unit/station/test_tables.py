@@ -15,6 +15,7 @@ from iort_station.cli import tables
 from iort_station.cli.options import Range
 from iort_station.data import Result
 from iort_station.errors import StationError
+from iort_station.recordings import tabular
 
 
 def result(n=3):
@@ -32,7 +33,7 @@ def result(n=3):
 
 def test_csv_has_the_form_that_spreadsheets_and_grafana_read():
     file = io.StringIO()
-    tables.to_csv(result(), file)
+    tabular.to_csv(result(), file)
     rows = list(csv.DictReader(io.StringIO(file.getvalue())))
     assert rows[1] == {
         "time": "2023-11-14T22:13:20.143456Z",
@@ -49,13 +50,13 @@ def test_csv_has_formulas_only_on_request(text):
     values = np.array([text, "a=b"], dtype=object)
     found = Result("car", "notes", np.arange(2, dtype=np.int64), {text: values, "x": np.array([-1.5, 2])})
     file = io.StringIO()
-    tables.to_csv(found, file)
+    tabular.to_csv(found, file)
     head, first, second = csv.reader(io.StringIO(file.getvalue()))
     assert head == ["time", f"'{text}", "x"]
     assert first[1:] == [f"'{text}", "-1.5"]
     assert second[1] == "a=b"
     raw = io.StringIO()
-    tables.to_csv(found, raw, raw=True)
+    tabular.to_csv(found, raw, raw=True)
     head, first, _ = csv.reader(io.StringIO(raw.getvalue()))
     assert (head[1], first[1]) == (text, text)
 
@@ -65,7 +66,7 @@ def test_csv_and_tables_have_no_control_characters():
     values = np.array([escape], dtype=object)
     found = Result("car", "notes", np.zeros(1, dtype=np.int64), {escape: values})
     file = io.StringIO()
-    tables.to_csv(found, file)
+    tabular.to_csv(found, file)
     Console(file=file, width=200).print(tables.terminal(found).table)
     assert "\x1b" not in file.getvalue()
     assert file.getvalue().count("\\u001b]52;c;YQ==\\u0007") == 4
@@ -73,7 +74,7 @@ def test_csv_and_tables_have_no_control_characters():
 
 def test_json_lines_keep_null_text_and_microseconds():
     file = io.StringIO()
-    tables.to_json_lines(result(25_000), file)
+    tabular.to_json_lines(result(25_000), file)
     lines = [json.loads(line) for line in file.getvalue().splitlines()]
     assert len(lines) == 25_000
     assert lines[2] == {
@@ -89,7 +90,7 @@ def test_json_lines_keep_null_text_and_microseconds():
 
 def test_parquet_keeps_times_types_null_and_units():
     file = io.BytesIO()
-    tables.to_parquet(result(), file)
+    tabular.to_parquet(result(), file)
     table = pq.read_table(io.BytesIO(file.getvalue()))
     assert str(table.schema.field("time").type) == "timestamp[us, tz=UTC]"
     assert table.schema.field("speed").metadata == {b"unit": b"erpm"}
@@ -148,7 +149,8 @@ def test_ranges_are_parsed(capsys):
     assert capsys.readouterr().err == ""
     Range.of("2023-11-14T22:13:20", None, None)
     assert "this machine's zone" in capsys.readouterr().err
-    found = Range.of(None, None, None)
+    assert Range.of(None, None, None) == Range(None, None)
+    found = Range.of(None, None, None, "5m")
     assert found.end_us - found.start_us == 300_000_000
     assert "--last all" in capsys.readouterr().err
 
@@ -170,19 +172,19 @@ def test_integers_are_written_as_integers_and_fractions_as_fractions():
     mixed[:] = [2**63 + 1, -127.0]
     columns = {"rssi": np.array([-127.0, np.nan]), "volts": np.array([12.0, 12.5]), "large": mixed}
     found = Result("car", "radio", np.array([0, 1_000_000]), {**columns, "far": np.array([1e300, 1.0])})
-    assert [line.partition(",")[2] for line in written(tables.to_csv, found)] == [
+    assert [line.partition(",")[2] for line in written(tabular.to_csv, found)] == [
         "rssi,volts,large,far",
         "-127,12.0,9223372036854775809,1e+300",
         ",12.5,-127,1.0",
     ]
-    first, second = written(tables.to_json_lines, found)
+    first, second = written(tabular.to_json_lines, found)
     assert '"rssi": -127, "volts": 12.0, "large": 9223372036854775809' in first
     assert '"rssi": null, "volts": 12.5, "large": -127' in second
     many = Result("car", "radio", np.arange(20_000), {"n": np.arange(20_000.0)})
-    assert written(tables.to_csv, many)[-1].endswith(",19999")
+    assert written(tabular.to_csv, many)[-1].endswith(",19999")
     # A column with a later fraction is written as fractions from the start.
     many.columns["n"][-1] = 0.5
-    assert written(tables.to_csv, many)[1].endswith(",0.0")
+    assert written(tabular.to_csv, many)[1].endswith(",0.0")
 
 
 def test_a_latitude_is_shown_to_the_centimetre():

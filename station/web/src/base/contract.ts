@@ -10,6 +10,20 @@ export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+export const CAR_ALARMS = {
+  "FaultSamples": {
+    "meaning": "a car reports a fault",
+    "advice": "stop it and look; `iort query` with a condition on `fault_code` finds the car"
+  },
+  "TemperatureDegC": {
+    "meaning": "a car's controller is hot",
+    "advice": "let it cool; a VESC throttles by itself from 85 degC"
+  },
+  "BatteryVolts": {
+    "meaning": "a car's battery is low",
+    "advice": "change it: a lithium cell below 3 V is damaged"
+  }
+} as const;
 /** speed of the car, m/s */
 export const speed_mps = (speed: number, speed_to_erpm_gain: number, speed_to_erpm_offset: number): number => (speed - speed_to_erpm_offset) / speed_to_erpm_gain;
 /** electrical power from the battery, negative while regenerating, W */
@@ -20,11 +34,13 @@ export const FIELD_TABLE: FieldTable = {
   "fields": {
     "voltage_input": {
       "unit": "V",
-      "meaning": "battery voltage at the controller"
+      "meaning": "battery voltage at the controller",
+      "label": "Battery voltage"
     },
     "temperature_pcb": {
       "unit": "degC",
-      "meaning": "temperature of the controller's board"
+      "meaning": "temperature of the controller's board",
+      "label": "Board temperature"
     },
     "temp_fet": {
       "unit": "degC",
@@ -36,11 +52,13 @@ export const FIELD_TABLE: FieldTable = {
     },
     "current_motor": {
       "unit": "A",
-      "meaning": "motor current, negative while braking"
+      "meaning": "motor current, negative while braking",
+      "label": "Motor current"
     },
     "current_input": {
       "unit": "A",
-      "meaning": "battery current, negative while regenerating"
+      "meaning": "battery current, negative while regenerating",
+      "label": "Battery current"
     },
     "avg_id": {
       "unit": "A",
@@ -132,11 +150,13 @@ export const FIELD_TABLE: FieldTable = {
     },
     "cpu_percent": {
       "unit": "%",
-      "meaning": "share of one core, since the sample before"
+      "meaning": "share of one core, since the sample before",
+      "label": "Processor"
     },
     "rss_mb": {
       "unit": "MB",
-      "meaning": "memory in use"
+      "meaning": "memory in use",
+      "label": "Memory"
     },
     "samples_per_s": {
       "unit": "samples/s",
@@ -172,15 +192,18 @@ export const FIELD_TABLE: FieldTable = {
     },
     "files_sent_bytes": {
       "unit": "bytes",
-      "meaning": "bytes of files sent"
+      "meaning": "bytes of files sent",
+      "label": "Files sent"
     },
     "speed_mps": {
       "unit": "m/s",
-      "meaning": "speed of the car"
+      "meaning": "speed of the car",
+      "label": "Speed"
     },
     "power_w": {
       "unit": "W",
-      "meaning": "electrical power from the battery, negative while regenerating"
+      "meaning": "electrical power from the battery, negative while regenerating",
+      "label": "Battery power"
     }
   },
   "ros_units": {
@@ -233,6 +256,8 @@ export interface FieldEntry {
   readonly unit: string;
   readonly ros2_unit?: string;
   readonly meaning: string;
+  /** What the page calls it, unless its name says it. */
+  readonly label?: string;
 }
 
 export interface FieldTable {
@@ -270,6 +295,11 @@ export interface RobotsAnswer {
   readonly robots: Readonly<Record<string, RobotPresence>>;
 }
 
+/** Answers ``tags``: each robot's tags, which are the attributes of its thing. */
+export interface TagsAnswer {
+  readonly tags: Readonly<Record<string, Readonly<Record<string, string>>>>;
+}
+
 /** Answers ``vehicles``: as in `Config`. */
 export interface VehiclesAnswer {
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
@@ -278,6 +308,37 @@ export interface VehiclesAnswer {
 /** Answers ``streams``: the names of a robot's streams. */
 export interface StreamsAnswer {
   readonly streams: readonly string[];
+}
+
+/** From the first sample to the time just after the last one, in microseconds since the epoch. */
+export interface Extent {
+  readonly from_us: number;
+  readonly to_us: number;
+}
+
+/** What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent counted, up to its last report; null without a report. */
+export interface RunPart {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly batches: number;
+  readonly samples: number | null;
+}
+
+/** A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is "cut off" if it did not end properly, and "unknown" without a report of the agent. ``lost`` counts the messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was recorded. */
+export interface Run {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly run: string;
+  readonly state: "running" | "ended" | "cut off" | "unknown";
+  readonly lost: number;
+  readonly streams: Readonly<Record<string, RunPart>>;
+}
+
+/** Answers ``runs``: the runs of a robot's agent, newest first. ``older`` tells whether there are more; ask for those before the last one's ``from_us``. ``streams`` has the extent of all that is stored. */
+export interface RunsAnswer {
+  readonly runs: readonly Run[];
+  readonly older: boolean;
+  readonly streams: Readonly<Record<string, Extent>>;
 }
 
 /** Answers ``dashboards``: their names. */
@@ -316,6 +377,52 @@ export interface Alarm {
   readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
   readonly reason: string;
   readonly since_s: number;
+}
+
+/** Who has seen an alarm, and when. */
+export interface Acknowledged {
+  readonly by: string;
+  readonly at_s: number;
+}
+
+/** An alarm with its entry in the catalogue. ``robots`` are the cars that it may be about; ``named`` says whether an alert has named them. ``acknowledged`` is null unless it is raised and somebody has seen it since. */
+export interface AlarmEntry {
+  readonly name: string;
+  readonly about: string;
+  readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
+  readonly reason: string;
+  readonly since_s: number;
+  readonly key: string;
+  readonly meaning: string;
+  readonly advice: string;
+  readonly evidence: "quarantine" | "logs" | "cars";
+  readonly threshold: number | null;
+  readonly robots: readonly string[];
+  readonly named: boolean;
+  readonly acknowledged: Acknowledged | null;
+}
+
+/** Answers ``alarms``, the raised ones first; ``user`` is who acknowledges if the viewer gives no name. */
+export interface AlarmsAnswer {
+  readonly alarms: readonly AlarmEntry[];
+  readonly user: string;
+}
+
+/** A message in quarantine; ``robot`` is "-" if it is unknown. */
+export interface Rejected {
+  readonly id: string;
+  readonly robot: string;
+  readonly source: string;
+  readonly topic: string;
+  readonly reason: string;
+  readonly last_s: number;
+  readonly seen: number;
+}
+
+/** Answers ``rejected``: the newest messages in quarantine; ``found`` may exceed their number. */
+export interface RejectedAnswer {
+  readonly rejected: readonly Rejected[];
+  readonly found: number;
 }
 
 /** A dashboard's widget; ``number`` is its place in the dashboard's body. */

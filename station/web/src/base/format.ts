@@ -32,7 +32,7 @@ const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "i
 /** The format of a field; `ros2` selects the ROS 2 driver's units. */
 export function spec(field: string, table: FieldTable, ros2 = false): Spec {
   const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
-  const label = humanise(field);
+  const label = known?.label ?? humanise(field);
   if (!known) {
     const plain = rosUnit(field, table);
     return { label, meaning: "", unit: UNITS[plain] ?? plain, ...AS_SENT, digits: DIGITS[plain] };

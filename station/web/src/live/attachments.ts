@@ -1,4 +1,4 @@
-// Attachments: content that is too large for a message is a file (docs/files.md). The sample has five fields for
+// Attachments: content that is too large for a message is a file (docs/how-to/files.md). The sample has five fields for
 // it, among them the file's key and, for a picture, a thumbnail.
 
 import { ATTACHMENT_PARTS, type Value } from "../base/contract";

@@ -7,7 +7,7 @@ import { el, setAttribute, Text } from "../base/dom";
 import type { Fleet } from "../live/fleet";
 import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../base/format";
 import { Thumbnail } from "../widgets/thumbnail";
-import { route } from "../base/route";
+import { route, setAddress, type Query } from "../base/route";
 import { RangeChart } from "../charts/range_chart";
 import { Comparison } from "../widgets/comparison";
 
@@ -39,6 +39,7 @@ export class HistoryView {
   private readonly kept = new Map<string, { readonly picture: Thumbnail; readonly rows: readonly number[] }>();
   private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: RangeChart }>();
   private robot: string | undefined;
+  private query: Query<"history"> = {};
   private drive: HistoryAnswer | undefined;
   private loading: AbortController | undefined;
   private playing: number | undefined;
@@ -66,6 +67,10 @@ export class HistoryView {
       event.preventDefault();
       void this.load(seconds(this.from), seconds(this.to));
     });
+    this.stream.addEventListener("change", () => {
+      setAddress({ view: "history", robot: this.robot!, query: { stream: this.stream.value } });
+      form.requestSubmit();
+    });
     for (const each of [this.from, this.to]) each.addEventListener("input", () => this.sayZone());
     this.scrub.addEventListener("input", () => this.point(Number(this.scrub.value)));
     this.play.addEventListener("click", () => (this.playing === undefined ? this.start() : this.stop()));
@@ -81,7 +86,8 @@ export class HistoryView {
   }
 
   /** Show a robot's past; undefined when the viewer leaves. */
-  show(robot: string | undefined): void {
+  show(robot: string | undefined, query: Query<"history"> = {}): void {
+    this.query = query;
     if (robot === undefined || robot !== this.robot) {
       this.stop();
       this.loading?.abort();
@@ -104,7 +110,8 @@ export class HistoryView {
     try {
       const { streams } = await ask<{ streams: string[] }>("streams", { robot });
       if (robot !== this.robot) return;
-      const chosen = streams.includes(this.table.stream) ? this.table.stream : streams[0];
+      const wanted = [this.query.stream, this.table.stream].find((name) => name !== undefined && streams.includes(name));
+      const chosen = wanted ?? streams[0];
       this.stream.replaceChildren(...streams.map((name) => el("option", { value: name }, name)));
       if (chosen === undefined) this.note.set("Nothing of this car is stored.");
       else {
@@ -206,6 +213,8 @@ export class HistoryView {
     }
     this.pictures.replaceChildren(...[...this.kept.values()].map(({ picture }) => picture.node));
     const claims = new Set(ofBytes.flatMap(partsOf));
+    // The car's speed, where the motor's is not shown as it already.
+    if (this.spec("speed").unit === "m/s" && all.has("speed")) claims.add("speed_mps");
     return [...all.keys()].filter((field) => !claims.has(field));
   }
 

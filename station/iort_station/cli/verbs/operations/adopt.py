@@ -10,7 +10,8 @@ from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot
-from iort_station.cli.progress import bar, say
+from iort_station.cli.progress import bar
+from iort_station.cli.words import say
 from iort_station.errors import StationError
 from iort_station.recordings import adopt
 from iort_station.recordings.adopt import Adoption
@@ -41,7 +42,7 @@ def adopt_(
     """Copy batches from an old telemetry table, or from one restored from a backup, into the deployment's.
 
     The other table stays as it is, and a second run changes nothing. Lambda 2 makes the summaries again. Exit
-    status 1 if some items cannot be adopted; each is printed with its reason. See docs/upgrading.md.
+    status 1 if some items cannot be adopted; each is printed with its reason. See docs/how-to/upgrading.md.
     """
     cloud = context.obj.cloud()
     try:
