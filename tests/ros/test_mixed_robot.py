@@ -36,8 +36,8 @@ from tests.ros.mixed_rosbridge import GraphServer
 from tests.ros1_types import as_json
 
 RECORD = Path("/usr/lib/rosbag/record")
-DURATION_S = float(os.environ.get("IORT_MIXED_S") or 30)
-OUTAGE_S = max(10.0, DURATION_S / 5)
+DURATION_S = float(os.environ.get("IORT_MIXED_S") or 20)
+OUTAGE_S = max(5.0, DURATION_S / 5)
 SECOND_S = 5.0
 # A killed agent loses its open batches, which are one second long.
 OPEN_S = 2.5
@@ -250,7 +250,7 @@ def _export(mixed: Mixed, embedded: EmbeddedCloud) -> tuple[Bag, dict[str, str]]
     run, paths, failed = iort.__wrapped__(embedded), [], {}
     for name, topic in TOPICS.items():
         path = mixed.out / f"{topic.stream}.bag"
-        done = run("export", mixed.bundle.robot, topic.stream, "--last", "all", "--output", str(path))
+        done = run("export", mixed.bundle.robot, topic.stream, "--last", "all", "--out", str(path))
         if not done.exit_code:
             paths.append(path)
         elif "has no stream" not in str(done.exception):
