@@ -448,7 +448,7 @@ export interface Dashboard {
   readonly widgets: readonly Widget[];
 }
 
-/** Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. */
+/** Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. The first line of a cell says what happened. */
 export interface Logs {
   readonly columns: readonly string[];
   readonly rows: readonly (readonly string[])[];
