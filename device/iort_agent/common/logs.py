@@ -11,7 +11,6 @@ from typing import Any
 
 _SYSLOG_LEVELS = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 _KEPT = 5
-LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
 def neutral(text: str) -> str:

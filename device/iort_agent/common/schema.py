@@ -16,6 +16,7 @@ import yaml
 
 from iort_agent.errors import ConfigError
 from iort_contract.limits import ContractError
+from iort_contract.messages.settings import Choice, Flag, Number
 
 T = TypeVar("T")
 # YAML may have read a value as another type than its writer meant.
@@ -106,6 +107,18 @@ def choice(*names: str) -> Rule:
         if value not in names:
             raise place.error(value, f"one of {', '.join(names)}", did_you_mean(value, names))
         return str(value)
+
+    return rule
+
+
+def allowed(values: Flag | Number | Choice) -> Rule:
+    """The values of a setting that may change at run time."""
+
+    def rule(value: Any, place: Place) -> Any:
+        if not values.accepts(value):
+            hint = did_you_mean(value, values.names) if isinstance(values, Choice) else ""
+            raise place.error(value, values.allowed, hint)
+        return float(value) if isinstance(values, Number) else value
 
     return rule
 
