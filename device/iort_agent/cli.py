@@ -16,7 +16,8 @@ from typing import Any, Callable, Sequence
 
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.common.logs import LOG_LEVELS, neutral, set_up
+from iort_agent.common.log_lines import neutral
+from iort_agent.common.logs import LOG_LEVELS, set_up
 from iort_agent.common.state import document
 from iort_agent.common.version import agent_version
 from iort_agent.config import Config, load_config

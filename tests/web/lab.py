@@ -26,10 +26,8 @@ VIEWS = {
     "cloudwatch": "#/cloudwatch",
 }
 TRACEBACK = """[ERROR] ValueError: the gain of car-7 must not be 0
-Traceback (most recent call last):
   File "/var/task/functions/live.py", line 61, in handler
-    publish(event)
-ValueError: the gain of car-7 must not be 0"""
+    publish(event)"""
 NOW_S = time.time()
 
 
