@@ -126,7 +126,7 @@ export class CarView {
       return;
     }
     if (this.chosen.size >= MOST_CHOSEN) this.close(this.chosen.keys().next().value!);
-    const { label, unit, digits, ...as } = spec(field, this.table, stream.ros2);
+    const { label, unit, digits, ...as } = spec(field, this.table, stream.ros2, stream.name);
     const reading = { name: key, unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
     const panel = new ChartPanel(this.chosenCharts, {
       title: label,
@@ -167,7 +167,7 @@ export class CarView {
     for (const each of this.chosen.values()) {
       const { panel, stream, field } = each;
       if (each.ros2 !== stream.ros2) {
-        const as = spec(field, table, stream.ros2);
+        const as = spec(field, table, stream.ros2, stream.name);
         panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, as, as.unit);
         each.ros2 = stream.ros2;
       }
