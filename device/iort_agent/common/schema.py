@@ -113,14 +113,9 @@ def choice(*names: str) -> Rule:
 
 def allowed(values: Flag | Number | Choice) -> Rule:
     """The values of a setting that may change at run time."""
-
-    def rule(value: Any, place: Place) -> Any:
-        if not values.accepts(value):
-            hint = did_you_mean(value, values.names) if isinstance(values, Choice) else ""
-            raise place.error(value, values.allowed, hint)
-        return float(value) if isinstance(values, Number) else value
-
-    return rule
+    if isinstance(values, Number):
+        return number(values.low, values.high, unit=values.unit)
+    return choice(*values.names) if isinstance(values, Choice) else flag()
 
 
 def text(check: Callable[[str], str] | None = None) -> Rule:
