@@ -51,7 +51,7 @@ class Page {
     this.waiting = new Waiting(config, this.registry);
     this.bar = new StatusBar(config, this.fleet, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
-    this.carView = new CarView(this.fleet, table, this.tools);
+    this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
     for (const [id, to] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) byId(id).setAttribute("href", route({ view: to }));
@@ -83,6 +83,8 @@ class Page {
     this.cloudWatchView.show(view === "cloudwatch");
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
+    if (this.route.view === "car") this.carView.open(this.route.robot, this.route.query);
+    else this.carView.open(undefined);
     this.arrange();
   }
 
@@ -94,7 +96,7 @@ class Page {
     if (this.route.view === "car" && robot) {
       this.carView.show(this.fleet.robots.get(robot));
       const link = (text: string, label: string, name: string): HTMLElement =>
-        el("a", { class: "tool", href: route({ view: "car", robot: name }), "aria-label": label }, text);
+        el("a", { class: "tool", href: route({ view: "car", robot: name, query: this.carView.query }), "aria-label": label }, text);
       const [before, after] = this.neighbours(robot);
       this.tools.replaceChildren(
         el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
@@ -125,7 +127,7 @@ class Page {
     if (this.route.view !== "car") return;
     const [before, after] = this.neighbours(this.route.robot);
     const to = { ArrowLeft: before, ArrowRight: after }[event.key];
-    if (to !== undefined) location.hash = route({ view: "car", robot: to });
+    if (to !== undefined) location.hash = route({ view: "car", robot: to, query: this.carView.query });
   }
 
   private readonly frame = (): void => {
