@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from iort_station.errors import StationError
+
+
+def cache(environment: Mapping[str, str]) -> Path:
+    """The user's folder for what can be made again."""
+    home = environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".cache"
+    return Path(home) / "iort"
 
 
 def check_free(path: Path, *, force: bool) -> None:

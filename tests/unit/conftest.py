@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
 
 import pytest
 from pytest_socket import disable_socket, enable_socket
@@ -21,15 +24,20 @@ def no_network():
     enable_socket()
 
 
+@cache
+def kept_by(module: ModuleType) -> list[Callable[[], None]]:
+    """What clears the caches of a function's module."""
+    return [value.cache_clear for value in vars(module).values() if hasattr(value, "cache_clear")]
+
+
 @pytest.fixture(autouse=True)
 def new_environment():
     """Every test is a new environment of the functions: they have read no variable and made no client."""
     yield
     for name, module in list(sys.modules.items()):
         if name.startswith("functions."):
-            for made in vars(module).values():
-                if hasattr(made, "cache_clear"):
-                    made.cache_clear()
+            for clear in kept_by(module):
+                clear()
 
 
 @pytest.fixture(autouse=True)

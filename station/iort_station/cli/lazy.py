@@ -28,9 +28,12 @@ class Verb(TyperCommand):
         group.add_typer(import_module(self._module).commands)
         return typer.main.get_group(group).commands[str(self.name)]
 
-    def make_context(self, *given: Any, **named: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], *given: Any, **named: Any) -> Any:
         """The context of the command, which then takes the verb's place."""
-        return self.load().make_context(*given, **named)
+        if named.get("resilient_parsing") and args and args[-1].startswith("-"):
+            # TAB asks for the value of this option; without it the parser would give up, and know no robot.
+            args = args[:-1]
+        return self.load().make_context(info_name, args, *given, **named)
 
 
 class Verbs(TyperGroup):

@@ -66,7 +66,7 @@ def main() -> None:
     """Run the command. An expected error prints one line on standard error; the status is 2 for wrong use,
     and otherwise 1."""
     try:
-        app()
+        app(prog_name="iort")
     except UsageError as error:
         _end(str(error), 2)
     except StationError as error:
@@ -84,3 +84,7 @@ def main() -> None:
 def _end(text: str, status: int = 1) -> NoReturn:
     say(text)
     sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

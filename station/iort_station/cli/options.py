@@ -11,17 +11,24 @@ from typing import Annotated, Any
 import typer
 
 from iort_contract.catalog.derived import DERIVED
+from iort_station.cli import completion
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
 from iort_station.times import duration_us, has_zone, time_us
 
-Robot = Annotated[str, typer.Argument(help="The robot's name.")]
-Stream = Annotated[str, typer.Argument(help="The stream, for example vesc.")]
-OneRobot = Annotated[str | None, typer.Option("--robot", help="Only this robot.")]
+Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
+Stream = Annotated[
+    str, typer.Argument(help="The stream, for example vesc.", autocompletion=completion.streams)
+]
+OneRobot = Annotated[
+    str | None, typer.Option("--robot", help="Only this robot.", autocompletion=completion.robots)
+]
 Fields = Annotated[
     str | None,
     typer.Option(
-        "--fields", help=f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived."
+        "--fields",
+        help=f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived.",
+        autocompletion=completion.fields,
     ),
 ]
 Where = Annotated[

@@ -16,7 +16,7 @@ from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.tables import BATCH, STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
-from iort_station.data.blocks import Block, values
+from iort_station.data.blocks import Block, join, values
 from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown
@@ -154,6 +154,12 @@ def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
 def _blocks(cloud: Cloud, robot: str, stream: str, start_us: int | None = None) -> Iterator[Block]:
     selection = Selection(robot=robot, stream=stream, start_us=start_us)
     return blocks(stored(cloud, selection), RefusedItems())
+
+
+def newest_block(cloud: Cloud, robot: str, stream: str) -> Block:
+    """The samples of a stream's newest batch."""
+    item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
+    return join(list(blocks([[item]] if item else [], RefusedItems())))
 
 
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:

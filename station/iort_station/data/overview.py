@@ -10,8 +10,6 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.page import Extent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import RefusedItems, blocks, telemetry_table, topic_of
-from iort_station.data.blocks import join
 from iort_station.data.queries import has_fraction
 from iort_station.data.runs import runs
 from iort_station.data.units import unit
@@ -40,12 +38,11 @@ def overview(cloud: Cloud, robot: str, *, count: int = 100) -> list[StreamOvervi
     streams = sorted(inventory.check_recorded(cloud, robot), key=lambda name: (name in OWN_STREAMS, name))
     found = runs(cloud, robot, streams=streams, count=count)
     kinds = {kind.stream: kind for _, kind in inventory.types_of(cloud, robot)}
-    table, told = telemetry_table(cloud), []
+    told = []
     for stream in streams:
         if stream not in found["streams"]:
             continue
-        item = table.first(topic_of(cloud, robot, stream), newest=True)
-        newest = join(list(blocks([[item]] if item else [], RefusedItems())))
+        newest = inventory.newest_block(cloud, robot, stream)
         kind = kinds.get(stream) or inventory.assumed_kind(stream, newest.columns.keys())
         kind = None if stream in {VESC_STREAM, *OWN_STREAMS} else kind
         ros2 = has_fraction(newest)

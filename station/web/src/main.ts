@@ -4,6 +4,7 @@ import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
 import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
+import { Alarms } from "./live/alarms";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
@@ -12,6 +13,7 @@ import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
+import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
 import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
@@ -20,6 +22,9 @@ import { HistoryView } from "./views/history";
 // The period of ages and states, and the shortest period of values and charts.
 const CLOCK_S = 0.25;
 const VALUES_S = 0.04;
+
+/** The views that the bar above links to. */
+const TABS = ["fleet", "alarms", "cloudwatch"] as const;
 
 class Page {
   private readonly fleet: Fleet;
@@ -31,6 +36,7 @@ class Page {
   private readonly carView: CarView;
   private readonly historyView: HistoryView;
   private readonly cloudWatchView: CloudWatchView;
+  private readonly alarmsView: AlarmsView;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
   private route: Route = { view: "fleet" };
@@ -49,12 +55,14 @@ class Page {
     });
     this.registry = new Registry(config);
     this.waiting = new Waiting(config, this.registry);
-    this.bar = new StatusBar(config, this.fleet, table);
+    const alarms = new Alarms(config, this.fleet, table);
+    this.bar = new StatusBar(config, this.fleet, alarms, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
-    for (const [id, to] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) byId(id).setAttribute("href", route({ view: to }));
+    this.alarmsView = new AlarmsView(config, alarms);
+    for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
     window.addEventListener("hashchange", () => this.go());
     window.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("visibilitychange", () => !document.hidden && this.frame());
@@ -67,16 +75,16 @@ class Page {
     this.route = readRoute(location.hash);
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, cloudwatch: this.cloudWatchView }[view];
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
     document.body.dataset["view"] = view;
-    document.title = robot ? `${robot} · iort` : view === "cloudwatch" ? "CloudWatch · iort" : "iort live";
+    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", car: "iort live", history: "iort live" }[view];
     if (this.stage.firstElementChild !== shown.node) {
       this.stage.replaceChildren(shown.node);
       window.scrollTo(0, 0);
     }
-    for (const [id, name] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) {
-      if (view === name) byId(id).setAttribute("aria-current", "page");
-      else byId(id).removeAttribute("aria-current");
+    for (const tab of TABS) {
+      if (view === tab) byId(`to-${tab}`).setAttribute("aria-current", "page");
+      else byId(`to-${tab}`).removeAttribute("aria-current");
     }
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
@@ -151,6 +159,7 @@ class Page {
     if (view === "fleet") this.fleetView.clock(at, linked);
     if (view === "car") this.carView.clock(at, linked);
     if (view === "history") this.historyView.clock(at);
+    if (view === "alarms") this.alarmsView.clock(at);
   };
 }
 

@@ -12,6 +12,7 @@ from awsiot import iotidentity
 
 from functions.echo import pong
 from iort_agent.control.runtime_settings import FIELDS, RULES, RuntimeSettings, overlay
+from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
@@ -123,12 +124,13 @@ SAMPLES: dict[str, accounts.Account | MessageType] = {
         "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
     ),
 }
+STREAMS = (LOG_STREAM, POSE_STREAM)
 SHADOW = ("desired", "reported")
 PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
 
 
 def test_each_example_is_compared_with_the_code() -> None:
-    assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *SHADOW, *PROVISIONING, "update"}
+    assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *STREAMS, *SHADOW, *PROVISIONING, "update"}
     assert PAGE.count("```json\n") == len(EXAMPLES)
 
 
@@ -247,6 +249,11 @@ def test_the_samples_of_a_robots_own_streams_equal_the_pages_examples(
     if name == "account":
         text = section("## A robot's own streams")
         assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_the_samples_of_a_stream_have_the_catalogues_fields(stream: str) -> None:
+    assert list(EXAMPLES[stream]) == [field.name for field in CATALOG[stream].fields]
 
 
 def test_the_agent_reads_and_writes_the_shadows_documents_of_the_page() -> None:

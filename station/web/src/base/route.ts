@@ -5,8 +5,9 @@
 const PARAMETERS = {
   fleet: ["find", "sort", "group"],
   car: ["window", "charts"],
-  history: ["stream"],
+  history: ["stream", "from", "to"],
   cloudwatch: [],
+  alarms: [],
 } as const;
 
 type View = keyof typeof PARAMETERS;
@@ -19,7 +20,7 @@ interface Address<V extends View> {
 interface RobotAddress<V extends View> extends Address<V> {
   readonly robot: string;
 }
-export type Route = Address<"fleet"> | Address<"cloudwatch"> | RobotAddress<"car"> | RobotAddress<"history">;
+export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | RobotAddress<"car"> | RobotAddress<"history">;
 
 export function route(to: Route): string {
   const view = to.view === "fleet" ? "" : to.view;
@@ -35,7 +36,9 @@ export function readRoute(hash: string): Route {
   const read = <V extends View>(view: V): Query<V> =>
     Object.fromEntries(PARAMETERS[view].flatMap((key) => (values.has(key) ? [[key, values.get(key)]] : []))) as Query<V>;
   if ((name === "car" || name === "history") && robot !== undefined) return { view: name, robot, query: read(name) };
-  return name === "cloudwatch" ? { view: name, query: read(name) } : { view: "fleet", query: read("fleet") };
+  if (name === "cloudwatch") return { view: name, query: read(name) };
+  if (name === "alarms") return { view: name, query: read(name) };
+  return { view: "fleet", query: read("fleet") };
 }
 
 /** Put what the view shows into the address, as a step of the browser's history if `step`. The view is not called. */

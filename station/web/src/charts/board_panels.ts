@@ -98,14 +98,14 @@ class FieldPanel extends TimePanel {
     private readonly field: string,
     private readonly table: FieldTable,
   ) {
-    const { label, unit, digits } = spec(field, table);
+    const { label, unit, digits } = spec(field, table, false, stream);
     const reading = { name: fieldKey(stream, field), unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
     super(new ChartPanel({ title: label, readings: [reading], chart: { lines: [{ colour: "--accent" }], span: 1e-3 } }), label);
   }
 
   values(robot: Robot): boolean {
     const stream = robot.streams.get(this.stream);
-    const as = spec(this.field, this.table, stream?.ros2);
+    const as = spec(this.field, this.table, stream?.ros2, this.stream);
     this.panel.show(stream && { history: stream.history, columns: [stream.columns.get(this.field)] }, as, as.unit);
     this.panel.update([numeric(stream?.sample.get(this.field))]);
     return stream?.columns.has(this.field) ?? false;

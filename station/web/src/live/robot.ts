@@ -1,6 +1,6 @@
 // One car: its streams, the delays and the faults. Nothing here touches the page; times are those of base/clock.ts.
 
-import { GONE_S, STALE_S, type FieldTable, type Value } from "../base/contract";
+import { GONE_S, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
 import { BOUNDS, DEEP_S, deepRows, MEDIAN_S, WINDOW_S } from "./bounds";
 import { Ring } from "./ring";
 import type { Stream } from "./stream";
@@ -108,3 +108,9 @@ export function median(values: Float64Array): number {
   const middle = sorted.length >> 1;
   return sorted.length % 2 === 1 ? sorted[middle]! : (sorted[middle - 1]! + sorted[middle]!) / 2;
 }
+
+/** The controller's hottest temperature, as in the contract: a sensor that is not read is 0. */
+export const hottest = (newest: (field: string) => number): number => {
+  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value) && value !== 0);
+  return known.length > 0 ? Math.max(...known) : NaN;
+};

@@ -198,7 +198,7 @@ export class HistoryView {
   }
 
   private spec(field: string): Spec {
-    return asSpeed(field, spec(field, this.table, this.drive?.ros2), this.fleet.speed(this.robot ?? ""));
+    return asSpeed(field, spec(field, this.table, this.drive?.ros2, this.stream.value), this.fleet.speed(this.robot ?? ""));
   }
 
   /** Make thumbnails for the fields of bytes, and return the other fields. */

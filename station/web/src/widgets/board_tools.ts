@@ -85,7 +85,7 @@ export class BoardTools {
       first,
       ...group("Charts", [...BOARD].flatMap(([key, { title }]) => option(key, title))),
       ...streams.flatMap(({ name, columns, ros2 }) =>
-        group(name, [...columns.keys()].flatMap((field) => option(fieldKey(name, field), spec(field, this.table, ros2).label))),
+        group(name, [...columns.keys()].flatMap((field) => option(fieldKey(name, field), spec(field, this.table, ros2, name).label))),
       ),
     );
     first.selected = true;

@@ -4,10 +4,9 @@ import type { FieldTable } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
 import { age, linear, milliseconds, NOTHING, number } from "../base/format";
 import { route } from "../base/route";
-import { hottest } from "../charts/car_charts";
 import { Sparkline } from "../charts/sparkline";
 import type { Fleet } from "../live/fleet";
-import type { Robot } from "../live/robot";
+import { hottest, type Robot } from "../live/robot";
 import { CARD_FIELD, numeric } from "../live/stream";
 
 export class Card {

@@ -87,7 +87,7 @@ export class StreamSection {
     this.drawn = stream.version;
     if (stream.ros2 !== this.ros2) {
       this.ros2 = stream.ros2;
-      for (const [field, tile] of this.tiles) tile.write(spec(field, this.table, this.ros2));
+      for (const [field, tile] of this.tiles) tile.write(spec(field, this.table, this.ros2, stream.name));
     }
     this.arrange();
     for (const [field, tile] of this.tiles) tile.set(stream.sample.get(field));
@@ -122,7 +122,7 @@ export class StreamSection {
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));
-      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2), charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined));
+      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2, this.stream.name), charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined));
     }
     const known = Object.keys(this.table.fields);
     const place = (field: string): number => (known.includes(field) ? known.indexOf(field) : known.length);

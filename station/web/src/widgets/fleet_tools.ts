@@ -4,9 +4,8 @@ import type { FieldTable } from "../base/contract";
 import { byName, el } from "../base/dom";
 import { keep, kept } from "../base/kept";
 import { setAddress, type Query } from "../base/route";
-import { hottest } from "../charts/car_charts";
 import type { Registry } from "../live/registry";
-import type { Robot } from "../live/robot";
+import { hottest, type Robot } from "../live/robot";
 import { numeric } from "../live/stream";
 
 /** The orders, and what is compared: the smallest comes first, and a car without a value last. */

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson
+from iort_station.cli.options import AsJson, Robot
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.shadow import Shadow, State, answered
 
@@ -21,7 +21,7 @@ _WITHDRAWN_S = 3.0
 @commands.command("config")
 def config(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     changes: Annotated[
         list[str] | None,
         typer.Argument(

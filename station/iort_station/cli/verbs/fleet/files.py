@@ -13,8 +13,8 @@ from typing import Annotated
 import typer
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
-from iort_station.cli import console
-from iort_station.cli.options import AsJson, Force, From, Last, Range, To, Yes, agreed, to_file
+from iort_station.cli import completion, console
+from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
@@ -32,7 +32,7 @@ _Name = Annotated[str, typer.Option(help="Only names that match, for example '*.
 @commands.command("list")
 def list_(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     name: _Name = "*",
     start: From = None,
     end: To = None,
@@ -54,9 +54,13 @@ def list_(
 @commands.command("get")
 def get(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     which: Annotated[
-        list[str] | None, typer.Argument(help="Names or keys; a name means its newest file. Default: all.")
+        list[str] | None,
+        typer.Argument(
+            help="Names or keys; a name means its newest file. Default: all.",
+            autocompletion=completion.files,
+        ),
     ] = None,
     name: _Name = "*",
     start: From = None,

@@ -9,7 +9,7 @@ import typer
 
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, out
-from iort_station.cli.options import Yes, agreed, to_file
+from iort_station.cli.options import Robot, Yes, agreed, to_file
 from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
 
@@ -22,7 +22,7 @@ _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 @commands.command("add")
 def add(
     context: typer.Context,
-    name: str,
+    name: Annotated[str, typer.Argument(help="The robot's name.")],
     folder: Annotated[Path, to_file("Where to write the robot's folder of configuration and keys.")] = Path(),
     speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
 ) -> None:
@@ -73,7 +73,7 @@ def claim(
 @commands.command("rotate")
 def rotate(
     context: typer.Context,
-    name: str,
+    name: Robot,
     folder: _ClaimFolder = Path("claim"),
     finish: Annotated[
         bool, typer.Option("--finish", help="The robot has its new certificate: wait, and revoke the old.")

@@ -26,8 +26,9 @@ from iort_contract.tables import (
     ROBOT,
     STREAMS,
 )
+from iort_station.cli import completion
 from iort_station.cli.console import Console, errors, out, print_json
-from iort_station.cli.options import AsJson, From, Last, Range, Yes, agreed
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import say
@@ -45,7 +46,7 @@ _PIPE_WIDTH = 10_000
 @commands.command("set")
 def set_(
     context: typer.Context,
-    name: str,
+    name: Robot,
     parameters: Annotated[
         list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{' or '.join(robots.F1TENTH)}.")
     ],
@@ -113,7 +114,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
 @commands.command("show")
 def show(
     context: typer.Context,
-    name: str,
+    name: Robot,
     as_json: AsJson = False,
 ) -> None:
     """Show a robot: its connection, its share of Lambda 2, its provisioning, its certificates."""
@@ -148,7 +149,9 @@ def show(
 @commands.command("remove")
 def remove(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="The robot; not with --all.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="The robot; not with --all.", autocompletion=completion.robots)
+    ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Remove every robot and lasting claim, before `make destroy`.")
     ] = False,

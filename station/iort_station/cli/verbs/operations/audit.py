@@ -12,8 +12,9 @@ from rich.text import Text
 
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
+from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, From, Last, Range, To
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
 from iort_station.data import inventory
 from iort_station.errors import StationError
 from iort_station.operations import accounts, audit
@@ -28,10 +29,14 @@ _LISTED = 20
 @commands.command("audit")
 def audit_(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--stream", help="Only this stream; may be repeated. Default: all known."),
+        typer.Option(
+            "--stream",
+            help="Only this stream; may be repeated. Default: all known.",
+            autocompletion=completion.streams,
+        ),
     ] = None,
     start: From = None,
     end: To = None,
