@@ -4,8 +4,8 @@ import type { Config, FieldTable } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { age, AS_SENT, linear, type Linear } from "../base/format";
 import { setAddress, type Query } from "../base/route";
-import { Board } from "../charts/board";
-import { GAUGES } from "../charts/car_charts";
+import { Board } from "../car/board";
+import { GAUGES } from "../car/car_charts";
 import { Gauge } from "../charts/gauge";
 import { Waterfall } from "../charts/waterfall";
 import { MEDIAN_S, WINDOW_S } from "../live/bounds";
@@ -14,9 +14,9 @@ import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
-import { BoardTools } from "../widgets/board_tools";
-import { FaultLog } from "../widgets/fault_log";
-import { StreamSection } from "../widgets/field_tiles";
+import { BoardTools } from "../car/board_tools";
+import { FaultLog } from "../car/fault_log";
+import { StreamSection } from "../car/field_tiles";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;

@@ -5,9 +5,9 @@ import { el } from "../base/dom";
 import { spec } from "../base/format";
 import { keep, kept } from "../base/kept";
 import type { Query } from "../base/route";
-import type { Board } from "../charts/board";
-import { fieldKey } from "../charts/board_panels";
-import { BOARD } from "../charts/car_charts";
+import type { Board } from "./board";
+import { fieldKey } from "./board_panels";
+import { BOARD } from "./car_charts";
 import { windowLabel, WINDOWS } from "../charts/windows";
 import type { Robot } from "../live/robot";
 

@@ -6,9 +6,9 @@ import { AS_SENT, linear, spec, type Linear } from "../base/format";
 import type { Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { BOARD, type DelaySpec, type LineSpec, type XYChartSpec } from "./car_charts";
-import { ChartPanel } from "./chart_panel";
-import { windowLabel, WINDOWS } from "./windows";
-import { XYChart, type Track } from "./xy_chart";
+import { ChartPanel } from "../charts/chart_panel";
+import { windowLabel, WINDOWS } from "../charts/windows";
+import { XYChart, type Track } from "../charts/xy_chart";
 
 export interface BoardPanel {
   readonly title: string;

@@ -3,9 +3,9 @@
 import { power_w } from "../base/contract";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
 import { hottest, type Robot } from "../live/robot";
-import type { ChartPanelOptions } from "./chart_panel";
-import type { GaugeOptions } from "./gauge";
-import type { XYChartOptions } from "./xy_chart";
+import type { ChartPanelOptions } from "../charts/chart_panel";
+import type { GaugeOptions } from "../charts/gauge";
+import type { XYChartOptions } from "../charts/xy_chart";
 
 /** A number with a bar. */
 export interface GaugeSpec extends GaugeOptions {

@@ -6,7 +6,7 @@ import type { Linear } from "../base/format";
 import type { Robot } from "../live/robot";
 import { panelOf, type BoardPanel } from "./board_panels";
 import { BOARD } from "./car_charts";
-import { WINDOWS } from "./windows";
+import { WINDOWS } from "../charts/windows";
 
 const MOST = 24;
 const STEPS: Readonly<Record<string, number>> = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };

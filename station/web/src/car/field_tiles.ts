@@ -6,8 +6,8 @@ import { el, setAttribute, Text } from "../base/dom";
 import { STALE_S, type FieldTable } from "../base/contract";
 import { numeric, type Stream } from "../live/stream";
 import { age, spec, write, type Spec } from "../base/format";
-import { Thumbnail } from "./thumbnail";
-import { fieldKey } from "../charts/board_panels";
+import { Thumbnail } from "../widgets/thumbnail";
+import { fieldKey } from "./board_panels";
 import { Sparkline } from "../charts/sparkline";
 
 class Tile {
