@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import operator
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from iort_agent.errors import SourceError
+from iort_agent.common.schema import Place, load
+from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.sim.circuit import HALL, Circuit, wrapped
 from iort_agent.sources.sim.driver import Pose
 from iort_agent.sources.sim.graph import DRIVE_TYPE, SimGraph
@@ -74,6 +76,20 @@ def test_the_same_seed_drives_the_same_lap() -> None:
     for stream in (VESC_STREAM, POSE_STREAM):
         assert drive(stream, duration_s=20, seed=5) == drive(stream, duration_s=20, seed=5)
         assert drive(stream, duration_s=20, seed=5) != drive(stream, duration_s=20, seed=6)
+
+
+def test_the_example_of_a_track_is_the_hall_and_a_car_may_drive_another(tmp_path: Path) -> None:
+    example = Path(__file__).parents[3] / "docs" / "examples" / "hall.csv"
+    assert example.read_text() == HALL.csv()
+    big = tmp_path / "big.csv"
+    big.write_text("0,0,2,2\n60,0,2,2\n60,40,2,2\n0,40,2,2\n")
+    config = load(SimConfig, {"track": "big.csv", "duration_s": 60}, Place(tmp_path / "car.yaml"))
+    xs: list[Any] = []
+    config.build(ManualClock()).run(lambda *sample: xs.append(sample[2].get("x", 0)), threading.Event())
+    assert 58 < max(xs) < 62
+    big.write_text("0,0,2,2\n60,0\n")
+    with pytest.raises(ConfigError, match=r"track: .*big.csv: line 2 must be the four numbers"):
+        load(SimConfig, {"track": "big.csv"}, Place(tmp_path / "car.yaml"))
 
 
 def test_poses_come_at_their_own_rate_with_the_times_of_samples() -> None:
