@@ -6,6 +6,7 @@ neither boto3 nor moto is installed.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Callable
@@ -60,14 +61,26 @@ def aws(monkeypatch):
 
 @pytest.fixture(scope="session")
 def tables():
-    """The properties of the storage stack's tables, by logical id. One stack is synthesized, not the app."""
-    from aws_cdk import App, assertions
+    """The properties of the storage stack's tables, by logical id.
 
-    from stacks.settings import Settings
-    from stacks.storage import Storage
+    One stack is synthesized, not the app, and only if its sources have changed since the last time.
+    """
+    from local.deployment import ROOT, sources
+    from local.kept import kept
 
-    template = assertions.Template.from_stack(Storage(App(), Settings()))
-    found = template.find_resources("AWS::DynamoDB::Table")
+    def synthesize(folder):
+        from aws_cdk import App, assertions
+
+        from stacks.settings import Settings
+        from stacks.storage import Storage
+
+        template = assertions.Template.from_stack(Storage(App(), Settings()))
+        folder.mkdir()
+        (folder / "tables.json").write_text(json.dumps(template.find_resources("AWS::DynamoDB::Table")))
+
+    found = json.loads(
+        (kept(ROOT / "build" / "tables", "tables", sources(ROOT), synthesize) / "tables.json").read_text()
+    )
     return {logical: resource["Properties"] for logical, resource in found.items()}
 
 

@@ -49,7 +49,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "robot nobody is not registered; the nearest: "),
+        (("files", "list", "nobody"), "robot nobody is not registered; "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
         (("files", "get", "nobody"), "robot nobody is not registered"),
         (("trace", "nobody"), "robot nobody is not registered"),
