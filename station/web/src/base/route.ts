@@ -4,7 +4,7 @@
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
   fleet: ["find", "sort", "group"],
-  car: [],
+  car: ["window", "charts"],
   history: ["stream", "from", "to"],
   cloudwatch: [],
   alarms: [],

@@ -5,7 +5,7 @@ import { keep, kept } from "./kept";
 const CHOICES = ["auto", "light", "dark"] as const;
 type Choice = (typeof CHOICES)[number];
 
-const listeners: (() => void)[] = [];
+const listeners = new Set<() => void>();
 const probe = document.createElement("span");
 
 export function startTheme(button: HTMLElement): void {
@@ -29,8 +29,10 @@ export function startTheme(button: HTMLElement): void {
   apply();
 }
 
-export function onTheme(listener: () => void): void {
-  listeners.push(listener);
+/** Call the listener after every change; returns what ends that. */
+export function onTheme(listener: () => void): () => void {
+  listeners.add(listener);
+  return () => listeners.delete(listener);
 }
 
 /** A custom property's colour in a form that a canvas accepts. */
