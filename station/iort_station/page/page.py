@@ -19,7 +19,7 @@ from iort_contract.topics import check_namespace, check_robot
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
@@ -58,6 +58,8 @@ def config(
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
     token: str = "",
     answers: bool = False,
+    actions: Iterable[str] = (),
+    key: str = "",
 ) -> Config:
     """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
 
@@ -92,4 +94,6 @@ def config(
         "vehicles": known,
         "token": token,
         "answers": answers,
+        "actions": sorted(actions),
+        "key": key,
     }
