@@ -11,7 +11,7 @@ import pytest
 from awsiot import iotidentity
 
 from functions.echo import pong
-from iort_agent.control.runtime_settings import FIELDS, RULES, RuntimeSettings, overlay
+from iort_agent.control.runtime_settings import RuntimeSettings, overlay
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
@@ -46,8 +46,9 @@ from iort_contract.messages.live import (
     live_update,
 )
 from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.messages.settings import CHANGEABLE
+from iort_contract.messages.shadow import decode_desired, decode_reported, encode_reported
 from iort_contract.tables import (
-    AGENT_VERSION,
     OVER_SHARE,
     PUT_OFF,
     PUT_OFF_LAST_MS,
@@ -55,7 +56,7 @@ from iort_contract.tables import (
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
 )
-from iort_contract.topics import ACCEPTED, COMMANDS, build_topic
+from iort_contract.topics import ACCEPTED, build_topic
 from iort_station.fleet.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -258,17 +259,18 @@ def test_the_samples_of_a_stream_have_the_catalogues_fields(stream: str) -> None
 
 def test_the_agent_reads_and_writes_the_shadows_documents_of_the_page() -> None:
     base = RuntimeSettings(True, True, 10.0, 0, "info")
-    settings, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
+    wanted = decode_desired(EXAMPLES["desired"]["state"]["desired"])
+    settings, rejected = overlay(base, base, wanted.settings, {})
     assert rejected == {}
-    reported = EXAMPLES["reported"]["state"]["reported"]
-    assert {key: reported[key] for key in settings.as_document()} == settings.as_document()
-    assert reported.keys() == {*settings.as_document(), "rejected", COMMANDS, AGENT_VERSION}
-    state = State(1, {}, reported)
-    assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
-    assert [refusal.name for refusal in state.rejections()] == ["live.rate_hz"]
+    example = EXAMPLES["reported"]["state"]["reported"]
+    reported = decode_reported(example)
+    assert reported.settings == dict(sorted(settings.by_name().items()))
+    assert encode_reported(reported) == example
+    assert outcome(State(reported=reported), "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
+    assert list(reported.rejected) == ["live.rate_hz"]
     desired, reported_keys = section("## The shadow").split("<!-- example: reported -->")
-    assert {name for row in rows(desired) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
-    assert {name for row in rows(reported_keys) for name in named(row[0])} == reported.keys()
+    assert {name for row in rows(desired) for name in named(row[0])} == set(CHANGEABLE)
+    assert {name for row in rows(reported_keys) for name in named(row[0])} == example.keys()
 
 
 def test_the_messages_of_provisioning_equal_those_of_awss_client() -> None:

@@ -11,7 +11,7 @@ const AGAIN_S = 60;
 export class LogTable {
   readonly node: HTMLElement;
   private readonly note = new Text("note", "p", { role: "status" });
-  private readonly host = el("div", { class: "log", role: "region", tabindex: "0" });
+  private readonly host = el("div", { class: "log", role: "group", tabindex: "0" });
   private askedAt = -Infinity;
   // A query may take longer than the dashboard's refresh period.
   private asking: AbortController | undefined;
