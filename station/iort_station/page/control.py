@@ -12,7 +12,8 @@ from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import commands
-from iort_station.page.parameters import Answer, text, whole
+from iort_station.page.answers import text, whole
+from iort_station.page.server import Answer
 
 
 def actions(cloud: Cloud) -> dict[str, Answer]:

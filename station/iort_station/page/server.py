@@ -31,10 +31,12 @@ from typing_extensions import Self
 
 from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, KEY_HEADER, PUBNUB_ORIGIN, security_policy
+from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, TYPES, built_files, config
-from iort_station.page.parameters import Answer
+
+Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
@@ -74,6 +76,7 @@ class PageServer(BackgroundServer):
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
         actions: Mapping[str, Answer] | None = None,
+        track: Track | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         names: Iterable[str] = (),
@@ -96,6 +99,7 @@ class PageServer(BackgroundServer):
             answers=bool(answers),
             actions=actions or (),
             key=self._key,
+            track=track,
         )
         # Only these can be requested: no path reaches the file system.
         self._files = {

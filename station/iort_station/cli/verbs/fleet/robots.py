@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
@@ -14,6 +13,7 @@ from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
     AGENT_VERSION,
     ALERT_PREFIX,
     CONNECTED_MS,
@@ -21,6 +21,7 @@ from iort_contract.tables import (
     DISCONNECTED_MS,
     FILES_BYTES,
     FILES_DAY,
+    LAST_SEEN_MS,
     ONLINE,
     OVER_SHARE,
     PRESENCE,
@@ -35,7 +36,7 @@ from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
-from iort_station.times import iso_s, time_us
+from iort_station.times import iso_s, stamped, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
 commands.add_typer(provisioning.commands)
@@ -97,7 +98,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
     rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
     if as_json:
-        print_json(rows, default=float)
+        print_json([_as_json(row) for row in rows])
         return
     if not rows:
         errors.print("no robot is registered; `iort robots add NAME` registers one")
@@ -123,11 +124,27 @@ def show(
     row, held = registry.get(cloud, name), certificates.attached(cloud, name)
     over = shadow.over_share(cloud, name)
     if as_json:
-        described = [
-            {**one._asdict(), "created": _time(one.created), "expires": _time(one.expires)} for one in held
-        ]
-        said = {OVER_SHARE: over and asdict(over), "certificates": described}
-        print_json({**row, **said}, default=float)
+        print_json(
+            {
+                **_as_json(row),
+                OVER_SHARE: over
+                and {
+                    "batches": over.batches,
+                    **stamped("since", over.since_ms * 1000),
+                    **stamped("last", over.last_ms * 1000),
+                },
+                "certificates": [
+                    {
+                        "id": one.id,
+                        "arn": one.arn,
+                        "status": one.status,
+                        **stamped("created", time_us(one.created, 0)),
+                        **stamped("expires", None if one.expires is None else time_us(one.expires, 0)),
+                    }
+                    for one in held
+                ],
+            }
+        )
         return
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(no_wrap=True)
@@ -182,6 +199,21 @@ def _parameter(text: str) -> tuple[str, float]:
         return name, float(value)
     except ValueError as error:
         raise UsageError(f"must be PARAMETER=NUMBER, got {text!r}") from error
+
+
+def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A robot's row with every attribute that a row may have; null is not known."""
+    known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, FILES_DAY, FILES_BYTES))
+    told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
+    told |= {name: float(row[name]) for name in robots.F1TENTH if name in row}
+    for name in (CONNECTED_MS, DISCONNECTED_MS, LAST_SEEN_MS, ADMITTED_MS):
+        at_ms = told.pop(name)
+        told |= stamped(name.removesuffix("_ms"), None if at_ms is None else int(at_ms) * 1000)
+    until_s = told.pop(ADMIT_UNTIL_S)
+    told |= stamped("admit_until", None if until_s is None else int(until_s) * 1_000_000)
+    for name in [name for name in told if name.startswith(ALERT_PREFIX)]:
+        told |= stamped(name, int(told[name]) * 1_000_000)
+    return told
 
 
 def _connection(row: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from iort_station.data import inventory
 from iort_station.errors import StationError
 from iort_station.operations import accounts, audit
 from iort_station.operations.audit import Audit
-from iort_station.times import duration_us, iso, iso_s
+from iort_station.times import duration_us, iso, iso_s, stamped
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -173,12 +173,23 @@ def _table(one: Audit) -> Table:
 
 
 def _as_json(one: Audit) -> dict[str, Any]:
+    left_out = {"samples_of", "first_us", "last_us"}
     runs = [
         {
-            **{name: value for name, value in asdict(run).items() if name != "samples_of"},
+            **{name: value for name, value in asdict(run).items() if name not in left_out},
+            **stamped("first", run.first_us),
+            **stamped("last", run.last_us),
             "expected": run.expected,
             "missing_batches": sum(gap.batches for gap in run.missing),
-            "missing": [gap._asdict() for gap in run.missing],
+            "missing": [
+                {
+                    "first": gap.first,
+                    "last": gap.last,
+                    **stamped("after", gap.after_us),
+                    **stamped("before", gap.before_us),
+                }
+                for gap in run.missing
+            ],
         }
         for run in one.runs
     ]

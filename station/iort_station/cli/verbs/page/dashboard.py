@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
-from iort_station.cli.options import Token
+from iort_station.cli.options import Token, TrackFile
 from iort_station.fleet import registry
 from iort_station.page import keys
 
@@ -31,11 +31,13 @@ def dashboard(
         typer.Option(help="Another name of this server than localhost; may be repeated."),
     ] = None,
     token: Token = "",
+    track: TrackFile = None,
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
     from iort_station.page import control  # noqa: PLC0415 - as above
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
@@ -46,6 +48,7 @@ def dashboard(
         answers=answers(cloud),
         # Whoever reaches the page can use it, and only people at this machine may move a robot.
         actions=actions(cloud) | (control.actions(cloud) if on_loopback(host) else {}),
+        track=None if track is None else load_track(track),
         host=host,
         port=port,
         names=name or (),

@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
-from iort_station.cli.options import Yes, agreed
+from iort_station.cli.options import TrackFile, Yes, agreed
 from iort_station.fleet import registry
 from iort_station.page import keys
-from iort_station.page.page import config
+from iort_station.page.page import config, load_track
 from iort_station.page.site import publish, upload
 
 commands = typer.Typer()
@@ -29,6 +29,7 @@ def site(
     remove: Annotated[
         bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
     ] = False,
+    track: TrackFile = None,
     yes: Yes = False,
 ) -> None:
     """Upload the page to the stack iort-site, which serves it. Deploy with -c site=true first."""
@@ -39,4 +40,11 @@ def site(
         out.print(f"{len(gone)} files deleted")
         return
     vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
-    out.print(publish(cloud, config(namespace=cloud.namespace, vehicles=vehicles, token=token, **pubnub)))
+    told = config(
+        namespace=cloud.namespace,
+        vehicles=vehicles,
+        token=token,
+        track=None if track is None else load_track(track),
+        **pubnub,
+    )
+    out.print(publish(cloud, told))

@@ -25,6 +25,7 @@ from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.listener import Listener
 from iort_station.page.watch import FleetWatch
+from iort_station.times import iso
 
 commands = typer.Typer()
 _REFRESH_S = 0.25
@@ -70,7 +71,13 @@ def _print_line(update: Any, now_us: int, done: threading.Event) -> None:
         return
     live = heard.live
     delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
-    line = {ROBOT: heard.robot, "stream": heard.stream, T_US: live.t_us, "delay_ms": delay_ms}
+    line = {
+        ROBOT: heard.robot,
+        "stream": heard.stream,
+        "time": iso(live.t_us),
+        T_US: live.t_us,
+        "delay_ms": delay_ms,
+    }
     try:
         print(json.dumps({**line, "sample": live.sample}), flush=True)
     except BrokenPipeError:
