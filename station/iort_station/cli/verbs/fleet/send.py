@@ -60,7 +60,7 @@ def send(
         )
         payload = encode_command(command)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     shadow.data.publish(topic=topic, qos=1, payload=payload)
     with errors.status(f"waiting for {robot}"):
         said = shadow.wait(lambda state: outcome(state, name, command.session, command.seq), seconds)

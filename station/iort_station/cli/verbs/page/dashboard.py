@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import Token
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, Token
 from iort_station.fleet import registry
 from iort_station.page import keys
 
@@ -27,6 +27,7 @@ def dashboard(
         typer.Option(help="Another name of this server than localhost; may be repeated."),
     ] = None,
     token: Token = "",
+    as_json: AsJson = False,
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
@@ -45,5 +46,5 @@ def dashboard(
         names=name or (),
         **keys.load(cloud).reading(),
     ) as page:
-        out.print(f"{page.url}  (Ctrl-C stops)")
+        tell({"url": page.url}, f"{page.url}  (Ctrl-C stops)", as_json=as_json)
         threading.Event().wait()

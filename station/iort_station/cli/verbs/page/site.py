@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import Yes, agreed
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, Yes, agreed
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.page import config
@@ -30,13 +30,15 @@ def site(
         bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
     ] = False,
     yes: Yes = False,
+    as_json: AsJson = False,
 ) -> None:
     """Upload the page to the stack iort-site, which serves it. Deploy with -c site=true first."""
     cloud = context.obj.cloud()
     if remove:
         agreed(f"Take the page of the deployment {cloud.namespace} down?", yes=yes)
         gone = upload(cloud.client("s3"), cloud.output("site", "PageBucket"), {})
-        out.print(f"{len(gone)} files deleted")
+        tell({"deleted": len(gone)}, f"{len(gone)} files deleted", as_json=as_json)
         return
     vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
-    out.print(publish(cloud, config(namespace=cloud.namespace, vehicles=vehicles, token=token, **pubnub)))
+    url = publish(cloud, config(namespace=cloud.namespace, vehicles=vehicles, token=token, **pubnub))
+    tell({"url": url}, url, as_json=as_json)
