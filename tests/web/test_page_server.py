@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, config
+from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import MOST_ANSWERS, PageServer
 
 TOLD: dict[str, Any] = {
@@ -164,6 +164,19 @@ def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> N
         finally:
             done.set()
         assert ask(page, "/slow.json")[0].status == 200
+
+
+def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) -> None:
+    file = tmp_path / "track.csv"
+    file.write_text("# x_m, y_m, w_right_m, w_left_m\n0,0,1,2\n4,0,1,2\n4,3,1,2\n0,3,1,2\n")
+    with PageServer(**TOLD, built=built, track=load_track(file)) as page:
+        told = json.loads(ask(page, "/config.json")[1])
+    assert told["track"] == {
+        "x_m": [0, 4, 4, 0], "y_m": [0, 0, 3, 3], "w_right_m": [1, 1, 1, 1], "w_left_m": [2, 2, 2, 2],
+    }  # fmt: skip
+    file.write_text("0,0\n")
+    with pytest.raises(StationError, match=r"track.csv: line 1 must be the four numbers"):
+        load_track(file)
 
 
 def test_a_malformed_request_is_answered_without_a_traceback(

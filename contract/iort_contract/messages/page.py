@@ -10,10 +10,19 @@ from typing import Literal, TypedDict, Union
 from iort_contract.limits import Value
 
 
+class TrackMap(TypedDict):
+    """A closed track's centre line and its widths to either side: `iort_contract.track.Track`."""
+
+    x_m: list[float]
+    y_m: list[float]
+    w_right_m: list[float]
+    w_left_m: list[float]
+
+
 class Config(TypedDict):
     """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
     whether the server answers questions about the past; a static site does not. ``vehicles`` maps a
-    robot to its `Vehicle`'s parameters."""
+    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known."""
 
     namespace: str
     subscribe_key: str
@@ -22,6 +31,7 @@ class Config(TypedDict):
     token: str
     answers: bool
     vehicles: dict[str, dict[str, float]]
+    track: TrackMap | None
 
 
 class RobotPresence(TypedDict):

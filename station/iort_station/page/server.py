@@ -29,6 +29,7 @@ from typing_extensions import Self
 
 from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, TYPES, built_files, config
@@ -72,6 +73,7 @@ class PageServer(BackgroundServer):
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
         actions: Mapping[str, Answer] | None = None,
+        track: Track | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         names: Iterable[str] = (),
@@ -90,6 +92,7 @@ class PageServer(BackgroundServer):
             vehicles=vehicles,
             token=token,
             answers=bool(answers),
+            track=track,
         )
         # Only these can be requested: no path reaches the file system.
         self._files = {

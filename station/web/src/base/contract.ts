@@ -311,7 +311,15 @@ export interface FieldTable {
 
 export type Value = null | boolean | number | string;
 
-/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``vehicles`` maps a robot to its `Vehicle`'s parameters. */
+/** A closed track's centre line and its widths to either side: `iort_contract.track.Track`. */
+export interface TrackMap {
+  readonly x_m: readonly number[];
+  readonly y_m: readonly number[];
+  readonly w_right_m: readonly number[];
+  readonly w_left_m: readonly number[];
+}
+
+/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
   readonly subscribe_key: string;
@@ -320,6 +328,7 @@ export interface Config {
   readonly token: string;
   readonly answers: boolean;
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
+  readonly track: TrackMap | null;
 }
 
 /** Whether a robot is connected, and since when it is or is not; null if it never was. */

@@ -122,7 +122,7 @@ class XYPanel implements BoardPanel {
   private window_s = 0;
 
   constructor(private readonly spec: XYChartSpec) {
-    const host = el("div", { class: "plot", "aria-hidden": "true" });
+    const host = el("div", { class: "plot" });
     this.title = spec.title;
     this.node = el("section", { class: "panel xy", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), this.note), host);
     this.chart = new XYChart(host, { ...spec, x: () => spec.x + this.unit });

@@ -2,9 +2,13 @@
 
 import uPlot from "uplot";
 import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { setAttribute } from "../base/dom";
+import { number } from "../base/format";
 import { colour, onTheme } from "../base/theme";
+import { AGAIN_MS, extremes } from "./spoken";
 
 export interface XYChartOptions {
+  readonly title: string;
   /** A text, or a function that gives one when the chart is drawn. */
   readonly x: string | (() => string);
   readonly y: string;
@@ -33,12 +37,15 @@ export class XYChart {
   private drawnAt = -Infinity;
   private ink = "";
   private paint = paint();
+  private writtenAt = -Infinity;
   private bounds: { x: [number, number]; y: [number, number] };
 
   constructor(
-    host: HTMLElement,
+    private readonly host: HTMLElement,
     private readonly options: XYChartOptions,
   ) {
+    host.setAttribute("role", "img");
+    this.write();
     this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
     this.ink = colour("--accent");
     const colours = () => this.paint;
@@ -98,6 +105,19 @@ export class XYChart {
       this.plot.setScale("y", { min: this.bounds.y[0], max: this.bounds.y[1] });
       this.plot.redraw(false, true);
     });
+    if (performance.now() - this.writtenAt >= AGAIN_MS) this.write();
+  }
+
+  /** Say in words what the chart shows. */
+  private write(): void {
+    this.writtenAt = performance.now();
+    const { title, x, y } = this.options;
+    const axes = [[typeof x === "string" ? x : x(), this.track.x], [y, this.track.y]] as const;
+    const figures = axes.map(([name, values]) => {
+      const { newest, least, most } = extremes(values);
+      return Number.isNaN(newest) ? `${name}: no values` : `${name}: newest ${number(newest, 2)}, minimum ${number(least, 2)}, maximum ${number(most, 2)}`;
+    });
+    setAttribute(this.host, "aria-label", `Chart ${title}. ${figures.join("; ")}.`);
   }
 
   private setBounds(): void {

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import tell
-from iort_station.cli.options import AsJson, Token
+from iort_station.cli.options import AsJson, Token, TrackFile
 from iort_station.fleet import registry
 from iort_station.page import keys
 
@@ -27,11 +27,13 @@ def dashboard(
         typer.Option(help="Another name of this server than localhost; may be repeated."),
     ] = None,
     token: Token = "",
+    track: TrackFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
@@ -41,6 +43,7 @@ def dashboard(
         token=token,
         answers=answers(cloud),
         actions=actions(cloud),
+        track=None if track is None else load_track(track),
         host=host,
         port=port,
         names=name or (),

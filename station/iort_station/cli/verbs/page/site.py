@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import tell
-from iort_station.cli.options import AsJson, Yes, agreed
+from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
 from iort_station.fleet import registry
 from iort_station.page import keys
-from iort_station.page.page import config
+from iort_station.page.page import config, load_track
 from iort_station.page.site import publish, upload
 
 commands = typer.Typer()
@@ -29,6 +29,7 @@ def site(
     remove: Annotated[
         bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
     ] = False,
+    track: TrackFile = None,
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
@@ -40,5 +41,12 @@ def site(
         tell({"deleted": len(gone)}, f"{len(gone)} files deleted", as_json=as_json)
         return
     vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
-    url = publish(cloud, config(namespace=cloud.namespace, vehicles=vehicles, token=token, **pubnub))
+    told = config(
+        namespace=cloud.namespace,
+        vehicles=vehicles,
+        token=token,
+        track=None if track is None else load_track(track),
+        **pubnub,
+    )
+    url = publish(cloud, told)
     tell({"url": url}, url, as_json=as_json)
