@@ -31,6 +31,7 @@ from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import delivery
+from iort_station.page import control
 from iort_station.page.answers import actions, answers
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
@@ -150,7 +151,7 @@ class _Demo:
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
                     track=HALL if self._options.bag is None else None,
-                    actions=actions(embedded.cloud),
+                    actions=actions(embedded.cloud) | control.actions(embedded.cloud),
                     port=self._options.port,
                 )
             )

@@ -14,6 +14,7 @@ import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
+import { Commands } from "../car/commands";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
 import { StreamSection } from "../car/field_tiles";
@@ -31,6 +32,7 @@ export class CarView {
   private readonly board: Board;
   private readonly tools: BoardTools;
   private readonly past: Past;
+  private readonly commands = new Commands();
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
@@ -64,7 +66,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node)),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, ...(config.actions.includes("send") ? [this.commands.node] : []))),
       this.streams,
     );
   }
@@ -83,6 +85,7 @@ export class CarView {
       return;
     }
     this.name = name;
+    this.commands.of(name);
     this.tools.read(query);
     this.drawn = -1;
   }

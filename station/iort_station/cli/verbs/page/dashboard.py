@@ -20,7 +20,11 @@ def dashboard(
     context: typer.Context,
     port: Annotated[int, typer.Option(help="The page's port; 0 takes a free one.")] = 8080,
     host: Annotated[
-        str, typer.Option(help="The address to listen on. Whoever reaches it can read the cars' past.")
+        str,
+        typer.Option(
+            help="The address to listen on. Whoever reaches it can read the cars' past; "
+            "only a page on 127.0.0.1 sends commands."
+        ),
     ] = "127.0.0.1",
     name: Annotated[
         list[str] | None,
@@ -32,9 +36,10 @@ def dashboard(
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
+    from iort_station.page import control  # noqa: PLC0415 - as above
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
-    from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
+    from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
     with PageServer(
@@ -42,7 +47,8 @@ def dashboard(
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
-        actions=actions(cloud),
+        # Whoever reaches the page can use it, and only people at this machine may move a robot.
+        actions=actions(cloud) | (control.actions(cloud) if on_loopback(host) else {}),
         track=None if track is None else load_track(track),
         host=host,
         port=port,
