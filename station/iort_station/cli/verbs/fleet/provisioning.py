@@ -10,6 +10,7 @@ import typer
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, Robot, Yes, agreed, to_file
+from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
 
@@ -19,7 +20,7 @@ _Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
 _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
 
-@commands.command("add")
+@commands.command("add", epilog=examples("robots add car8 --out robots"))
 def add(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The robot's name.")],
@@ -36,7 +37,7 @@ def add(
     tell({"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)}, text, as_json=as_json)
 
 
-@commands.command("register")
+@commands.command("register", epilog=examples("robots register car20 car21 --days 7"))
 def register(
     context: typer.Context,
     names: Annotated[list[str], typer.Argument(help="The robots' names.")],
@@ -56,7 +57,7 @@ def register(
         tell({"robot": name, "days": days}, f"{name} is expected for {days:g} days", as_json=as_json)
 
 
-@commands.command("claim")
+@commands.command("claim", epilog=examples("robots claim car9 --out claim-car9"))
 def claim(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
@@ -79,7 +80,7 @@ def claim(
     tell({"robot": name, "folder": str(folder), "claim": str(path)}, text, as_json=as_json)
 
 
-@commands.command("rotate")
+@commands.command("rotate", epilog=examples("robots rotate car7 --out claim-car7 --no-wait"))
 def rotate(
     context: typer.Context,
     name: Robot,
@@ -113,7 +114,7 @@ def rotate(
         tell({"robot": name, "revoked": len(old)}, text, as_json=as_json)
 
 
-@commands.command("revoke-claims")
+@commands.command("revoke-claims", epilog=examples("robots revoke-claims --yes"))
 def revoke_claims(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
     agreed("Revoke every lasting claim?", yes=yes)
