@@ -16,7 +16,13 @@ PAGE = (ROOT / "docs" / "reference" / "iort.md").read_text()
 
 
 def test_every_example_works(embedded, bundle, iort, tmp_path, monkeypatch):
-    car = bundle(sources=[{"type": "sim", "rate_hz": 50}])
+    drive = {
+        "topic": "/drive",
+        "type": "ackermann_msgs/AckermannDriveStamped",
+        "partial": True,
+        "motion": {"stop": {"drive": {"speed": 0.0}}},
+    }
+    car = bundle(sources=[{"type": "sim", "rate_hz": 50}], downlink={"cmd": {"drive": drive}})
     monkeypatch.chdir(tmp_path)
     agent = subprocess.Popen([Path(sys.executable).parent / "iort-agent", "run", "--config", car.config])
     try:
