@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -219,8 +220,15 @@ def manual() -> None:
     root.commands = {name: verb.load() for name, verb in root.commands.items()}
     _whole_sentences(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root), name="iort")
+    text = re.sub(r"\x08\nExamples:\n((?:  .*\n)+)", _console, text)
     # The page has a title of its own. The text is escaped for HTML; Markdown shows an apostrophe as it is.
     print(html.unescape(text.partition("\n\n")[2]).strip())
+
+
+def _console(found: re.Match[str]) -> str:
+    """A verb's examples as a console's text."""
+    commands = (f"$ {line.strip()}" for line in found[1].splitlines())
+    return "\n".join(["**Examples**:", "", "```console", *commands, "```", ""])
 
 
 def _whole_sentences(group: Any) -> None:

@@ -9,14 +9,14 @@ import typer
 
 from iort_station.cli.options import SHORT, Force, From, Last, Range, Robot, To, to_file
 from iort_station.cli.progress import reading
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
 
 commands = typer.Typer()
 
 
-@commands.command("export")
+@commands.command("export", epilog=examples("export car7 vesc --last 10m --out car7.mcap"))
 def export(
     context: typer.Context,
     robot: Robot,

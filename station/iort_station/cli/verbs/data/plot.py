@@ -25,7 +25,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
@@ -48,7 +48,13 @@ class Align(str, Enum):
     start = "start"
 
 
-@commands.command("plot")
+@commands.command(
+    "plot",
+    epilog=examples(
+        "plot car7 vesc --last 10m --fields speed_mps --out speed.png",
+        "plot car7 pose --kind trajectory --last 10m --out track.png",
+    ),
+)
 def plot(
     context: typer.Context,
     robot: Robot,

@@ -10,6 +10,7 @@ import typer
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, out
 from iort_station.cli.options import Robot, Yes, agreed, to_file
+from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
 
@@ -19,7 +20,7 @@ _Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
 _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
 
-@commands.command("add")
+@commands.command("add", epilog=examples("robots add car8 --out robots"))
 def add(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The robot's name.")],
@@ -32,7 +33,7 @@ def add(
     out.print(f"  iort-agent run --config {bundle.folder.name}/car.yaml")
 
 
-@commands.command("register")
+@commands.command("register", epilog=examples("robots register car20 car21 --days 7"))
 def register(
     context: typer.Context,
     names: Annotated[list[str], typer.Argument(help="The robots' names.")],
@@ -51,7 +52,7 @@ def register(
         out.print(f"{name} is expected for {days:g} days")
 
 
-@commands.command("claim")
+@commands.command("claim", epilog=examples("robots claim car9 --out claim-car9"))
 def claim(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
@@ -70,7 +71,7 @@ def claim(
     out.print(f"  iort-agent provision --config {folder.name}/{path.name}")
 
 
-@commands.command("rotate")
+@commands.command("rotate", epilog=examples("robots rotate car7 --out claim-car7 --no-wait"))
 def rotate(
     context: typer.Context,
     name: Robot,
@@ -99,7 +100,7 @@ def rotate(
         out.print(f"{name} has settled with its new certificate; revoked: {len(old)}")
 
 
-@commands.command("revoke-claims")
+@commands.command("revoke-claims", epilog=examples("robots revoke-claims --yes"))
 def revoke_claims(context: typer.Context, yes: Yes = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
     agreed("Revoke every lasting claim?", yes=yes)

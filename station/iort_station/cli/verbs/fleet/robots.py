@@ -33,7 +33,7 @@ from iort_station.cli.console import Console, errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
 from iort_station.times import iso_s, stamped, time_us
@@ -45,7 +45,7 @@ commands.add_typer(tags.commands)
 _PIPE_WIDTH = 10_000
 
 
-@commands.command("set")
+@commands.command("set", epilog=examples("robots set car7 speed_to_erpm_gain=4614 --last 7d"))
 def set_(
     context: typer.Context,
     name: Robot,
@@ -93,7 +93,7 @@ def set_(
         out.print(f"{name}: 0 seconds recomputed: no summary has a speed", soft_wrap=True)
 
 
-@commands.command("list")
+@commands.command("list", epilog=examples("robots list"))
 def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
     rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
@@ -113,7 +113,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
 
 
-@commands.command("show")
+@commands.command("show", epilog=examples("robots show car7"))
 def show(
     context: typer.Context,
     name: Robot,
@@ -164,7 +164,7 @@ def show(
     out.print(table)
 
 
-@commands.command("remove")
+@commands.command("remove", epilog=examples("robots remove car8 --yes"))
 def remove(
     context: typer.Context,
     name: Annotated[

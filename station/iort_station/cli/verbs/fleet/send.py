@@ -11,13 +11,14 @@ from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.topics import ACCEPTED
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import commands as fleet_commands
 
 commands = typer.Typer()
 
 
-@commands.command("send")
+@commands.command("send", epilog=examples("""send car7 drive '{"drive": {"speed": 1.0}}' --lease-ms 500"""))
 def send(
     context: typer.Context,
     robot: Robot,

@@ -7,18 +7,23 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
+from iort_station.cli.options import Robot
+from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import tags
 
 commands = typer.Typer()
 
 
-@commands.command("tag")
+@commands.command(
+    "tag", epilog=examples("robots tag car7 lab=north team=blue", "robots tag car7 --remove team")
+)
 def tag(
     context: typer.Context,
-    name: str,
+    name: Robot,
     changes: Annotated[
-        list[str] | None, typer.Argument(metavar="[TAG=VALUE]...", help="For example lab=north team=blue.")
+        list[str] | None,
+        typer.Argument(metavar="[TAG=VALUE]...", help="Tags to set, for example lab=north team=blue."),
     ] = None,
     remove: Annotated[list[str] | None, typer.Option(help="A tag to remove; may be repeated.")] = None,
 ) -> None:

@@ -11,7 +11,7 @@ from iort_contract.topics import check_robot
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot
 from iort_station.cli.progress import bar
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import StationError
 from iort_station.recordings import adopt
 from iort_station.recordings.adopt import Adoption
@@ -21,7 +21,7 @@ commands = typer.Typer()
 _LISTED = 20
 
 
-@commands.command("adopt")
+@commands.command("adopt", epilog=examples("adopt telemetry-restored --dry-run"))
 def adopt_(
     context: typer.Context,
     table: Annotated[
@@ -34,7 +34,7 @@ def adopt_(
     robot: OneRobot = None,
     units: Annotated[
         int,
-        typer.Option(min=1, help="Write units (1 KB) a second. A stream takes 1,000, its robot's included."),
+        typer.Option(min=1, help="Speed in write units of DynamoDB (1 KB) a second. A stream takes 1,000."),
     ] = adopt.UNITS_PER_S,
     dry_run: DryRun = False,
     as_json: AsJson = False,

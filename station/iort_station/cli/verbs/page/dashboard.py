@@ -9,13 +9,14 @@ import typer
 
 from iort_station.cli.console import out
 from iort_station.cli.options import Token, TrackFile
+from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
 
 commands = typer.Typer()
 
 
-@commands.command("dashboard")
+@commands.command("dashboard", epilog=examples("dashboard --port 8080"))
 def dashboard(
     context: typer.Context,
     port: Annotated[int, typer.Option(help="The page's port; 0 takes a free one.")] = 8080,

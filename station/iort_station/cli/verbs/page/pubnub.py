@@ -7,20 +7,22 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
+from iort_station.cli.words import examples
 from iort_station.errors import StationError
 from iort_station.page import keys
 
 commands = typer.Typer()
 
 
-@commands.command("pubnub")
+@commands.command("pubnub", epilog=examples("pubnub"))
 def pubnub(
     context: typer.Context,
     publish_key: Annotated[
-        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="Default: asks for it.")
+        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="The publish key. Default: asks for it.")
     ] = None,
     subscribe_key: Annotated[
-        str | None, typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="Default: asks for it.")
+        str | None,
+        typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="The subscribe key. Default: asks for it."),
     ] = None,
 ) -> None:
     """Store PubNub's keys, encrypted, where Lambda 1 reads them."""

@@ -8,6 +8,7 @@ import typer
 
 from iort_station.cli.console import out
 from iort_station.cli.options import TrackFile, Yes, agreed
+from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.page import config, load_track
@@ -16,7 +17,7 @@ from iort_station.page.site import publish, upload
 commands = typer.Typer()
 
 
-@commands.command("site")
+@commands.command("site", epilog=examples("site"))
 def site(
     context: typer.Context,
     token: Annotated[
