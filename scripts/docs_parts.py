@@ -33,6 +33,7 @@ from scripts import agent_reference, cloud_tables
 from scripts.page_contract import formula, page_contract
 
 __all__ = [
+    "agent_manual",
     "alarms",
     "car_yaml",
     "cost",
@@ -67,6 +68,7 @@ FILES = tuple(
         "docs/reference/fields.md",
         "docs/reference/metrics.md",
         "docs/explanation/cost.md",
+        "docs/reference/iort-agent.md",
         "docs/reference/iort.md",
         "docs/reference/messages.md",
         "docs/explanation/processing.md",
@@ -185,6 +187,13 @@ def car_yaml() -> None:
     for section in agent_reference.sections():
         print(f"\n## {section.path or 'The file'}\n\n{section.meaning}\n")
         _table(("key", "default", "allowed"), section.rows, right=False)
+
+
+def agent_manual() -> None:
+    """The command `iort-agent`."""
+    for command in agent_reference.commands():
+        print(f"\n## `iort-agent {command.name}`\n\n{command.meaning}\n")
+        _table(("option", "meaning"), command.rows, right=False)
 
 
 def errors() -> None:

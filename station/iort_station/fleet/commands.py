@@ -11,7 +11,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.fleet.shadow import Shadow, outcome
 
 VALID_MS, ANSWER_S = 2_000, 10.0
@@ -37,7 +37,7 @@ def send(
     """Send a command and wait for the robot's answer, at most ``seconds``.
 
     Every call is an operator's session of its own, which takes over from earlier ones. ``lease_ms`` is how
-    long the robot may move. Raises `StationError` for an unknown robot and for an invalid command.
+    long the robot may move. Raises `UsageError` for an unknown robot and for an invalid command.
     """
     shadow = Shadow(cloud, robot)
     now_us = time.time_ns() // 1000
@@ -55,7 +55,7 @@ def send(
         )
         payload = encode_command(command)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     shadow.data.publish(topic=topic, qos=1, payload=payload)
     return Sent(
         command, shadow.wait(lambda state: outcome(state, name, command.session, command.seq), seconds)

@@ -9,8 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
+from iort_station.cli.console import tell
 from iort_station.cli.options import (
     SHORT,
+    AsJson,
     Every,
     Fields,
     Force,
@@ -78,6 +80,7 @@ def plot(
     where: Where = None,
     every: Every = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
@@ -113,7 +116,8 @@ def plot(
     else:
         figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
     plots.save(figure, out, force=force)
-    say(f"{out}: {sum(len(run.result) for run in drawn):,} samples")
+    count = sum(len(run.result) for run in drawn)
+    tell({"file": str(out), "samples": count}, f"{out}: {count:,} samples", as_json=as_json)
 
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:

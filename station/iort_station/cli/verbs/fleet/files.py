@@ -91,13 +91,13 @@ def get(
 
 
 @commands.command("empty", epilog=examples("files empty --yes"))
-def empty(context: typer.Context, yes: Yes = False) -> None:
+def empty(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Delete every file of every robot, and the results of queries. Do so before you destroy the stacks."""
     cloud = context.obj.cloud()
     agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
     counts: list[int] = []
     files.empty(cloud, counts.append)
-    console.out.print(f"{sum(counts)} deleted")
+    console.tell({"deleted": sum(counts)}, f"{sum(counts)} deleted", as_json=as_json)
 
 
 def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[StoredFile]:

@@ -17,7 +17,7 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
 from iort_station.cli.words import examples
 from iort_station.data import inventory
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.operations import accounts, audit
 from iort_station.operations.audit import Audit
 from iort_station.times import duration_us, iso, iso_s, stamped
@@ -62,7 +62,7 @@ def audit_(
         check_robot(robot)
         names = [check_stream(name) for name in streams or ()] or inventory.known(cloud, robot)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
     found, now_us = [], time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import Token, TrackFile
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, Token, TrackFile
 from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
@@ -33,6 +33,7 @@ def dashboard(
     ] = None,
     token: Token = "",
     track: TrackFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
@@ -55,5 +56,5 @@ def dashboard(
         names=name or (),
         **keys.load(cloud).reading(),
     ) as page:
-        out.print(f"{page.url}  (Ctrl-C stops)")
+        tell({"url": page.url}, f"{page.url}  (Ctrl-C stops)", as_json=as_json)
         threading.Event().wait()
