@@ -46,7 +46,7 @@ _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
 # `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`; nobody is hurt by a long lease.
-_COMMANDS = {
+DRIVE_COMMANDS = {
     "drive": {
         "topic": "/drive",
         "type": DRIVE_TYPE,
@@ -196,7 +196,9 @@ class _Demo:
         if duration_s is not None:
             source["duration_s"] = duration_s
         settings = {"sources": [source], "ping": _PING}
-        return settings if self._options.bag is not None else {**settings, "downlink": {"cmd": _COMMANDS}}
+        return (
+            settings if self._options.bag is not None else {**settings, "downlink": {"cmd": DRIVE_COMMANDS}}
+        )
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
