@@ -11,6 +11,7 @@ import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { startTheme } from "./base/theme";
 import { CarView } from "./views/car";
+import { CompareView } from "./views/compare";
 import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
 import { HistoryView } from "./views/history";
@@ -26,6 +27,7 @@ class Page {
   private readonly fleetView: FleetView;
   private readonly carView: CarView;
   private readonly historyView: HistoryView;
+  private readonly compareView: CompareView;
   private readonly cloudWatchView: CloudWatchView;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
@@ -47,6 +49,7 @@ class Page {
     this.fleetView = new FleetView(config, this.fleet, table);
     this.carView = new CarView(this.fleet, table, this.tools);
     this.historyView = new HistoryView(config, table, this.fleet);
+    this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
     for (const [id, to] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) byId(id).setAttribute("href", route({ view: to }));
     window.addEventListener("hashchange", () => this.go());
@@ -61,7 +64,7 @@ class Page {
     this.route = readRoute(location.hash);
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, cloudwatch: this.cloudWatchView }[view];
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, compare: this.compareView, cloudwatch: this.cloudWatchView }[view];
     document.body.dataset["view"] = view;
     document.title = robot ? `${robot} · iort` : view === "cloudwatch" ? "CloudWatch · iort" : "iort live";
     if (this.stage.firstElementChild !== shown.node) {
@@ -74,6 +77,7 @@ class Page {
     }
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
+    this.compareView.show(this.route.view === "compare" ? this.route.query : undefined);
     this.cloudWatchView.show(view === "cloudwatch");
     this.fleetView.show(view === "fleet");
     this.arrange();

@@ -4,7 +4,7 @@ const KEY = "iort.theme";
 const CHOICES = ["auto", "light", "dark"] as const;
 type Choice = (typeof CHOICES)[number];
 
-const listeners: (() => void)[] = [];
+const listeners = new Set<() => void>();
 const probe = document.createElement("span");
 
 export function startTheme(button: HTMLElement): void {
@@ -32,8 +32,10 @@ export function startTheme(button: HTMLElement): void {
   apply();
 }
 
-export function onTheme(listener: () => void): void {
-  listeners.push(listener);
+/** Call the listener with every change, until the returned function is called. */
+export function onTheme(listener: () => void): () => void {
+  listeners.add(listener);
+  return () => listeners.delete(listener);
 }
 
 /** A custom property's colour in a form that a canvas accepts. */

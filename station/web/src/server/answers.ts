@@ -2,16 +2,43 @@
 
 export class AnswerError extends Error {}
 
+type Parameters = Readonly<Record<string, string>>;
+
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
-export async function ask<T>(name: string, parameters: Readonly<Record<string, string>>, signal?: AbortSignal): Promise<T> {
+export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
+  const answer = await request(`${name}.json`, parameters, signal);
+  return (await answer.json()) as T;
+}
+
+/** Ask for a file, and report the bytes received; throws `AnswerError` also if the file is cut off. */
+export async function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<{ readonly content: Blob; readonly name: string }> {
+  const answer = await request(name, parameters, signal);
+  const parts: Uint8Array<ArrayBuffer>[] = [];
+  let size = 0;
+  try {
+    for (const reader = answer.body!.getReader(); ; ) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      parts.push(value);
+      received((size += value.length));
+    }
+  } catch (error) {
+    if (signal.aborted) throw error;
+    throw new AnswerError(`The download was cut off after ${size} bytes; nothing was saved. The server's terminal has the reason.`);
+  }
+  const named = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1];
+  return { content: new Blob(parts), name: named ?? name };
+}
+
+async function request(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
   let answer: Response;
   try {
-    answer = await fetch(`${name}.json?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+    answer = await fetch(`${name}?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
   } catch (error) {
     if (signal?.aborted) throw error;
     throw new AnswerError("The page's server does not answer. Is `iort dashboard` still running?");
   }
+  if (answer.ok) return answer;
   const body = (await answer.json().catch(() => ({}))) as { error?: unknown };
-  if (!answer.ok) throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
-  return body as T;
+  throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
 }
