@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -30,9 +30,10 @@ test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS
 	@build/oldest/bin/python -m pytest -W "ignore:Python 3.8 is no longer supported" \
 		tests/device tests/unit/agent tests/unit/contract
 
-check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
+check: setup ## run the linters, the type checkers, the links of docs/, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench verify docs/examples && $(BIN)/lint-imports --no-cache --no-logo && $(BIN)/npm run --silent check
+	@$(MAKE) --no-print-directory docs
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
 wheels: setup ## build the wheels of contract, agent and station into dist/
@@ -56,8 +57,8 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
 		$(if $(REPORT),--json "$(REPORT)")
 
-bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: SOAK=300 REPORT=figures.json
-	@$(BIN)/python -m bench.page $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
+bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
+	@$(BIN)/python -m bench.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
@@ -72,9 +73,19 @@ verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,f
 docs-parts: setup ## fill the generated parts of README.md and docs/ again
 	@$(BIN)/python -m scripts.docs_parts
 
+docs: ## build the documentation site into build/site; a broken link fails it
+	@$(PYTHON) scripts/setup.py --docs
+	@$(MKDOCS) build --strict --site-dir build/site
+
+docs-serve: ## serve the documentation site on this machine, and follow what you write: PORT=8000
+	@$(PYTHON) scripts/setup.py --docs
+	@$(MKDOCS) serve --dev-addr localhost:$(or $(PORT),8000)
+
 layer: ## build Lambda 1's layer for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda
 
+# Its warning is about mkdocs 2, which requirements/docs.txt excludes.
+MKDOCS := NO_MKDOCS_2_WARNING=1 build/mkdocs/bin/mkdocs
 CDK := $(BIN)/node node_modules/aws-cdk/bin/cdk
 
 bootstrap: layer ## prepare an AWS account and region for the CDK, once
@@ -102,6 +113,8 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		-c requirements/dev.txt requirements/build.in -o requirements/build.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		requirements/checkov.in -o requirements/checkov.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		requirements/docs.in -o requirements/docs.txt
 	@$(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --python-version 3.8.10 \
 		--no-emit-package iort-agent --no-emit-package iort-contract requirements/oldest.in -o requirements/oldest.txt
 

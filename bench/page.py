@@ -1,10 +1,11 @@
 """`make bench-page`: the cost of the page in the browser, with 20 cars at 10 Hz.
 
-    python -m bench.page [--cars 20] [--seconds 30] [--soak 300] [--json FILE]
+    python -m bench.page [--cars 20] [--rate 10] [--seconds 30] [--soak 300] [--json FILE]
 
 Processor time of the page's main thread and of its worker, as shares of a processor, on the fleet's view
 and on that of one car, by Chromium's own counters; and the JavaScript heap after a collection, every half
-minute of the soak. Processor time, because on a machine that is shared the wall clock measures the others.
+minute of the soak, with the memory of the page's process. Processor time, because on a machine that is
+shared the wall clock measures the others.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from rich.console import Console
 
 from bench.command import made, parser, write
 from bench.errors import BenchError
-from bench.meters import chromium
+from bench.load.cars import RATE_HZ
+from bench.meters import chromium, usage
 from bench.report.result import Table
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
@@ -49,30 +51,42 @@ def main() -> None:
     """Measure and print; exit status 1 if the main thread is busier than `MAX_BUSY`."""
     arguments = parser(__doc__)
     arguments.add_argument("--cars", type=int, default=20)
+    arguments.add_argument("--rate", type=float, default=RATE_HZ, help="Hz, of each car")
     arguments.add_argument("--seconds", type=float, default=30.0, help="of each view")
     arguments.add_argument("--soak", type=float, default=300.0, help="seconds of watching the memory")
     options = arguments.parse_args()
     console = Console()
     try:
-        views, heap, bounds = _watched(console, options)
+        views, heap, process, bounds = _watched(console, options)
     except BenchError as error:
         sys.exit(f"bench-page: {error}")
     rows = [
         [view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}"] for view in views
     ]
-    title = f"The page with {options.cars} cars at 10 Hz"
+    title = f"The page with {options.cars} cars at {options.rate:g} Hz"
     Table(title, ["view", "main thread busy", "messages/s"], rows).show(console)
-    told = ", ".join(f"{mb:.1f}" for mb in heap)
-    console.print(f"JavaScript heap after a collection, MB, every {_STEP_S:.0f} s: {told}", highlight=False)
+    for what, figures in (("JavaScript heap after a collection", heap), ("the page's process", process)):
+        told = ", ".join(f"{mb:.1f}" for mb in figures)
+        console.print(f"{what}, MB, every {_STEP_S:.0f} s: {told}", highlight=False)
     write(
         options.json,
-        {**made(), "views": [asdict(view) for view in views], "heap_mb": heap, "bounds": bounds},
+        {
+            **made(),
+            "cars": options.cars,
+            "rate_hz": options.rate,
+            "views": [asdict(view) for view in views],
+            "heap_mb": heap,
+            "process_mb": process,
+            "bounds": bounds,
+        },
     )
     sys.exit(1 if any(view.main_thread > MAX_BUSY for view in views) else 0)
 
 
-def _watched(console: Console, options: argparse.Namespace) -> tuple[list[View], list[float], Any]:
-    """Return the views, the heap in MB every half minute of the soak, and the page's bounds."""
+def _watched(
+    console: Console, options: argparse.Namespace
+) -> tuple[list[View], list[float], list[float], Any]:
+    """Return the views; heap and memory in MB every half minute of the soak; and the page's bounds."""
     with ExitStack() as stack:
         pubnub = stack.enter_context(PubNubStandIn(publish_key=_KEY, subscribe_key=_KEY))
         vehicles = {f"car{i + 1}": F1TENTH for i in range(options.cars)}
@@ -80,7 +94,7 @@ def _watched(console: Console, options: argparse.Namespace) -> tuple[list[View],
             namespace="iort", subscribe_key=_KEY, origin=pubnub.origin, tls=False, vehicles=vehicles
         )
         url = stack.enter_context(server).url
-        stack.enter_context(_cars(pubnub.origin, options.cars))
+        stack.enter_context(_cars(pubnub.origin, options.cars, options.rate))
         browser = stack.enter_context(chromium.opened())
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.goto(url)
@@ -93,19 +107,22 @@ def _watched(console: Console, options: argparse.Namespace) -> tuple[list[View],
                 page.wait_for_timeout(_WARM_UP_S * 1000)
             with console.status(f"{name}: measuring for {options.seconds:.0f} s"):
                 views.append(_measure(page, probe, name, options.seconds))
-        heap = []
+        heap, process = [], []
+        all_processes = browser.new_browser_cdp_session()
         for _ in range(int(options.soak / _STEP_S) + 1):
             heap.append(_heap_mb(probe))
+            process.append(_process_mb(all_processes))
             with console.status(f"memory: {heap[-1]:.1f} MB after {len(heap) * _STEP_S - _STEP_S:.0f} s"):
                 page.wait_for_timeout(_STEP_S * 1000)
-        return views, heap, page.evaluate("iort.bounds")
+        return views, heap, process, page.evaluate("iort.bounds")
 
 
 @contextmanager
-def _cars(origin: str, count: int) -> Iterator[None]:
+def _cars(origin: str, count: int, rate_hz: float) -> Iterator[None]:
     """Run the cars in their own process, which ends when its input does."""
     keys = ["--publish-key", _KEY, "--subscribe-key", _KEY]
     command = [sys.executable, "-m", "bench.load.cars", "--origin", origin, *keys, "--cars", str(count)]
+    command += ["--rate", str(rate_hz)]
     with subprocess.Popen(command, stdin=subprocess.PIPE):
         yield
 
@@ -127,6 +144,12 @@ def _metrics(probe: Any) -> dict[str, float]:
 def _heap_mb(probe: Any) -> float:
     probe.send("HeapProfiler.collectGarbage")
     return float(_metrics(probe)["JSHeapUsedSize"]) / 1e6
+
+
+def _process_mb(browser: Any) -> float:
+    """The memory of the page's process: columns of numbers are not on the heap."""
+    found = browser.send("SystemInfo.getProcessInfo")["processInfo"]
+    return sum(usage.of(each["id"]).rss_mb for each in found if each["type"] == "renderer")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,8 @@ import typer
 from cogapp import Cog
 from typer.cli import get_docs_for_click
 
+import iort_agent.errors
+import iort_station.errors
 from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_contract.catalog.derived import DERIVED
@@ -26,18 +28,24 @@ from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
-from scripts import cloud_tables
+from scripts import agent_reference, cloud_tables
 from scripts.page_contract import formula, page_contract
 
 __all__ = [
     "agent",
     "alarms",
+    "car_yaml",
     "cost",
+    "decisions",
     "derived",
+    "errors",
+    "example",
     "fields",
     "headline",
     "manual",
+    "measured",
     "metrics",
+    "month",
     "page_contract",
     "rules",
     "settings",
@@ -48,8 +56,14 @@ FILES = tuple(
     ROOT / name
     for name in (
         "README.md",
+        "docs/decisions/index.md",
+        "docs/explanation/benchmark.md",
         "docs/how-to/alarms.md",
+        "docs/reference/car-yaml.md",
+        "docs/reference/clients.md",
         "docs/reference/deployment.md",
+        "docs/reference/errors.md",
+        "docs/reference/fields.md",
         "docs/reference/metrics.md",
         "docs/explanation/cost.md",
         "docs/reference/iort.md",
@@ -58,6 +72,8 @@ FILES = tuple(
     )
 )
 PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"
+EXAMPLES = ROOT / "docs" / "examples"
+DECISIONS = ROOT / "docs" / "decisions"
 REPORT = ROOT / "docs" / "bench" / "report.json"
 
 
@@ -123,6 +139,16 @@ def cost(name: str) -> None:
     _table(rows.head, rows.body)
 
 
+def month() -> None:
+    """What a small deployment costs a month, in a sentence."""
+    rows = {row[0]: row[1] for row in report.month(Usage(hours_per_day=2)).body}
+    aws = {name: float(dollars) for name, dollars in rows.items() if name.startswith("AWS, ")}
+    del aws["AWS, the same driving a message a sample"]
+    driving = aws.pop("AWS, the driving")
+    print(f"A robot that drives two hours a day costs ${driving:.0f} a month on AWS, at list prices.")
+    print(f"The deployment itself costs up to ${sum(aws.values()):.0f} more, mostly for metrics and alarms.")
+
+
 def headline() -> None:
     """The kept bench report's ratios that have a target, and the machine of the measurement."""
     kept = json.loads(REPORT.read_text())
@@ -134,9 +160,63 @@ def headline() -> None:
     _table(("ratio, side by side in one run", "measured", "target", "reached"), rows)
 
 
+def measured() -> None:
+    """Five of the kept report's figures, beside the thesis'."""
+    kept = json.loads(REPORT.read_text())
+    value = {ratio["name"]: ratio["value"] for section in kept["sections"] for ratio in section["ratios"]}
+    delay_ms = 300 * value["car to subscriber with 25 ms each way / thesis' 300 ms"]
+    cycle_ms = 2 * value["node's cycle / thesis' 2 ms"]
+    query = value["query, client's processor: thesis' layout / ours"]
+    cost = 1 / value["cost with the live lane at 10 Hz / a message a sample"]
+    lost = value["samples lost over an outage"]
+    rows = [
+        ("car to dashboard, with the thesis' ping of 50 ms", f"{delay_ms:.0f} ms", "250-300 ms"),
+        ("the car's node, processor time of a sample", f"{cycle_ms:.3f} ms", "2 ms"),
+        ("a query of 14,368 points, processor time", f"1/{query:.0f}", "1"),
+        ("AWS for a robot-hour, live lane at 10 Hz", f"1/{cost:.1f}", "1"),
+        ("samples lost over 60 s without a broker", f"{lost:g}", "not measured"),
+    ]
+    _table((f"measured on {kept['machine']['date'][:10]}", "iort", "thesis"), rows)
+
+
+def car_yaml() -> None:
+    """The sections of car.yaml."""
+    for section in agent_reference.sections():
+        print(f"\n## {section.path or 'The file'}\n\n{section.meaning}\n")
+        _table(("key", "default", "allowed"), section.rows, right=False)
+
+
+def errors() -> None:
+    """The errors of the agent and of the station."""
+    rows = []
+    for module in (iort_agent.errors, iort_station.errors):
+        for name, cls in vars(module).items():
+            if isinstance(cls, type) and issubclass(cls, Exception):
+                meaning = (cls.__doc__ or "").strip().splitlines()[0].replace("``", "`")
+                rows.append((f"`{module.__name__}.{name}`", meaning))
+    _table(("error", "meaning"), rows, right=False)
+
+
+def example(name: str) -> None:
+    """A file of docs/examples."""
+    language = {".py": "python", ".mjs": "javascript"}.get(Path(name).suffix, "c")
+    print(f"```{language}\n{(EXAMPLES / name).read_text()}```")
+
+
+def decisions() -> None:
+    """The decisions by subject, each with its title."""
+    for folder in sorted(DECISIONS.iterdir()):
+        if folder.is_dir():
+            print(f"\n## {folder.name.capitalize()}\n")
+            for page in sorted(folder.glob("*.md")):
+                number, _, title = page.read_text().partition("\n")[0].removeprefix("# ").partition(". ")
+                print(f"- {number}: [{title}]({page.relative_to(DECISIONS)})")
+
+
 def manual() -> None:
     """The command `iort`, as typer describes it."""
     root: Any = typer.main.get_command(app)
+    root.commands = {name: verb.load() for name, verb in root.commands.items()}
     _whole_sentences(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root), name="iort")
     # The page has a title of its own. The text is escaped for HTML; Markdown shows an apostrophe as it is.

@@ -11,6 +11,7 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 from iort_contract import checks, limits, topics
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
+from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
@@ -71,6 +72,10 @@ def _constants() -> Iterator[str]:
             yield f"export const {name} = {literal};"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
+    # The alarms that the page can see in a car's live values.
+    cars = {name: metric.alarm for name, metric in METRICS.items() if metric.of_a_robot and metric.alarm}
+    told = {name: {"meaning": alarm.meaning, "advice": alarm.advice} for name, alarm in cars.items()}
+    yield f"export const CAR_ALARMS = {json.dumps(told, indent=2)} as const;"
     for entry in DERIVED.values():
         arguments = ", ".join(f"{name}: number" for name in entry.arguments)
         yield f"/** {entry.meaning}, {entry.unit} */"

@@ -1,6 +1,6 @@
 """Sets the checkout up: .venv, node_modules, the built page and Lambda 1's layer. Writes only inside it.
 
-    python3 scripts/setup.py [--layer lambda] [--checkov] [--oldest any|/path/to/python3.8]
+    python3 scripts/setup.py [--layer lambda] [--checkov] [--docs] [--oldest any|/path/to/python3.8]
 
 It needs only Python 3.10 or newer with the venv module. It skips a step whose inputs are unchanged since its
 last success, so another run is cheap.
@@ -67,11 +67,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
     parser.add_argument("--checkov", action="store_true", help="also install what `make check` needs")
+    parser.add_argument("--docs", action="store_true", help="also install what `make docs` needs")
     parser.add_argument("--oldest", metavar="PYTHON", help="also install the robot's tests for Python 3.8")
     asked, began = parser.parse_args(), time.monotonic()
     try:
         check_machine()
-        for step in steps(layer=bool(asked.layer), checkov=asked.checkov, oldest=asked.oldest):
+        for step in steps(
+            layer=bool(asked.layer), checkov=asked.checkov, docs=asked.docs, oldest=asked.oldest
+        ):
             run(step, began)
     except SetupError as error:
         sys.exit(f"setup: {error}")
@@ -79,7 +82,7 @@ def main() -> None:
         sys.exit("\nsetup: stopped; the same command goes on from here")
 
 
-def steps(*, layer: bool, checkov: bool, oldest: str | None) -> Iterator[Step]:
+def steps(*, layer: bool, checkov: bool, docs: bool, oldest: str | None) -> Iterator[Step]:
     """Every step in its order."""
     base = shlex.quote(str(BASE_PYTHON))
     build = "--disable-pip-version-check --no-deps --no-compile -r requirements/build.txt"
@@ -109,6 +112,12 @@ def steps(*, layer: bool, checkov: bool, oldest: str | None) -> Iterator[Step]:
         # Its requirements contradict ours.
         title = "checkov, in an environment of its own"
         yield Step("checkov", title, ("requirements/checkov.txt",), apart)
+    if docs:
+        site = (
+            f".venv/bin/uv venv --clear --python {base} build/mkdocs",
+            f"{SYNC} build/mkdocs requirements/docs.txt",
+        )
+        yield Step("docs", "mkdocs, in an environment of its own", ("requirements/docs.txt",), site)
     if oldest:
         python = OLDEST_OF_ROBOT if oldest == "any" else shlex.quote(oldest)
         right = f"import sys; assert '%d.%d' % sys.version_info[:2] == '{OLDEST_OF_ROBOT}', sys.version"

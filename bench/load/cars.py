@@ -108,15 +108,17 @@ class Publisher:
             raise OSError(f"the stand-in answered {answer.status}")
 
 
-def drive(cars: list[SimulatedCar], publisher: Publisher, stop: threading.Event) -> None:
-    """Publish every car at `RATE_HZ`, evenly spread, until ``stop`` is set."""
+def drive(
+    cars: list[SimulatedCar], publisher: Publisher, stop: threading.Event, rate_hz: float = RATE_HZ
+) -> None:
+    """Publish every car at ``rate_hz``, evenly spread, until ``stop`` is set."""
     began, turn = time.monotonic(), 0
     while not stop.is_set():
         for i, car in enumerate(cars):
-            due = began + (turn + i / len(cars)) / RATE_HZ
+            due = began + (turn + i / len(cars)) / rate_hz
             if stop.wait(max(0.0, due - time.monotonic())):
                 return
-            for update in car.updates(1 / RATE_HZ):
+            for update in car.updates(1 / rate_hz):
                 publisher.publish(update)
         turn += 1
 
@@ -127,13 +129,14 @@ def main() -> None:
     for name in ("--origin", "--publish-key", "--subscribe-key"):
         parser.add_argument(name, required=True)
     parser.add_argument("--cars", type=int, default=20)
+    parser.add_argument("--rate", type=float, default=RATE_HZ, help="Hz, of each car")
     options = parser.parse_args()
     publisher = Publisher(
         origin=options.origin, publish_key=options.publish_key, subscribe_key=options.subscribe_key
     )
     cars = [SimulatedCar(f"car{i + 1}", i + 1) for i in range(options.cars)]
     stop = threading.Event()
-    driving = threading.Thread(target=drive, args=(cars, publisher, stop))
+    driving = threading.Thread(target=drive, args=(cars, publisher, stop, options.rate))
     driving.start()
     sys.stdin.read()
     stop.set()

@@ -69,7 +69,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="iort-agent",
         description="Sends a robot's data to AWS IoT: every sample recorded, the newest one live. "
-        "Without a command, it runs.",
+        "Without COMMAND it runs: `iort-agent --config FILE`.",
     )
     parser.add_argument("--version", action="version", version=f"iort-agent {agent_version()}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -104,7 +104,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
     renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
-    if arguments and arguments[0] not in (*commands.choices, "-h", "--help", "--version"):
+    if not arguments:
+        parser.print_help(sys.stderr)
+        raise SystemExit(2)
+    first = arguments[0]
+    if first not in ("-h", "--help", "--version") and (first.startswith("-") or _REMAPPING.fullmatch(first)):
         arguments = ["run", *arguments]
     remappings = []
     if arguments and arguments[0] == "run":

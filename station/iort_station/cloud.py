@@ -10,16 +10,16 @@ import os
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-import boto3
-import botocore.session
-from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.errors import StationError
+
+if TYPE_CHECKING:
+    import boto3
 
 # The embedded cloud's description, relative to the checkout.
 EMBEDDED = Path("build/local/cloud.json")
@@ -28,7 +28,6 @@ EMBEDDED_VARIABLE = "IORT_EMBEDDED"
 
 # An embedded cloud has its own credentials; the profile in AWS_PROFILE may not exist.
 _NO_PROFILE = {"profile": (None, None, None, None)}
-_CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
 
 
 def find_embedded(folder: Path) -> Path | None:
@@ -78,6 +77,10 @@ class Cloud:
 
     @cached_property
     def _session(self) -> boto3.Session:
+        # Its import takes longer than `iort --help` may.
+        import boto3  # noqa: PLC0415 - see above
+        import botocore.session  # noqa: PLC0415 - see above
+
         return boto3.Session(
             botocore_session=None if self.access_key_id is None else botocore.session.Session(_NO_PROFILE),
             profile_name=self.profile,
@@ -111,6 +114,8 @@ class Cloud:
 
         Raises `StationError` if region or credentials are missing.
         """
+        from botocore.config import Config  # noqa: PLC0415 - as above
+
         key = service, region
         if key not in self._clients:
             try:
@@ -119,7 +124,9 @@ class Cloud:
                     region_name=region,
                     endpoint_url=self.endpoint_url,
                     verify=self.ca_bundle,
-                    config=_CONFIG,
+                    config=Config(
+                        retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20
+                    ),
                 )
             except BotoCoreError as error:
                 raise StationError(f"no AWS client for {service}: {error}") from error

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timedelta, timezone
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from iort_station.errors import StationError
+from iort_contract.messages.page import Extent
+from iort_station.errors import UsageError
 
 Time: TypeAlias = int | str | datetime
 
@@ -25,13 +26,11 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
 def duration_us(text: str) -> int:
-    """Parse a duration such as ``100ms``, ``1s``, ``10m``, ``1.5h`` or ``7d``; raises `StationError`."""
+    """Parse a duration such as ``100ms``, ``1s``, ``10m``, ``1.5h`` or ``7d``; raises `UsageError`."""
     match = _DURATION.fullmatch(text.strip())
     length_us = round(float(match[1]) * _UNITS_US[match[2]]) if match else 0
     if length_us < 1:
-        raise StationError(
-            f"duration must be a number with us, ms, s, m, h, d or w, such as 10m, got {text!r}"
-        )
+        raise UsageError(f"duration must be a number with us, ms, s, m, h, d or w, such as 10m, got {text!r}")
     return length_us
 
 
@@ -39,7 +38,7 @@ def time_us(value: Time, now_us: int) -> int:
     """Parse a time: microseconds since the epoch, a datetime, or a text such as ``now``, ``-10m`` or
     ``2026-05-04T10:00:00+02:00``. A time without a zone is local to this machine.
 
-    Raises `StationError`.
+    Raises `UsageError`.
     """
     if isinstance(value, int):
         return value
@@ -55,7 +54,7 @@ def time_us(value: Time, now_us: int) -> int:
         normal = re.sub(r"\.(\d{1,6})\d*", lambda m: "." + m[1].ljust(6, "0"), text)
         return time_us(datetime.fromisoformat(re.sub(r"[zZ]$", "+00:00", normal)), now_us)
     except (ValueError, OverflowError) as error:
-        raise StationError(
+        raise UsageError(
             f"time must be now, -10m for ten minutes ago, or ISO 8601 such as 2026-05-04T10:00:00Z, "
             f"got {value!r}"
         ) from error
@@ -76,6 +75,17 @@ def iso(t_us: int) -> str:
 def iso_s(t_us: int) -> str:
     """The time as ISO 8601 in UTC, cut to the second."""
     return _iso(t_us, "seconds")
+
+
+def between(extent: Extent) -> dict[str, Any]:
+    """An extent for JSON: its times as ISO 8601 and in milliseconds."""
+    start_us, end_us = extent["from_us"], extent["to_us"]
+    return {
+        "from": iso(start_us),
+        "from_ms": start_us // 1000,
+        "to": iso(end_us),
+        "to_ms": -(-end_us // 1000),
+    }
 
 
 def _iso(t_us: int, to: str) -> str:

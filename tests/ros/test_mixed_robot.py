@@ -250,7 +250,7 @@ def _export(mixed: Mixed, embedded: EmbeddedCloud) -> tuple[Bag, dict[str, str]]
     run, paths, failed = iort.__wrapped__(embedded), [], {}
     for name, topic in TOPICS.items():
         path = mixed.out / f"{topic.stream}.bag"
-        done = run("export", mixed.bundle.robot, topic.stream, "--last", "all", "--output", str(path))
+        done = run("export", mixed.bundle.robot, topic.stream, "--last", "all", "--out", str(path))
         if not done.exit_code:
             paths.append(path)
         elif "has no stream" not in str(done.exception):

@@ -40,15 +40,19 @@ def built(tmp_path: Path) -> Path:
 
 
 def ask(
-    page: PageServer, path: str, method: str = "GET", headers: dict[str, str] | None = None
+    page: PageServer,
+    path: str,
+    method: str = "GET",
+    headers: dict[str, str] | None = None,
+    body: str | None = None,
 ) -> tuple[http.client.HTTPResponse, bytes]:
     address = urlsplit(page.url)
     connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
-    connection.request(method, path, headers=headers or {})
+    connection.request(method, path, body and body.encode(errors="surrogatepass"), headers or {})
     answer = connection.getresponse()
-    body = answer.read()
+    content = answer.read()
     connection.close()
-    return answer, body
+    return answer, content
 
 
 @pytest.mark.parametrize(
@@ -197,6 +201,33 @@ def test_gzip_is_sent_only_if_it_is_accepted(built: Path, accepted: str, *, pack
 def test_other_methods_are_rejected(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         assert ask(page, "/", "POST")[0].status == 405
+
+
+def test_an_action_needs_a_post_of_json(built: Path) -> None:
+    """A page elsewhere can send neither this method by a link, nor this type by a form."""
+    done: list[Mapping[str, str]] = []
+
+    def act(asked: Mapping[str, str]) -> dict[str, Any]:
+        done.append(asked)
+        if not asked:
+            raise StationError("nothing was asked")
+        return {"done": True}
+
+    def post(page: PageServer, body: str, kind: str = "application/json", host: str = "localhost") -> Any:
+        headers = {"Content-Type": kind, "Host": host}
+        answer, body_ = ask(page, "/act.json", "POST", headers, body)
+        return answer.status, json.loads(body_)
+
+    with PageServer(**TOLD, actions={"act": act}, built=built) as page:
+        assert ask(page, "/act.json")[0].status == 404
+        assert post(page, '{"a": "b"}', "text/plain")[0] == 415
+        assert post(page, '{"a": "b"}', host="evil.example")[0] == 403
+        for wrong in ("", "[]", '{"a": 1}', "\ud800"):
+            assert post(page, wrong)[0] == 400
+        assert not done
+        assert post(page, "{}") == (400, {"error": "nothing was asked"})
+        assert post(page, '{"a": "b"}') == (200, {"done": True})
+    assert done == [{}, {"a": "b"}]
 
 
 def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:

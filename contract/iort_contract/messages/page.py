@@ -37,6 +37,12 @@ class RobotsAnswer(TypedDict):
     robots: dict[str, RobotPresence]
 
 
+class TagsAnswer(TypedDict):
+    """Answers ``tags``: each robot's tags, which are the attributes of its thing."""
+
+    tags: dict[str, dict[str, str]]
+
+
 class VehiclesAnswer(TypedDict):
     """Answers ``vehicles``: as in `Config`."""
 
@@ -135,6 +141,54 @@ class Alarm(TypedDict):
     since_s: float
 
 
+class Acknowledged(TypedDict):
+    """Who has seen an alarm, and when."""
+
+    by: str
+    at_s: float
+
+
+class AlarmEntry(Alarm):
+    """An alarm with its entry in the catalogue. ``robots`` are the cars that it may be about;
+    ``named`` says whether an alert has named them. ``acknowledged`` is null unless it is raised and
+    somebody has seen it since."""
+
+    key: str
+    meaning: str
+    advice: str
+    evidence: Literal["quarantine", "logs", "cars"]
+    threshold: float | None
+    robots: list[str]
+    named: bool
+    acknowledged: Acknowledged | None
+
+
+class AlarmsAnswer(TypedDict):
+    """Answers ``alarms``, the raised ones first; ``user`` is who acknowledges if the viewer gives no name."""
+
+    alarms: list[AlarmEntry]
+    user: str
+
+
+class Rejected(TypedDict):
+    """A message in quarantine; ``robot`` is "-" if it is unknown."""
+
+    id: str
+    robot: str
+    source: str
+    topic: str
+    reason: str
+    last_s: float
+    seen: int
+
+
+class RejectedAnswer(TypedDict):
+    """Answers ``rejected``: the newest messages in quarantine; ``found`` may exceed their number."""
+
+    rejected: list[Rejected]
+    found: int
+
+
 class _Drawn(TypedDict):
     x: int
     y: int
@@ -175,11 +229,14 @@ class Logs(TypedDict):
 
 Answer = Union[
     RobotsAnswer,
+    TagsAnswer,
     VehiclesAnswer,
     StreamsAnswer,
-    RunsAnswer,
     HistoryAnswer,
     DashboardsAnswer,
     Dashboard,
     Logs,
+    AlarmsAnswer,
+    RejectedAnswer,
+    RunsAnswer,
 ]

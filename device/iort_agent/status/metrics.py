@@ -24,7 +24,7 @@ _STATM = Path("/proc/self/statm")
 
 @dataclass(frozen=True)
 class MetricsConfig:
-    """The agent's own figures: one sample of the stream `iort_contract.AGENT_STREAM` every ``every_s``."""
+    """The agent's own figures: one sample of the stream ``agent`` every ``every_s``."""
 
     enabled: bool = setting(flag(), default=True)
     every_s: float = setting(number(1, 3600, unit="s"), 10.0)

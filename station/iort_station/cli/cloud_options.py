@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError
 
-from iort_station.cli.progress import say
+from iort_station.cli.words import say
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud, find_embedded
 from iort_station.errors import StationError
 

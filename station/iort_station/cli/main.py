@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -12,19 +10,23 @@ import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_station.cli import verbs
 from iort_station.cli.cloud_options import CloudOptions
+from iort_station.cli.lazy import Verbs
+from iort_station.cli.words import say
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
-from iort_station.errors import StationError
-from iort_station.texts import visible
+from iort_station.errors import StationError, UsageError
 
-app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
-for _name in verbs.COMMANDS:
-    app.add_typer(import_module(f"{verbs.__name__}.{_name}").commands)
+# Without markup, help needs no rich, whose import takes as long as everything else.
+app = typer.Typer(
+    cls=Verbs, no_args_is_help=True, rich_markup_mode=None, help="The operator's station of iort."
+)
 
 
 def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by position
     if asked:
+        # It reads packages' descriptions with a parser for mail.
+        from importlib.metadata import version  # noqa: PLC0415 - see above
+
         typer.echo(f"iort {version('iort-station')}")
         raise typer.Exit
 
@@ -61,9 +63,12 @@ def said(error: OSError) -> str:
 
 
 def main() -> None:
-    """Run the command. An expected error prints one line on standard error, and exits with status 1."""
+    """Run the command. An expected error prints one line on standard error; the status is 2 for wrong use,
+    and otherwise 1."""
     try:
-        app()
+        app(prog_name="iort")
+    except UsageError as error:
+        _end(str(error), 2)
     except StationError as error:
         _end(str(error))
     except ClientError as error:
@@ -76,5 +81,10 @@ def main() -> None:
         sys.exit(130)
 
 
-def _end(text: str) -> NoReturn:
-    sys.exit(visible(f"iort: {text}"))
+def _end(text: str, status: int = 1) -> NoReturn:
+    say(text)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

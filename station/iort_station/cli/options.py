@@ -1,67 +1,78 @@
-"""Options that several commands have, and the ranges of time that they name."""
+"""The options that several verbs have: each has one name and one meaning, in every verb."""
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from typing_extensions import Self
 
-from iort_station.cli.progress import say
-from iort_station.errors import StationError
+from iort_contract.catalog.derived import DERIVED
+from iort_station.cli import completion
+from iort_station.cli.words import say
+from iort_station.errors import UsageError
 from iort_station.times import duration_us, has_zone, time_us
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
-OneRobot = Annotated[str | None, typer.Option("--robot", help="Only this robot.")]
-Token = Annotated[
-    str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
+Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
+Stream = Annotated[
+    str, typer.Argument(help="The stream, for example vesc.", autocompletion=completion.streams)
 ]
-Robot = Annotated[str, typer.Argument(help="The robot's name.")]
-Stream = Annotated[str, typer.Argument(help="The stream, for example vesc.")]
-Every = Annotated[str | None, typer.Option(help="Combine samples: 100ms, 1s, 1m.")]
+OneRobot = Annotated[
+    str | None, typer.Option("--robot", help="Only this robot.", autocompletion=completion.robots)
+]
+Fields = Annotated[
+    str | None,
+    typer.Option(
+        "--fields",
+        help=f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived.",
+        autocompletion=completion.fields,
+    ),
+]
+Where = Annotated[
+    str | None, typer.Option("--where", help="Filter, for example 'speed_mps > 1.2 and fault_code == 0'.")
+]
+Every = Annotated[str | None, typer.Option("--every", help="Combine samples: 100ms, 1s, 1m.")]
 From = Annotated[
     str | None,
     typer.Option("--from", help="Start time: -10m, 2026-05-04T10:00:00Z. With --to alone: the beginning."),
 ]
 To = Annotated[str | None, typer.Option("--to", help="End time (exclusive). With --from alone: now.")]
 Last = Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d; or all.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. A script must give it.")]
+Token = Annotated[
+    str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
+]
 
-_USUAL = "5m"
+# The range of a verb that would otherwise read years.
+SHORT = "5m"
+
+
+def to_file(help_text: str) -> Any:
+    """The option --out, where a verb writes; its help says what."""
+    return typer.Option("--out", "-o", help=help_text)
+
+
+def agreed(question: str, *, yes: bool) -> None:
+    """Ask before something is destroyed; a no ends the command.
+
+    Raises `UsageError` where nobody can answer.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(f"{question} Nobody can answer here: give --yes")
+    typer.confirm(question, abort=True, err=True)
 
 
 def names(fields: str | None) -> list[str] | None:
     """The names in a comma-separated list; None for an empty one."""
     return [name.strip() for name in (fields or "").split(",") if name.strip()] or None
-
-
-def since_us(text: str) -> int:
-    """A time in microseconds from ``10m`` (ago) or ISO 8601; raises `StationError`."""
-    now_us = time.time_ns() // 1000
-    if text[:1].isdigit() and text[-1:].isalpha() and "T" not in text:
-        return now_us - duration_us(text)
-    return time_us(text, now_us)
-
-
-def bounds(
-    start: str | None, end: str | None, last: str | None, now_us: int
-) -> tuple[int | None, int | None]:
-    """The range of --from, --to and --last in microseconds; None for an open side.
-
-    Raises `StationError` for a text that is not a time, and if the options contradict one another.
-    """
-    if last is not None:
-        if start is not None or end is not None:
-            raise StationError("give --last, or --from and --to")
-        return now_us - duration_us(last), None
-    start_us = None if start is None else time_us(start, now_us)
-    end_us = None if end is None else time_us(end, now_us)
-    if start_us is not None and end_us is not None and start_us > end_us:
-        raise StationError("the range ends before it starts")
-    return start_us, end_us
 
 
 @dataclass(frozen=True)
@@ -72,20 +83,25 @@ class Range:
     end_us: int | None
 
     @classmethod
-    def of(cls, start: str | None, end: str | None, last: str | None) -> Self:
-        """The range of the options; raises `StationError` if they contradict one another."""
+    def of(cls, start: str | None, end: str | None, last: str | None, usual: str = "all") -> Range:
+        """The range of --from, --to and --last; ``usual`` is the --last of a command without any of them.
+
+        Raises `UsageError` for a text that is not a time, and if the options contradict one another.
+        """
         now_us = time.time_ns() // 1000
         if start is None and end is None:
-            if last == "all":
-                return cls(None, None)
-            if last is None:
-                say(f"no range is given: the last {_USUAL}; --last all reads everything")
-                last = _USUAL
-        elif end is None and last is None:
-            end = "now"
+            if last is None and usual != "all":
+                say(f"no range is given: the last {usual}; --last all reads everything")
+            last = last or usual
+            return cls(None, None) if last == "all" else cls(now_us - duration_us(last), now_us)
+        if last is not None:
+            raise UsageError("give --last, or --from and --to")
         for text in (start, end):
             if text is not None and not has_zone(text):
                 zone = datetime.now().astimezone()
                 say(f"{text} is read as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
-        start_us, end_us = bounds(start, end, last, now_us)
-        return cls(start_us, now_us if end_us is None else end_us)
+        start_us = None if start is None else time_us(start, now_us)
+        end_us = now_us if end is None else time_us(end, now_us)
+        if start_us is not None and start_us > end_us:
+            raise UsageError("the range ends before it starts")
+        return cls(start_us, end_us)

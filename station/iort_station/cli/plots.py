@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from iort_station.data import Result
 from iort_station.data.positions import PositionFields, fixes, local_metres, position_fields
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
+from iort_station.output import whole
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
 # By default: of a known stream these fields, of another the first few.
+_KINDS = (".pdf", ".png", ".svg")
 _USUAL = {"vesc": ("speed_mps", "current_motor", "voltage_input", "temperature_pcb")}
 _PANELS = 4
 _DASHES = ("-", "--", ":", "-.")
@@ -129,12 +131,17 @@ def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
     return _finished(figure, runs, "line: median")
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a picture as png, svg or pdf, by the file's ending. Raises `StationError`."""
-    kinds = {".png", ".svg", ".pdf"}
-    if path.suffix.lower() not in kinds:
-        raise StationError(f"the file must end in {', '.join(sorted(kinds))}, got {path}")
-    figure.savefig(path, dpi=160, facecolor="white")
+def check_ending(path: Path) -> None:
+    """Raise `UsageError` if the file's ending names no kind of picture."""
+    if path.suffix.lower() not in _KINDS:
+        raise UsageError(f"the file must end in {', '.join(_KINDS)}, got {path}")
+
+
+def save(figure: Figure, path: Path, *, force: bool = False) -> None:
+    """Write a picture as png, svg or pdf, by the file's ending. Raises `StationError` if the file exists."""
+    check_ending(path)
+    with whole(path, force=force) as part:
+        figure.savefig(part, format=path.suffix.lower()[1:], dpi=160, facecolor="white")
 
 
 def position_of(result: Result) -> PositionFields:

@@ -1,25 +1,21 @@
-"""Progress on standard error: a line, or a bar if somebody looks."""
+"""Progress on standard error: a bar, if somebody looks."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
 from iort_station.cli.console import errors
-from iort_station.data.batches import PageProgress
-from iort_station.texts import visible
+
+if TYPE_CHECKING:
+    from iort_station.data.batches import PageProgress
 
 # A bar that would be gone sooner is not shown.
 _PATIENCE_S = 1.0
-
-
-def say(text: str) -> None:
-    """Print a line on standard error, where it does not get into a pipe."""
-    print(visible(f"iort: {text}"), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from botocore.exceptions import ClientError
 
 from iort_station.cost.prices import PRICES, Price
 from iort_station.errors import StationError
+from iort_station.output import cache
 
 # The region of the API, which knows all regions' prices.
 API_REGION = "us-east-1"
@@ -169,8 +170,7 @@ def _known(products: list[Mapping[str, Any]]) -> str:
 
 def kept_at(environment: Mapping[str, str]) -> Path:
     """The file in which `iort cost --refresh` keeps the prices."""
-    home = environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".cache"
-    return Path(home) / "iort" / "prices.json"
+    return cache(environment) / "prices.json"
 
 
 def keep(listed: Listed, path: Path) -> None:

@@ -13,13 +13,13 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.tables import BATCH, ROBOT, STREAMS
+from iort_contract.tables import BATCH, STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
-from iort_station.data.blocks import Block, values
+from iort_station.data.blocks import Block, join, values
 from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
-from iort_station.errors import StationError
+from iort_station.errors import StationError, unknown
 from iort_station.fleet import registry
 from iort_station.times import iso
 
@@ -36,42 +36,41 @@ def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
 
 
 def check_there(cloud: Cloud, robot: str, stream: str) -> None:
-    """Raise `StationError` for an unknown robot or stream, naming the known ones.
+    """Raise `StationError` for an unknown robot or stream, naming the nearest ones.
 
     The samples of a removed robot stay, and so does its name here.
     """
     if _has_batches(cloud, robot, stream):
         return
-    has = ", ".join(streams_of(cloud, robot))
+    has = check_recorded(cloud, robot)
     if not has:
-        check_registered(cloud, robot)
-    raise StationError(f"{robot} has no stream {stream}; it has {has or 'sent nothing yet'}")
+        raise StationError(f"{robot} has no stream {stream}; it has sent nothing yet")
+    raise unknown(f"{robot} has no stream {stream}", [stream], has, f"iort streams {robot}")
 
 
-def check_registered(cloud: Cloud, robot: str) -> None:
-    """Raise `StationError` for a robot that is not registered, naming those that are."""
-    if registry.find(cloud, robot) is None:
-        known = sorted(str(row[ROBOT]) for row in registry.listed(cloud))
-        raise StationError(f"robot {robot} is not registered; registered are: {', '.join(known) or 'none'}")
+def check_recorded(cloud: Cloud, robot: str) -> list[str]:
+    """The streams of a robot; raises `StationError` for one that has none and is not registered."""
+    has = streams_of(cloud, robot)
+    if not has:
+        registry.get(cloud, robot)
+    return has
 
 
 def unknown_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) -> StationError:
-    """The error for a selection that names a field other than those ``there``, naming the known ones."""
-    unknown = sorted(selection.named() - there)
+    """The error for a selection that names a field other than those ``there``, naming the nearest ones."""
+    missing = sorted(selection.named() - there)
     stored_fields = _fields(cloud, selection)
     possible = stored_fields | {
         name for name, sources in SOURCES.items() if stored_fields.issuperset(sources)
     }
-    for name in unknown:
+    for name in missing:
         if name in possible and PARAMETERS[name]:
             parameter = PARAMETERS[name][0]
             return StationError(
                 f"{name} needs the {parameter} of {selection.robot}, which the registry lacks"
             )
-    return StationError(
-        f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
-        f"it has {', '.join(sorted(possible))}"
-    )
+    problem = f"{selection.robot} has no {', '.join(missing)} in {selection.stream} in this range"
+    return unknown(problem, missing, possible, f"iort streams {selection.robot}")
 
 
 def kind_of(cloud: Cloud, selection: Selection) -> MessageType | None:
@@ -88,8 +87,12 @@ def kind_of(cloud: Cloud, selection: Selection) -> MessageType | None:
     before = [kind for t_us, kind in kinds if selection.end_us is None or t_us < selection.end_us]
     if kinds:
         return before[-1] if before else kinds[0][1]
-    is_vesc = _fields(cloud, selection).issuperset(_VESC_FIELDS)
-    return MessageType(selection.stream, "", VESC_KIND, "", "") if is_vesc else None
+    return assumed_kind(selection.stream, _fields(cloud, selection))
+
+
+def assumed_kind(stream: str, fields: AbstractSet[str]) -> MessageType | None:
+    """The type of a stream without a published one: a VESC's, or None."""
+    return MessageType(stream, "", VESC_KIND, "", "") if fields >= _VESC_FIELDS else None
 
 
 def types_of(cloud: Cloud, robot: str) -> Iterator[tuple[int, MessageType]]:
@@ -151,6 +154,12 @@ def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
 def _blocks(cloud: Cloud, robot: str, stream: str, start_us: int | None = None) -> Iterator[Block]:
     selection = Selection(robot=robot, stream=stream, start_us=start_us)
     return blocks(stored(cloud, selection), RefusedItems())
+
+
+def newest_block(cloud: Cloud, robot: str, stream: str) -> Block:
+    """The samples of a stream's newest batch."""
+    item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
+    return join(list(blocks([[item]] if item else [], RefusedItems())))
 
 
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:

@@ -114,7 +114,7 @@ def query(
     def watched() -> Iterator[Block]:
         nonlocal ros2
         for block in found:
-            ros2 = ros2 or _has_fraction(block)
+            ros2 = ros2 or has_fraction(block)
             yield block
 
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
@@ -177,7 +177,7 @@ def samples(
         raise inventory.unknown_fields(cloud, selection, there)
 
 
-def _has_fraction(block: Block) -> bool:
+def has_fraction(block: Block) -> bool:
     """Whether charge or energy has fractions, which only the ROS 2 driver sends; the ROS 1 driver counts."""
     return any(
         column.dtype.kind == "f" and bool((column > np.floor(column)).any())

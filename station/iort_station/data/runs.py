@@ -75,9 +75,7 @@ def runs(
     that goes on after its end up to there. Raises `StationError` for an unknown robot.
     """
     if streams is None:
-        streams = [name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS]
-        if not streams:
-            inventory.check_registered(cloud, robot)
+        streams = [name for name in inventory.check_recorded(cloud, robot) if name not in OWN_STREAMS]
     reports, *readers = (_Reader(cloud, robot, stream) for stream in (ACCOUNT_STREAM, *streams))
 
     def parts(reader: _Reader) -> list[Part]:

@@ -27,7 +27,7 @@ from iort_station.data.batches import Item, PageProgress, ahead, summary_table, 
 from iort_station.data.blocks import Block, column_of, objects
 from iort_station.data.conditions import holds
 from iort_station.data.selection import Selection
-from iort_station.errors import StationError
+from iort_station.errors import unknown
 
 # The counts of a second.
 _COUNTS = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
@@ -59,14 +59,12 @@ def seconds(
             yield block
     # A condition must name a single statistic.
     compared = expression.names(selection.condition) if selection.condition is not None else set()
-    unknown = sorted(
+    missing = sorted(
         {name for name in selection.named() if not _stands_for(name, there)} | (compared - there.keys())
     )
-    if there and unknown:
-        raise StationError(
-            f"the summary of {selection.robot} {selection.stream} has no {', '.join(unknown)}; "
-            f"it has {', '.join(there)}"
-        )
+    if there and missing:
+        problem = f"the summary of {selection.robot} {selection.stream} has no {', '.join(missing)}"
+        raise unknown(problem, missing, there, f"iort streams {selection.robot}")
 
 
 def stored(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:

@@ -68,11 +68,16 @@ def listed(
 
 
 def download(
-    cloud: Cloud, file: StoredFile, out: Path, progress: CountProgress = lambda _bytes: None
+    cloud: Cloud,
+    file: StoredFile,
+    out: Path,
+    progress: CountProgress = lambda _bytes: None,
+    *,
+    force: bool = False,
 ) -> Path:
     """Download a file to ``out/<its name>``, continuing a partial download; returns its path.
 
-    Raises `StationError` for a wrong SHA-256, and if another file has this name.
+    Raises `StationError` for a wrong SHA-256, and if another file has this name, unless ``force``.
     """
     client, bucket = cloud.client("s3"), _bucket(cloud)
     head = client.head_object(Bucket=bucket, Key=file.key)
@@ -82,7 +87,8 @@ def download(
         if _sha256(path).hexdigest() == said:
             progress(file.size)
             return path
-        raise StationError(f"{path} is another file: move it away, or choose --out")
+        if not force:
+            raise StationError(f"{path} is another file: give another --out, or overwrite it with --force")
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{said[:12]}.part")
     digest = _sha256(part) if part.exists() else hashlib.sha256()

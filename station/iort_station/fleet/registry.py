@@ -25,7 +25,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError
+from iort_station.errors import StationError, unknown
 
 _serialize = TypeSerializer().serialize
 
@@ -84,8 +84,14 @@ def get(cloud: Cloud, robot: str) -> dict[str, Any]:
     """A robot's row; raises `StationError` if it is not registered."""
     row = find(cloud, robot)
     if row is None:
-        raise StationError(f"robot {robot} is not registered")
+        raise not_registered(cloud, robot)
     return row
+
+
+def not_registered(cloud: Cloud, robot: str) -> StationError:
+    """The error for a robot that is not registered, with the names nearest to it."""
+    known = (str(row[ROBOT]) for row in listed(cloud))
+    return unknown(f"robot {robot} is not registered", [robot], known, "iort robots list")
 
 
 def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
@@ -124,7 +130,7 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
             ReturnValues="UPDATED_OLD",
         )
     except dynamodb.exceptions.ConditionalCheckFailedException as error:
-        raise StationError(f"robot {robot} is not registered") from error
+        raise not_registered(cloud, robot) from error
     return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
 
 

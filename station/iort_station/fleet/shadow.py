@@ -16,6 +16,7 @@ from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAS
 from iort_contract.topics import COMMANDS, SHADOW, check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 
 _POLL_S = 0.3
 # HTTP's Date has whole seconds, so smaller differences may be rounding.
@@ -73,7 +74,7 @@ class Shadow:
         try:
             answer = iot.describe_thing(thingName=robot)
         except iot.exceptions.ResourceNotFoundException as error:
-            raise StationError(f"robot {robot} is not registered: `iort robots list`") from error
+            raise registry.not_registered(cloud, robot) from error
         _check_clock(answer["ResponseMetadata"]["HTTPHeaders"].get("date"), began_s, time.time())
         self.data = cloud.client("iot-data")
 

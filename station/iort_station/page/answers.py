@@ -1,4 +1,4 @@
-"""Answers to the live page: the cars' parameters, a car's past, and CloudWatch's dashboards.
+"""Answers to the live page: the cars' parameters, a car's past, alarms, and CloudWatch's dashboards.
 
 Each answer is a function of the request's parameters; its type is in `iort_contract.messages.page`.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
+from iort_contract.messages.page import Acknowledged, Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
 from iort_station import data
@@ -22,8 +22,8 @@ from iort_station.data.blocks import Column, values
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
-from iort_station.fleet import registry
-from iort_station.operations import cloudwatch, cloudwatch_logs
+from iort_station.fleet import registry, tags
+from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
 
 # No chart is wider, in points.
 MAX_ROWS = 5_000
@@ -38,6 +38,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer, by its name."""
     return {
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
+        "tags": lambda _asked: {"tags": tags.listed(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
         "runs": lambda asked: _runs(cloud, asked),
@@ -52,6 +53,17 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
             _whole(asked, "widget", 0, 500),
             minutes=_whole(asked, "minutes", 1, 14 * 24 * 60),
         ),
+        "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
+        "rejected": lambda _asked: alarms.rejected(cloud),
+    }
+
+
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Acknowledged]]:
+    """Every action, by its name."""
+    return {
+        "acknowledge": lambda asked: alarms.acknowledge(
+            cloud, _text(asked, "alarm"), _whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
+        )
     }
 
 

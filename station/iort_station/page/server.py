@@ -55,9 +55,10 @@ class PageServer(BackgroundServer):
     """The page's web server, in threads of its own.
 
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
-    from the parameters of the request. The server accepts a Host that is localhost, an address or one of
-    ``names``, and no other. Raises `StationError` if the page is not built, if the port is in use, and for a
-    configuration that it must not serve.
+    from the parameters of the request. ``actions`` are those that change something: they need a POST. The
+    server accepts a Host that is localhost, an address or one of ``names``, and no other. Raises
+    `StationError` if the page is not built, if the port is in use, and for a configuration that it must not
+    serve.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class PageServer(BackgroundServer):
         vehicles: Mapping[str, Mapping[str, float]] | None = None,
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
+        actions: Mapping[str, Answer] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         names: Iterable[str] = (),
@@ -77,6 +79,7 @@ class PageServer(BackgroundServer):
     ) -> None:
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
+        self._actions = {f"/{name}.json": action for name, action in (actions or {}).items()}
         self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
@@ -126,9 +129,11 @@ class PageServer(BackgroundServer):
         if not self._accepts(request.headers.get("Host", "")):
             refused = "this server answers to localhost, to addresses and to what --name says"
             return self._response(request, _json({"error": refused}), 403)
+        path = request.raw_path.partition("?")[0]
+        if request.method == "POST" and path in self._actions:
+            return await self._act(request, self._actions[path])
         if request.method not in {"GET", "HEAD"}:
             return self._response(request, _body(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
-        path = request.raw_path.partition("?")[0]
         answer = self._answers.get(path)
         if answer is not None:
             parameters = dict(request.query)
@@ -163,6 +168,22 @@ class PageServer(BackgroundServer):
 
         threading.Thread(target=run, name="page answer", daemon=True).start()
         return await asyncio.wrap_future(done)
+
+    async def _act(self, request: web.BaseRequest, action: Answer) -> web.StreamResponse:
+        """Answer with the result of an action; its parameters are texts in a JSON object."""
+        # A browser sends this type to another origin only after a question that is never answered here.
+        if request.content_type != TYPES[".json"]:
+            return self._response(
+                request, _json({"error": "an action needs a body of application/json"}), 415
+            )
+        try:
+            asked = json.loads(await request.text())
+        except ValueError:
+            asked = None
+        if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
+            return self._response(request, _json({"error": "the body must be an object of texts"}), 400)
+        status, body = await self._off_the_loop(lambda: _answered(action, asked))
+        return self._response(request, body, status)
 
     def _accepts(self, host: str) -> bool:
         """Whether a request's Host is ours.

@@ -3,7 +3,6 @@ plays."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import md5sum as md5sum_of
 from iort_contract.ros1.definition import parse
 from iort_station.errors import StationError
+from iort_station.output import whole
 
 Write = Callable[[int, bytes], None]
 
@@ -77,33 +77,20 @@ def checksum(kind: str, definition: str) -> str:
 
 
 @contextmanager
-def bag(path: Path) -> Iterator[Recording]:
+def bag(path: Path, *, force: bool = False) -> Iterator[Recording]:
     """A new ROS 1 bag, which appears once it is whole. Raises `StationError` if the file exists."""
-    with _new(path) as part, BagWriter(part) as writer:
+    with whole(path, force=force) as part, BagWriter(part) as writer:
         yield _Bag(writer)
 
 
 @contextmanager
-def mcap(path: Path) -> Iterator[Recording]:
+def mcap(path: Path, *, force: bool = False) -> Iterator[Recording]:
     """A new MCAP file, which appears once it is whole. Raises `StationError` if the file exists."""
-    with _new(path) as part, part.open("wb") as file:
+    with whole(path, force=force) as part, part.open("wb") as file:
         writer = McapWriter(file)
         writer.start(profile="ros1", library="iort")
         yield _Mcap(writer)
         writer.finish()
-
-
-@contextmanager
-def _new(path: Path) -> Iterator[Path]:
-    """The file to write before it is renamed to ``path``, so that a part is never taken for a recording."""
-    if path.exists():
-        raise StationError(f"{path} exists")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        part.rename(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 KINDS = {".bag": bag, ".mcap": mcap}

@@ -4,12 +4,16 @@ import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
 import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
+import { Alarms } from "./live/alarms";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
+import { Registry } from "./live/registry";
 import { observer } from "./observer";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
+import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
+import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
 import { CompareView } from "./views/compare";
 import { CloudWatchView } from "./views/cloudwatch";
@@ -20,15 +24,21 @@ import { HistoryView } from "./views/history";
 const CLOCK_S = 0.25;
 const VALUES_S = 0.04;
 
+/** The views that the bar above links to. */
+const TABS = ["fleet", "alarms", "cloudwatch"] as const;
+
 class Page {
   private readonly fleet: Fleet;
   private readonly feed: Feed;
+  private readonly registry: Registry;
+  private readonly waiting: Waiting;
   private readonly bar: StatusBar;
   private readonly fleetView: FleetView;
   private readonly carView: CarView;
   private readonly historyView: HistoryView;
   private readonly compareView: CompareView;
   private readonly cloudWatchView: CloudWatchView;
+  private readonly alarmsView: AlarmsView;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
   private route: Route = { view: "fleet" };
@@ -37,7 +47,7 @@ class Page {
   private valuesAt = -Infinity;
 
   constructor(
-    private readonly config: Config,
+    config: Config,
     table: FieldTable,
   ) {
     this.fleet = new Fleet(config, table);
@@ -45,13 +55,17 @@ class Page {
       this.bar.linked(state);
       this.clockAt = -Infinity;
     });
-    this.bar = new StatusBar(config, this.fleet, table);
-    this.fleetView = new FleetView(config, this.fleet, table);
+    this.registry = new Registry(config);
+    this.waiting = new Waiting(config, this.registry);
+    const alarms = new Alarms(config, this.fleet, table);
+    this.bar = new StatusBar(config, this.fleet, alarms, table);
+    this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(this.fleet, table, this.tools);
     this.historyView = new HistoryView(config, table, this.fleet);
     this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
-    for (const [id, to] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) byId(id).setAttribute("href", route({ view: to }));
+    this.alarmsView = new AlarmsView(config, alarms);
+    for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
     window.addEventListener("hashchange", () => this.go());
     window.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("visibilitychange", () => !document.hidden && this.frame());
@@ -64,22 +78,23 @@ class Page {
     this.route = readRoute(location.hash);
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, compare: this.compareView, cloudwatch: this.cloudWatchView }[view];
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
     document.body.dataset["view"] = view;
-    document.title = robot ? `${robot} · iort` : view === "cloudwatch" ? "CloudWatch · iort" : "iort live";
+    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", compare: "Compare · iort", car: "iort live", history: "iort live" }[view];
     if (this.stage.firstElementChild !== shown.node) {
       this.stage.replaceChildren(shown.node);
       window.scrollTo(0, 0);
     }
-    for (const [id, name] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) {
-      if (view === name) byId(id).setAttribute("aria-current", "page");
-      else byId(id).removeAttribute("aria-current");
+    for (const tab of TABS) {
+      if (view === tab) byId(`to-${tab}`).setAttribute("aria-current", "page");
+      else byId(`to-${tab}`).removeAttribute("aria-current");
     }
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
     this.compareView.show(this.route.view === "compare" ? this.route.query : undefined);
     this.cloudWatchView.show(view === "cloudwatch");
-    this.fleetView.show(view === "fleet");
+    this.registry.watch(view === "fleet" || view === "car");
+    if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
     this.arrange();
   }
 
@@ -101,9 +116,7 @@ class Page {
     // The view of a car waits for its car, as the fleet's view waits for the first.
     const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
     document.body.dataset["empty"] = String(waits);
-    byId("empty-name").textContent = robot ?? "a car";
-    byId("empty-past").hidden = robot === undefined || !this.config.answers;
-    if (robot !== undefined) byId("empty-past").setAttribute("href", route({ view: "history", robot }));
+    this.waiting.show(robot);
     this.clockAt = -Infinity;
   }
 
@@ -117,7 +130,9 @@ class Page {
   /** Left and right change the car; Escape leaves it. */
   private key(event: KeyboardEvent): void {
     const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
-    if (this.route.view === "fleet" || inField || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (this.route.view === "fleet") this.fleetView.key(event);
+    if (this.route.view === "fleet" || inField) return;
     if (event.key === "Escape") location.hash = "robot" in this.route && this.route.view === "history" ? route({ view: "car", robot: this.route.robot }) : route({ view: "fleet" });
     if (this.route.view !== "car") return;
     const [before, after] = this.neighbours(this.route.robot);
@@ -142,9 +157,11 @@ class Page {
     this.clockAt = at;
     const linked = this.feed.state.kind === "live";
     this.bar.clock(at, this.feed.state);
+    if (document.body.dataset["empty"] === "true") this.waiting.show("robot" in this.route ? this.route.robot : undefined);
     if (view === "fleet") this.fleetView.clock(at, linked);
     if (view === "car") this.carView.clock(at, linked);
     if (view === "history") this.historyView.clock(at);
+    if (view === "alarms") this.alarmsView.clock(at);
   };
 }
 

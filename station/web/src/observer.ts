@@ -4,7 +4,7 @@ import { now } from "./base/clock";
 import type { Feed } from "./live/feed";
 import type { Fleet } from "./live/fleet";
 import { GONE_S, STALE_S } from "./base/contract";
-import { BOUNDS } from "./live/robot";
+import { BOUNDS } from "./live/bounds";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

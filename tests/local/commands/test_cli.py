@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from iort_contract.messages.files import File, file_key
 from iort_station.cli.main import app
-from iort_station.cloud import Cloud
+from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud
 from iort_station.cost.usage import Usage
+from tests.local.conftest import run_agent, until
 from tests.ports import free_port
 
 
@@ -26,7 +31,10 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     shown = iort("robots", "list").stdout
     assert f"{'cli-car':<8}" in shown
     assert "speed_to_erpm_gain 3000" in shown
-    assert iort("robots", "remove", "cli-car").exit_code == 0
+    assert iort("robots", "tag", "cli-car", "lab=north", "team=blue").exit_code == 0
+    assert iort("robots", "tag", "cli-car", "--remove", "team").output == "lab=north\nvehicle=vesc\n"
+    assert "a tag's value must be" in str(iort("robots", "tag", "cli-car", "lab=two words").exception)
+    assert iort("robots", "remove", "cli-car", "--yes").exit_code == 0
     assert "cli-car" not in iort("robots", "list").output
 
 
@@ -35,7 +43,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "robot nobody is not registered; registered are: "),
+        (("files", "list", "nobody"), "robot nobody is not registered; the nearest: "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
         (("files", "get", "nobody"), "robot nobody is not registered"),
         (("trace", "nobody"), "robot nobody is not registered"),
@@ -99,3 +107,36 @@ def test_the_cost_covers_the_deployed_resources(iort):
 def test_a_robot_cannot_be_added_twice(iort, tmp_path):
     assert iort("robots", "add", "twice", "--out", str(tmp_path / "a")).exit_code == 0
     assert "already registered" in str(iort("robots", "add", "twice", "--out", str(tmp_path / "b")).exception)
+
+
+@pytest.fixture
+def tab(embedded, tmp_path):
+    """What bash offers after these words: `tab("query", "ca")`."""
+
+    def offered(*words, embedded_file=embedded.folder / EMBEDDED.name):
+        asked = {
+            "_IORT_COMPLETE": "complete_bash",
+            "COMP_WORDS": " ".join(["iort", *words]),
+            "COMP_CWORD": str(len(words)),
+            EMBEDDED_VARIABLE: str(embedded_file),
+            "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        }
+        command = Path(sys.executable).parent / "iort"
+        done = subprocess.run(
+            [command], env={**os.environ, **asked}, capture_output=True, text=True, timeout=60, check=True
+        )
+        assert done.stderr == ""
+        return done.stdout.split()
+
+    return offered
+
+
+def test_tab_offers_names_and_never_an_error(tab, bundle, embedded):
+    robot = bundle(sources=[{"type": "sim", "duration_s": 1}])
+    run_agent(robot)
+    until(lambda: robot.robot in tab("query", robot.robot[:9]))
+    until(lambda: tab("query", robot.robot, "v") == ["vesc"])
+    offered = until(lambda: tab("query", robot.robot, "vesc", "--fields", "duty_cycle,s"))
+    assert offered == ["duty_cycle,speed", "duty_cycle,speed_mps"]
+    assert tab("query", "x", embedded_file=embedded.folder / "nowhere.json") == []
+    assert tab("robots", "re") == ["remove", "register", "revoke-claims"]

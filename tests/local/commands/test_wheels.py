@@ -66,7 +66,7 @@ def test_an_installed_car_can_be_driven_queried_and_watched(agent, station, clou
                 assert "wheels" in json.load(told)["vehicles"]
         finally:
             dashboard.terminate()
-    station.run("iort", "robots", "remove", "wheels", **cloud)
+    station.run("iort", "robots", "remove", "wheels", "--yes", **cloud)
 
 
 def test_an_error_outside_a_checkout_explains_how_to_name_the_cloud(station):

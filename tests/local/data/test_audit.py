@@ -19,9 +19,9 @@ from verify.tools.robot import Robot
 T0_US = 1_760_000_000_000_000
 
 
-def _run(embedded, *arguments):
+def _run(embedded, *arguments, verb="audit"):
     where = ["--local", "--embedded", str(embedded.folder / "cloud.json")]
-    return CliRunner().invoke(app, [*where, "audit", *arguments, "--json"])
+    return CliRunner().invoke(app, [*where, verb, *arguments, "--json"])
 
 
 def _delete(embedded, robot, stream, item):
@@ -58,6 +58,16 @@ def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedde
     (wheels,) = [one for one in json.loads(done.stdout)["streams"] if one["stream"] == "wheels"]
     (gap,) = wheels["runs"][0]["missing"]
     assert gap["first"] == gap["last"] == seq
+    # `iort runs` and `iort streams` find the same run from a few batches.
+    (run,) = json.loads(_run(embedded, car.robot, "--gaps", verb="runs").stdout)["runs"]
+    assert run["state"] == "ended"
+    assert 1.9 < run["seconds"] < 2.1
+    assert run["streams"]["wheels"]["samples"] == 200
+    assert run["streams"]["wheels"]["missing"] == 1
+    listed, *own = json.loads(_run(embedded, car.robot, verb="streams").stdout)["streams"]
+    assert (listed["stream"], listed["runs"], listed["from"]) == ("wheels", 1, run["from"])
+    assert {"name": "speed", "unit": "erpm"} in listed["fields"]
+    assert ACCOUNT_STREAM in [one["stream"] for one in own]
     (short,) = wheels["shortfalls"]
     assert short["samples"] == samples
     # No later number reveals the loss of the last batch; the agent's own count does.

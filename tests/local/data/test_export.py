@@ -115,7 +115,7 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
     report = run_agent(robot)
     assert report["streams"]["types"]["samples"] == 3
     exported = tmp_path / "again.bag"
-    asked = ["export", robot.robot, "vesc", "servo", "lab", "--last", "all", "--output"]
+    asked = ["export", robot.robot, "vesc", "servo", "lab", "--last", "all", "--out"]
     done = iort(*asked, str(exported), embedded=embedded)
     assert done.returncode == 0, done.stderr
     assert "2,244 messages of vesc_msgs/VescStateStamped on /sensors/core" in done.stderr

@@ -48,7 +48,7 @@ def inbox(embedded):
     sqs.delete_queue(QueueUrl=url)
 
 
-def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
+def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox, iort):
     cloud, bundle = embedded.cloud, bundle()
     now_us = time.time_ns() // 1000
     sample = {"fault_code": FAULT, "voltage_input": LOW_V, "temperature_pcb": 40.0}
@@ -84,6 +84,12 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     assert len(mails()) == 2
     (alarm,) = cloud.client("cloudwatch").describe_alarms(AlarmNames=["iort-FaultSamples"])["MetricAlarms"]
     assert alarm["StateValue"] == "ALARM"
+    # The command says which car it was, until somebody has seen it.
+    (told,) = (one for one in json.loads(iort("alarms", "--json").stdout) if one["key"] == "FaultSamples")
+    assert (told["robots"], told["named"], told["acknowledged"]) == ([bundle.robot], True, None)
+    iort("alarms", "--acknowledge", "FaultSamples", "--by", "ada")
+    shown = iort("alarms").stdout
+    assert f"cars: {bundle.robot}\n    acknowledged by ada at " in shown
 
     def lines():
         return {

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
-from iort_station.page.answers import answers
+from iort_station.page.answers import actions, answers
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
@@ -45,6 +45,7 @@ def served(embedded: EmbeddedCloud) -> PageServer:
         namespace=embedded.namespace,
         **embedded.keys.reading(),
         answers=answers(embedded.cloud),
+        actions=actions(embedded.cloud),
     )
 
 

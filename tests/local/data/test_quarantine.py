@@ -161,9 +161,9 @@ def test_errors_are_listed_and_shown(bundle, iort, entry_of):
     car = bundle()
     send(car, b"\xff\x00" + b"[bold]no markup[/bold]\x1b[2J")
     entry = entry_of(car.robot)
-    listed = json.loads(iort("errors", "--robot", car.robot, "--since", "10m", "--json").stdout)
+    listed = json.loads(iort("errors", "--robot", car.robot, "--last", "10m", "--json").stdout)
     assert [(one[ENTRY], one["seen"]) for one in listed["entries"]] == [(entry.id, 1)]
-    assert json.loads(iort("errors", "--since", "2200-01-01", "--json").stdout)["entries"] == []
+    assert json.loads(iort("errors", "--to", "2020-01-01Z", "--json").stdout)["entries"] == []
     assert car.robot in iort("errors").stdout
     shown = iort("errors", entry.id)
     assert shown.exit_code == 0

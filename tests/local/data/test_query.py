@@ -95,7 +95,7 @@ def test_the_command_writes_its_matches_and_their_number(embedded, noise, tmp_pa
     assert len(rows) == 6
     assert rows[0]["f1"] == pytest.approx(np.mean(noise["f1"][:2000]))
     assert "6 samples" in done.stderr
-    done = iort(*asked, "--format", "csv", "--output", str(tmp_path / "f1.csv"), embedded=embedded)
+    done = iort(*asked, "--format", "csv", "--out", str(tmp_path / "f1.csv"), embedded=embedded)
     assert done.returncode == 0, done.stderr
     assert len((tmp_path / "f1.csv").read_text().splitlines()) == N + 1
     done = iort("query", ROBOT, "imu", "--last", "all", embedded=embedded)
@@ -118,7 +118,7 @@ def test_a_closed_pipe_is_not_an_error(embedded):
 
 def test_the_command_draws_a_plot(embedded, noise, tmp_path):
     picture = tmp_path / "noise.svg"
-    asked = ["plot", ROBOT, STREAM, "--last", "all", "--fields", "f0,f1", "--output", str(picture)]
+    asked = ["plot", ROBOT, STREAM, "--last", "all", "--fields", "f0,f1", "--out", str(picture)]
     done = iort(*asked, "--kind", "distribution", embedded=embedded)
     assert done.returncode == 0, done.stderr
     assert f"{N:,} samples" in done.stderr

@@ -47,7 +47,7 @@ def test_a_corrected_gain_applies_to_queries_and_summaries(embedded, bundle, ior
     old = [1060 * i / 4614 for i in range(SECONDS)]
     assert speeds(embedded, car.robot) == pytest.approx(old)
     at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start_us // 1_000_000 + 2))
-    done = iort("robots", "set", car.robot, "speed_to_erpm_gain=1060", "--since", at, "--no-wait")
+    done = iort("robots", "set", car.robot, "speed_to_erpm_gain=1060", "--from", at, "--no-wait")
     assert done.exit_code == 0, done.output
     assert "speed_to_erpm_gain 1060, was 4614" in done.stdout
     assert "vesc: 4 seconds recomputed" in done.stdout

@@ -102,7 +102,7 @@ def test_every_shape_is_exported_as_it_was_recorded(
 ) -> None:
     (robot, path), exported = shaped, tmp_path / "exported.bag"
     stream = topic[1:].replace("/", "_")
-    done = iort("export", robot, stream, "--last", "all", "--output", str(exported))
+    done = iort("export", robot, stream, "--last", "all", "--out", str(exported))
     assert done.exit_code == 0, done.exception
     whole = read(path)
     recorded = whole._replace(kinds={topic: whole.kinds[topic]})

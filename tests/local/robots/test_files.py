@@ -171,7 +171,7 @@ def test_pictures_of_a_recording_are_uploaded_as_attachments(embedded, bundle, b
     assert not list((car.folder / "large").glob("*/*"))
     # An export puts the contents back; a picture without an uploaded content is empty.
     exported = tmp_path / "exported.bag"
-    done = iort("export", car.robot, "camera", "--output", str(exported))
+    done = iort("export", car.robot, "camera", "--out", str(exported))
     assert done.exit_code == 0, done.output
     went, came = raws(path), raws(exported)
     assert [raw in came for raw in went] == [True, False, True, False]

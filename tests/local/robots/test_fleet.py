@@ -206,7 +206,7 @@ def test_rotation_keeps_the_old_certificate_of_an_offline_robot(embedded, bundle
 def test_a_revoked_claim_cannot_provision(embedded, tmp_path, iort):
     claims.register(embedded.cloud, "too-late")
     lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
-    assert "lasting claims revoked: " in iort("robots", "revoke-claims").output
+    assert "lasting claims revoked: " in iort("robots", "revoke-claims", "--yes").output
     assert (
         "the claim does not connect"
         in command("provision", "--config", lasting, "--robot", "too-late", status=1).stderr
@@ -232,7 +232,8 @@ def test_invalid_arguments_are_rejected(iort, arguments, said):
     assert said in str(outcome.exception)
 
 
-def test_the_removal_of_all_robots_needs_a_confirmation(embedded, bundle, iort):
+def test_the_removal_of_a_robot_needs_a_confirmation(embedded, bundle, iort):
     car = bundle()
-    assert iort("robots", "remove", "--all").exit_code == 1
+    asked = iort("robots", "remove", car.robot)
+    assert str(asked.exception).endswith("Nobody can answer here: give --yes")
     assert registry.get(embedded.cloud, car.robot)

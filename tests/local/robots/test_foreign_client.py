@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -17,10 +19,11 @@ from local.deployment import ROOT
 from tests.local.conftest import until
 
 EXAMPLES = ROOT / "docs" / "examples"
+SMALL = EXAMPLES / "batch_and_live.py"
 CLIENT, PROVISION = EXAMPLES / "python_client.py", EXAMPLES / "python_provision.py"
 
 
-@pytest.mark.parametrize("example", [CLIENT, PROVISION])
+@pytest.mark.parametrize("example", [CLIENT, PROVISION, SMALL])
 def test_the_examples_import_no_code_of_the_project(example):
     imported = set()
     for node in ast.walk(ast.parse(example.read_text())):
@@ -80,3 +83,38 @@ def test_a_foreign_client_works_like_any_robot(embedded, car, iort):
     assert body.read() == car.config.read_bytes()
     assert not list(quarantine.entries(embedded.cloud, robot=car.robot))
     until(lambda: registry.get(embedded.cloud, car.robot)["online"] is False)
+
+
+def python(_folder):
+    return [sys.executable, SMALL]
+
+
+def javascript(_folder):
+    node = Path(sys.executable).with_name("node")
+    if not node.exists() or not (ROOT / "node_modules" / "mqtt").exists():
+        pytest.skip("needs node and the npm package mqtt: run make setup")
+    return [node, SMALL.with_suffix(".mjs")]
+
+
+def c(folder):
+    source, program = SMALL.with_suffix(".c"), folder / "batch_and_live"
+    if shutil.which("cc") is None or not Path("/usr/include/MQTTClient.h").exists():
+        pytest.skip("needs a C compiler and paho: apt install gcc libpaho-mqtt-dev libssl-dev zlib1g-dev")
+    command = ["cc", "-Wall", "-Werror", source, "-o", program, "-lpaho-mqtt3cs", "-lcrypto", "-lz"]
+    subprocess.run(command, check=True)
+    return [program]
+
+
+@pytest.mark.parametrize("language", [python, javascript, c])
+def test_a_small_client_stores_a_batch_and_shows_a_live_sample(language, embedded, bundle, tmp_path):
+    client, car = language(tmp_path), bundle()
+    endpoint = [embedded.cloud.mqtt_endpoint, str(embedded.cloud.mqtt_port)]
+    with Listener(robot=car.robot, namespace=embedded.namespace, **embedded.keys.reading()) as listener:
+        subprocess.run(
+            [*client, *endpoint, car.robot, car.folder, car.folder / "root-ca.pem"], check=True, timeout=60
+        )
+        (live,) = until(lambda: listener.heard)
+    found = until(lambda: data.query(embedded.cloud, car.robot, "arm", "-1h", "now"))
+    assert found.columns["angle"].tolist() == [0.5, 1.5]
+    assert (live.robot, live.stream, live.seq) == (car.robot, "arm", 0)
+    assert not list(quarantine.entries(embedded.cloud, robot=car.robot))

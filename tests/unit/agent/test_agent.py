@@ -375,8 +375,21 @@ def test_a_wrong_configuration_prints_a_message_and_exits_with_2(
     assert "Traceback" not in error
 
 
-@pytest.mark.parametrize("arguments", [[], ["--config", "x", "--drain-s", "-1"], ["--config", "x", "--no"]])
-def test_wrong_arguments(arguments: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["--help"], 0, "Without COMMAND it runs"),
+        ([], 2, "replace the robot's key and certificate"),
+        (["rum"], 2, "'rum' (choose from"),
+        (["--config", "x", "--drain-s", "-1"], 2, "must be 0 to 86400"),
+        (["--config", "x", "--no"], 2, "unrecognized arguments: --no"),
+    ],
+)
+def test_wrong_use_names_the_commands_or_the_argument(
+    arguments: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as raised:
         main(arguments)
-    assert raised.value.code == 2
+    assert raised.value.code == status
+    printed = capsys.readouterr()
+    assert said in (printed.err if status else printed.out)

@@ -122,7 +122,7 @@ def test_the_way_to_add_a_field_works(copy: Copy) -> None:
     hottest = "from iort_contract.catalog.vesc import hottest_degc"
     assert copy.show("hottest_degc({'temp_battery': 81.5, 'temp_fet': 40})", hottest) == 81.5
     copy.run("-m", "scripts.docs_parts")
-    assert "| `temp_battery` | degC |" in (copy.root / "README.md").read_text()
+    assert "| `temp_battery` | degC |" in (copy.root / "docs/reference/fields.md").read_text()
     assert '"temp_battery"' in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
@@ -148,7 +148,7 @@ def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
     assert copy.show(needs, "from iort_station.data.selection import select") is True
     copy.run("-m", "scripts.docs_parts")
     formula = "`duty_cycle * voltage_input * current_motor`"
-    assert f"| {formula} |" in (copy.root / "README.md").read_text()
+    assert f"| {formula} |" in (copy.root / "docs/reference/fields.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 

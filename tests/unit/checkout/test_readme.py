@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from scripts.docs_parts import ROOT
 
 README = (ROOT / "README.md").read_text()
@@ -12,16 +14,23 @@ README = (ROOT / "README.md").read_text()
 def test_the_agent_knows_the_settings_of_car_yaml(tmp_path):
     from iort_agent.config import load_config
 
-    text = next(block for block in re.findall(r"```yaml\n(.*?)```", README, re.DOTALL))
+    page = (ROOT / "docs/reference/car-yaml.md").read_text()
+    text = next(block for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL))
     (tmp_path / "car.yaml").write_text(text)
     for name in ("certificate.pem", "private.key"):
         (tmp_path / name).touch()
     assert load_config(tmp_path / "car.yaml").robot == "car7"
 
 
-def test_every_make_target_in_the_readme_exists():
+def test_the_readme_is_a_page():
+    assert len(README.splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_every_make_target_that_is_named_exists(page):
+    text = (ROOT / page).read_text()
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    named = set(re.findall(r"`make ([a-z-]+)|^make ([a-z-]+)", README, re.MULTILINE))
+    named = set(re.findall(r"`make ([a-z-]+)|^make ([a-z-]+)", text, re.MULTILINE))
     assert {first or second for first, second in named} <= targets
 
 

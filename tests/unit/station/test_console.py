@@ -72,6 +72,6 @@ def test_every_command_prints_by_the_console():
                 printing.add((name, ast.unparse(node.args[0])))
     assert printing == {
         ("cli/main.py", "f\"iort {version('iort-station')}\""),
-        ("cli/progress.py", "visible(f'iort: {text}')"),
+        ("cli/words.py", "visible(f'iort: {text}')"),
         ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': live.sample})"),
     }

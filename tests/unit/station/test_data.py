@@ -189,9 +189,9 @@ def test_summary_gives_the_seconds_that_begin_in_the_range():
     assert found.columns["speed_min"].tolist() == [1, 2]
     assert found.columns["speed_mean"].tolist() == [1.5, 1.5]
     assert found.unit("speed_min") == "erpm"
-    with pytest.raises(StationError, match="has no volts; it has n, speed_last"):
+    with pytest.raises(StationError, match="has no volts; the nearest: speed_min"):
         data.query(cloud, "car", "vesc", fields=["volts"], summary=True)
-    with pytest.raises(StationError, match="has no speed; it has n, speed_last"):
+    with pytest.raises(StationError, match="has no speed; the nearest: speed_min, speed_max, speed_mean;"):
         data.query(cloud, "car", "vesc", where="speed > 1", summary=True)
     assert len(data.query(cloud, "car", "vesc", where="speed_min > 1", summary=True)) == 1
 
@@ -221,9 +221,9 @@ def test_an_empty_range_gives_an_empty_result():
 @pytest.mark.parametrize(
     ("question", "answer"),
     [
-        ({"robot": "bus"}, "robot bus is not registered; registered are: car"),
-        ({"stream": "imu"}, "car has no stream imu; it has vesc"),
-        ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has speed, speed_mps"),
+        ({"robot": "bus"}, "robot bus is not registered; the nearest: car; `iort robots list` lists all"),
+        ({"stream": "imu"}, "car has no stream imu; the nearest: vesc; `iort streams car` lists all"),
+        ({"fields": ["volts"]}, "car has no volts in vesc in this range; the nearest: speed, speed_mps;"),
         ({"where": "volts > 1"}, "car has no volts"),
         ({"fields": ["speed_mps"]}, "speed_mps needs the speed_to_erpm_gain of car"),
         ({"where": "speed >"}, "invalid expression"),
@@ -298,3 +298,13 @@ def test_types_are_read_only_when_a_unit_is_needed():
     assert asked > before
     found.unit("speed")
     assert cloud.table.calls["query"] == asked
+
+
+def test_a_mistyped_robot_of_a_large_fleet_is_answered_with_the_three_nearest_names():
+    cloud = cloud_of(robot="lab-a-07")
+    for i in range(100):
+        cloud.table.put(ROBOTS, {"robot": serialize(f"truck{i}")})
+    for name in ("lab-b-07", "lab-a-17"):
+        cloud.table.put(ROBOTS, {"robot": serialize(name)})
+    with pytest.raises(StationError, match=r"the nearest: lab-a-17, lab-a-07, lab-b-07; `iort robots"):
+        data.query(cloud, "lab-a-70", "vesc")

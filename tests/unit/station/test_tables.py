@@ -149,7 +149,8 @@ def test_ranges_are_parsed(capsys):
     assert capsys.readouterr().err == ""
     Range.of("2023-11-14T22:13:20", None, None)
     assert "this machine's zone" in capsys.readouterr().err
-    found = Range.of(None, None, None)
+    assert Range.of(None, None, None) == Range(None, None)
+    found = Range.of(None, None, None, "5m")
     assert found.end_us - found.start_us == 300_000_000
     assert "--last all" in capsys.readouterr().err
 

@@ -1,24 +1,29 @@
-"""The commands of `iort`, in a folder for each room of the station that they use.
+"""The verbs of `iort`, in a folder for each room of the station that they use.
 
-A command reads its options, calls its room and prints the result. To add one, write a file with a
-`typer.Typer` named ``commands``, and add its name here. The order is that of `iort --help`.
+A verb reads its options, calls its room and prints the result. To add one, write a file with a `typer.Typer`
+named ``commands``, and add a line here: the file, and what `iort --help` says of the verb. The verb has the
+file's name. `iort` imports the file only when somebody uses the verb. The order is that of `iort --help`.
 """
 
-COMMANDS = (
-    "fleet.robots",
-    "fleet.files",
-    "page.pubnub",
-    "page.dashboard",
-    "operations.cost",
-    "operations.audit",
-    "data.query",
-    "data.export",
-    "data.plot",
-    "operations.trace",
-    "page.watch",
-    "page.site",
-    "operations.errors",
-    "operations.adopt",
-    "fleet.send",
-    "fleet.config",
-)
+VERBS = {
+    "fleet.robots": "The robots that may connect.",
+    "fleet.files": "Bags, images and other files that robots have uploaded.",
+    "page.pubnub": "Store PubNub's keys, encrypted, where Lambda 1 reads them.",
+    "page.dashboard": "Serve the live page until Ctrl-C.",
+    "operations.cost": "Print the cost of a fleet, at list prices.",
+    "operations.audit": "Prove that every sample of a robot arrived.",
+    "data.streams": "List a robot's streams: fields, runs, times.",
+    "data.runs": "List the runs of a robot's agent.",
+    "data.query": "Print recorded samples.",
+    "data.export": "Write a recording: MCAP or a ROS 1 bag.",
+    "data.plot": "Draw recorded samples.",
+    "operations.trace": "Measure the delay of live updates, hop by hop.",
+    "page.watch": "Show every car in the terminal, live, until Ctrl-C.",
+    "page.site": "Upload the page to the stack iort-site, which serves it.",
+    "operations.alarms": "List the alarms with what to do, or acknowledge them.",
+    "operations.errors": "List rejected messages, or show one.",
+    "operations.replay_errors": "Put rejected messages back.",
+    "operations.adopt": "Copy batches of an old telemetry table.",
+    "fleet.send": "Send a command and print the robot's answer.",
+    "fleet.config": "Show or change a robot's settings.",
+}

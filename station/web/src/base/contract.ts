@@ -10,6 +10,20 @@ export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+export const CAR_ALARMS = {
+  "FaultSamples": {
+    "meaning": "a car reports a fault",
+    "advice": "stop it and look; `iort query` with a condition on `fault_code` finds the car"
+  },
+  "TemperatureDegC": {
+    "meaning": "a car's controller is hot",
+    "advice": "let it cool; a VESC throttles by itself from 85 degC"
+  },
+  "BatteryVolts": {
+    "meaning": "a car's battery is low",
+    "advice": "change it: a lithium cell below 3 V is damaged"
+  }
+} as const;
 /** speed of the car, m/s */
 export const speed_mps = (speed: number, speed_to_erpm_gain: number, speed_to_erpm_offset: number): number => (speed - speed_to_erpm_offset) / speed_to_erpm_gain;
 /** electrical power from the battery, negative while regenerating, W */
@@ -281,6 +295,11 @@ export interface RobotsAnswer {
   readonly robots: Readonly<Record<string, RobotPresence>>;
 }
 
+/** Answers ``tags``: each robot's tags, which are the attributes of its thing. */
+export interface TagsAnswer {
+  readonly tags: Readonly<Record<string, Readonly<Record<string, string>>>>;
+}
+
 /** Answers ``vehicles``: as in `Config`. */
 export interface VehiclesAnswer {
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
@@ -358,6 +377,52 @@ export interface Alarm {
   readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
   readonly reason: string;
   readonly since_s: number;
+}
+
+/** Who has seen an alarm, and when. */
+export interface Acknowledged {
+  readonly by: string;
+  readonly at_s: number;
+}
+
+/** An alarm with its entry in the catalogue. ``robots`` are the cars that it may be about; ``named`` says whether an alert has named them. ``acknowledged`` is null unless it is raised and somebody has seen it since. */
+export interface AlarmEntry {
+  readonly name: string;
+  readonly about: string;
+  readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
+  readonly reason: string;
+  readonly since_s: number;
+  readonly key: string;
+  readonly meaning: string;
+  readonly advice: string;
+  readonly evidence: "quarantine" | "logs" | "cars";
+  readonly threshold: number | null;
+  readonly robots: readonly string[];
+  readonly named: boolean;
+  readonly acknowledged: Acknowledged | null;
+}
+
+/** Answers ``alarms``, the raised ones first; ``user`` is who acknowledges if the viewer gives no name. */
+export interface AlarmsAnswer {
+  readonly alarms: readonly AlarmEntry[];
+  readonly user: string;
+}
+
+/** A message in quarantine; ``robot`` is "-" if it is unknown. */
+export interface Rejected {
+  readonly id: string;
+  readonly robot: string;
+  readonly source: string;
+  readonly topic: string;
+  readonly reason: string;
+  readonly last_s: number;
+  readonly seen: number;
+}
+
+/** Answers ``rejected``: the newest messages in quarantine; ``found`` may exceed their number. */
+export interface RejectedAnswer {
+  readonly rejected: readonly Rejected[];
+  readonly found: number;
 }
 
 /** A dashboard's widget; ``number`` is its place in the dashboard's body. */

@@ -6,11 +6,12 @@ import { readRange, writeTime, type Range } from "./range";
 
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
-  fleet: [],
+  fleet: ["find", "sort", "group"],
   car: [],
   history: ["stream", "from", "to", "fields", "at"],
   compare: ["runs", "stream", "fields", "x"],
   cloudwatch: [],
+  alarms: [],
 } as const;
 
 /** A robot's range: a run, a lap, or any other. */
@@ -23,7 +24,7 @@ export interface Part {
 export const MOST_PARTS = 6;
 
 type View = keyof typeof PARAMETERS;
-export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string>>>;
+export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string | undefined>>>;
 
 interface Address<V extends View> {
   readonly view: V;
@@ -32,7 +33,7 @@ interface Address<V extends View> {
 interface RobotAddress<V extends View> extends Address<V> {
   readonly robot: string;
 }
-export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history">;
+export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history">;
 
 export function route(to: Route): string {
   const view = to.view === "fleet" ? "" : to.view;
@@ -48,8 +49,10 @@ export function readRoute(hash: string): Route {
   const read = <V extends View>(view: V): Query<V> =>
     Object.fromEntries(PARAMETERS[view].flatMap((key) => (values.has(key) ? [[key, values.get(key)]] : []))) as Query<V>;
   if ((name === "car" || name === "history") && robot !== undefined) return { view: name, robot, query: read(name) };
+  if (name === "cloudwatch") return { view: name, query: read(name) };
+  if (name === "alarms") return { view: name, query: read(name) };
   if (name === "compare") return { view: name, query: read(name) };
-  return name === "cloudwatch" ? { view: name, query: read(name) } : { view: "fleet", query: read("fleet") };
+  return { view: "fleet", query: read("fleet") };
 }
 
 /** Put what the view shows into the address, as a step of the browser's history if `step`. The view is not called. */

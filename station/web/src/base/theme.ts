@@ -1,6 +1,7 @@
 // Dark or light, by the system's setting or the viewer's choice. Charts take their colours from here.
 
-const KEY = "iort.theme";
+import { keep, kept } from "./kept";
+
 const CHOICES = ["auto", "light", "dark"] as const;
 type Choice = (typeof CHOICES)[number];
 
@@ -21,11 +22,7 @@ export function startTheme(button: HTMLElement): void {
   };
   button.addEventListener("click", () => {
     choice = CHOICES[(CHOICES.indexOf(choice) + 1) % CHOICES.length]!;
-    try {
-      localStorage.setItem(KEY, choice);
-    } catch {
-      // The choice lasts until the page is closed.
-    }
+    keep("theme", choice);
     apply();
   });
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", apply);
@@ -45,10 +42,6 @@ export function colour(property: string): string {
 }
 
 function stored(): Choice {
-  try {
-    const known = localStorage.getItem(KEY);
-    return CHOICES.find((choice) => choice === known) ?? "auto";
-  } catch {
-    return "auto";
-  }
+  const known = kept("theme");
+  return CHOICES.find((choice) => choice === known) ?? "auto";
 }

@@ -1,8 +1,8 @@
 // The charts of a car's view. To add one, add an entry to `CHARTS`.
 
-import { power_w, TEMPERATURES } from "../base/contract";
+import { power_w } from "../base/contract";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
-import type { Robot } from "../live/robot";
+import { hottest, type Robot } from "../live/robot";
 import type { ChartPanelOptions } from "./chart_panel";
 import type { GaugeOptions } from "./gauge";
 import type { XYChartOptions } from "./xy_chart";
@@ -46,12 +46,6 @@ const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | 
   extent: field,
   show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
-
-/** The controller's hottest temperature, as in the contract: a sensor that is not read is 0. */
-export const hottest = (newest: (field: string) => number): number => {
-  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value) && value !== 0);
-  return known.length > 0 ? Math.max(...known) : NaN;
-};
 
 const first = ([value = NaN]: readonly number[]): number => value;
 const asSent = (): readonly [Linear] => [AS_SENT];

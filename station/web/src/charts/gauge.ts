@@ -23,6 +23,7 @@ export class Gauge {
   private readonly bar = el("div", { class: "bar", "aria-hidden": "true" }, el("span", { class: "band" }), el("span", { class: "needle" }));
   private from = 0;
   private to = 1;
+  private shown = "";
 
   constructor(private readonly options: GaugeOptions) {
     const { name, label, unit } = options;
@@ -46,6 +47,9 @@ export class Gauge {
 
   /** Show a value, and the minimum and maximum of the last 30 s. */
   set(value: number, least: number, most: number, unit = this.options.unit, digits = this.options.digits): void {
+    // The extremes were in another unit before the car's parameters were known.
+    if (unit !== this.shown) this.reset();
+    this.shown = unit;
     this.value.set(number(value, digits));
     this.unit.set(unit);
     for (const each of [least, value]) if (each < this.from) this.from = roundedOut(each, Math.floor);

@@ -1,7 +1,7 @@
 // A scrolling chart of the last 30 seconds by uPlot, drawn only when it would change.
 
 import uPlot from "uplot";
-import { WINDOW_S } from "../live/robot";
+import { WINDOW_S } from "../live/bounds";
 import { AS_SENT, linear, type Linear } from "../base/format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import type { Ring } from "../live/ring";

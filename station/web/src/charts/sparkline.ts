@@ -1,6 +1,6 @@
 // A small line of the last 30 seconds, without axes.
 
-import { WINDOW_S } from "../live/robot";
+import { WINDOW_S } from "../live/bounds";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
 

@@ -1,7 +1,8 @@
 // The delay by hop: a bar for each hop of a message, which begins at the end of the one before.
 
 import { el, setAttribute, Text } from "../base/dom";
-import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/robot";
+import { MEDIAN_S } from "../live/bounds";
+import { LEGS, type Delay, type Leg, type Robot } from "../live/robot";
 import { milliseconds, NOTHING } from "../base/format";
 
 const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {

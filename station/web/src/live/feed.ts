@@ -2,6 +2,7 @@
 
 import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
+import { keep, kept } from "../base/kept";
 import type { Fleet } from "./fleet";
 import type { FromWorker, LinkState, ToWorker } from "./worker_messages";
 
@@ -37,12 +38,9 @@ export class Feed {
 /** An id for this browser: PubNub bills by users, and a reload must not be a new user. */
 function userId(): string {
   const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
-  try {
-    const known = localStorage.getItem("iort.user");
-    if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
-    localStorage.setItem("iort.user", fresh);
-  } catch {
-    // Without storage, every visit is a new user.
-  }
+  const known = kept("user");
+  if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
+  // Without storage, every visit is a new user.
+  keep("user", fresh);
   return fresh;
 }

@@ -3,7 +3,9 @@
 import type { Linear } from "../base/format";
 import { ask, AnswerError } from "../server/answers";
 import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
-import { BOUNDS, Robot, Stream } from "./robot";
+import { BOUNDS } from "./bounds";
+import { Robot } from "./robot";
+import { Stream, type Used } from "./stream";
 import type { Arrival } from "./worker_messages";
 
 export class Fleet {
@@ -15,7 +17,8 @@ export class Fleet {
   lastRefusal = "";
   /** Grows when a car or a stream is new or forgotten. */
   shape = 0;
-  private columns = 0;
+  private readonly used: Used = { columns: 0 };
+  private watched: Robot | undefined;
   private vehicles: VehiclesAnswer["vehicles"];
   private learning: Promise<void> | undefined;
 
@@ -43,7 +46,7 @@ export class Fleet {
         this.lastRefusal = "too many streams";
         return;
       }
-      stream = new Stream(update.stream, this.table, () => this.columns < BOUNDS.columns && (this.columns += 1) > 0);
+      stream = new Stream(update.stream, this.table, this.used, robot === this.watched);
       robot.streams.set(stream.name, stream);
       this.shape += 1;
     }
@@ -67,6 +70,14 @@ export class Fleet {
     return gain ? { scale: 1 / gain, shift: offset === 0 ? 0 : -offset / gain } : undefined;
   }
 
+  /** Keep the values of a car's longest window, instead of another's. */
+  watch(robot: Robot | undefined): void {
+    if (robot === this.watched) return;
+    this.watched?.watch(false);
+    this.watched = robot;
+    robot?.watch(true);
+  }
+
   /** Ask for the cars' parameters again: a car was registered after the page was opened. */
   private async learn(): Promise<void> {
     try {
@@ -83,7 +94,7 @@ export class Fleet {
     if (this.robots.size >= BOUNDS.robots) {
       const silent = [...this.robots.values()].reduce((a, b) => (a.heardAt <= b.heardAt ? a : b));
       this.robots.delete(silent.name);
-      for (const { columns } of silent.streams.values()) this.columns -= columns.size;
+      for (const stream of silent.streams.values()) stream.forget();
     }
     if (this.config.answers && !Object.hasOwn(this.vehicles, name)) {
       // Several new cars at once are one request.

@@ -1,4 +1,4 @@
-// Questions to the server that serves the page; the answers' types are in contract.ts.
+// Questions and requests to the server that serves the page; the answers' types are in contract.ts.
 
 export class AnswerError extends Error {}
 
@@ -6,13 +6,19 @@ type Parameters = Readonly<Record<string, string>>;
 
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
 export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
-  const answer = await request(`${name}.json`, parameters, signal);
+  const answer = await get(`${name}.json`, parameters, signal);
+  return (await answer.json()) as T;
+}
+
+/** Have the server change something; throws `AnswerError` if it does not, or if the change is refused. */
+export async function act<T>(name: string, parameters: Parameters): Promise<T> {
+  const answer = await answered(`${name}.json`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(parameters) });
   return (await answer.json()) as T;
 }
 
 /** Ask for a file, and report the bytes received; throws `AnswerError` also if the file is cut off. */
 export async function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<{ readonly content: Blob; readonly name: string }> {
-  const answer = await request(name, parameters, signal);
+  const answer = await get(name, parameters, signal);
   const parts: Uint8Array<ArrayBuffer>[] = [];
   let size = 0;
   try {
@@ -24,18 +30,22 @@ export async function download(name: string, parameters: Parameters, received: (
     }
   } catch (error) {
     if (signal.aborted) throw error;
-    throw new AnswerError(`The download was cut off after ${size} bytes; nothing was saved. The server's terminal has the reason.`);
+    throw new AnswerError("The download was cut off, and nothing was saved. The server's terminal has the reason.");
   }
   const named = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1];
   return { content: new Blob(parts), name: named ?? name };
 }
 
-async function request(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
+function get(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
+  return answered(`${name}?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+}
+
+async function answered(address: string, request: RequestInit): Promise<Response> {
   let answer: Response;
   try {
-    answer = await fetch(`${name}?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+    answer = await fetch(address, request);
   } catch (error) {
-    if (signal?.aborted) throw error;
+    if (request.signal?.aborted) throw error;
     throw new AnswerError("The page's server does not answer. Is `iort dashboard` still running?");
   }
   if (answer.ok) return answer;

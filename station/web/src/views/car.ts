@@ -5,7 +5,9 @@ import type { Shown } from "../charts/live_chart";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { FaultLog } from "../widgets/fault_log";
 import type { Fleet } from "../live/fleet";
-import { median, MEDIAN_S, numeric, WINDOW_S, type Robot, type Stream } from "../live/robot";
+import { MEDIAN_S, WINDOW_S } from "../live/bounds";
+import { median, type Robot } from "../live/robot";
+import { numeric, type Stream } from "../live/stream";
 import { age, AS_SENT, linear, spec, type Linear } from "../base/format";
 import { Gauge } from "../charts/gauge";
 import { ChartPanel } from "../charts/chart_panel";
@@ -47,7 +49,7 @@ export class CarView {
   private robot: Robot | undefined;
   private drawn = -1;
   /** The time at which a message was drawn, and its delay since arrival in milliseconds. */
-  private screens = new Ring(2, SCREENS);
+  private screens = new Ring(2, SCREENS, MEDIAN_S);
 
   constructor(
     private readonly fleet: Fleet,
@@ -89,7 +91,7 @@ export class CarView {
       for (const key of [...this.chosen.keys()]) this.close(key);
       for (const gauge of this.gauges) gauge.reset();
       this.drawn = -1;
-      this.screens = new Ring(2, SCREENS);
+      this.screens = new Ring(2, SCREENS, MEDIAN_S);
       this.title.set(robot?.name ?? "");
     }
     this.arrange();

@@ -1,125 +1,174 @@
-// Every car: one card each, in the order of their names, so that a card stays where it is.
+// Every car: one card each. Only the cards on the screen are updated, so that hundreds cost little more than a few.
 
 import type { Config, FieldTable } from "../base/contract";
-import { AbsentCars } from "../widgets/absent_cars";
-import { byName, el, setAttribute, Text } from "../base/dom";
+import { byName, el, Text } from "../base/dom";
+import type { Query } from "../base/route";
 import type { Fleet } from "../live/fleet";
-import { numeric, type Robot } from "../live/robot";
-import { age, linear, milliseconds, NOTHING, number } from "../base/format";
-import { route } from "../base/route";
-import { Sparkline } from "../charts/sparkline";
-import { hottest } from "../charts/car_charts";
+import type { Registry } from "../live/registry";
+import type { Robot } from "../live/robot";
+import { Card } from "../widgets/card";
+import { FleetTools } from "../widgets/fleet_tools";
+import { OfflineCars } from "../widgets/offline_cars";
+
+// A car that is gone for longer is folded: until then, its card says so in its place.
+const FOLD_S = 60;
+// Cards change places at most this often, and never under the viewer's pointer or keyboard.
+const PLACE_S = 2;
 
 export class FleetView {
   readonly node: HTMLElement;
   private readonly nav = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
-  private readonly absent: AbsentCars;
+  private readonly tools: FleetTools;
+  private readonly offline: OfflineCars;
   private readonly cards = new Map<string, Card>();
+  private readonly headings = new Map<string, { readonly node: HTMLElement; readonly count: Text }>();
+  private readonly seen = new Set<string>();
+  private readonly nothing = el("p", { class: "note", role: "status", hidden: "" }, "No car has this name or tag.");
+  private placedAt = -Infinity;
+  private known = -1;
+
+  private readonly watcher = new IntersectionObserver(
+    (entries) => {
+      for (const { target, isIntersecting } of entries) {
+        const name = (target as HTMLElement).dataset["robot"]!;
+        if (isIntersecting) this.seen.add(name);
+        else this.seen.delete(name);
+      }
+      this.refresh();
+    },
+    { rootMargin: "25%" },
+  );
+  /** Updates the cards on the screen, as the last clock did. */
+  private refresh: () => void = () => {};
 
   constructor(
     config: Config,
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
+    private readonly registry: Registry,
   ) {
-    this.absent = new AbsentCars(config, fleet);
-    this.node = el("div", { class: "fleet" }, this.nav, this.absent.node);
-    this.nav.addEventListener("keydown", (event) => this.key(event));
+    this.tools = new FleetTools(registry, table, () => (this.placedAt = -Infinity));
+    this.offline = new OfflineCars(config);
+    this.node = el("div", { class: "fleet" }, this.tools.node, this.nothing, this.nav, this.offline.node);
   }
 
-  show(shown: boolean): void {
-    this.absent.show(shown);
+  /** Show the address's choice of cars. */
+  show(query: Query<"fleet">): void {
+    this.tools.read(query);
+    this.arrange();
   }
 
-  /** Cards for the cars there are. */
+  /** There are other cars, or they have moved. */
   arrange(): void {
-    for (const [name, card] of this.cards) {
-      if (!this.fleet.robots.has(name)) {
-        card.node.remove();
-        this.cards.delete(name);
-      }
-    }
-    [...this.fleet.robots.keys()].sort(byName).forEach((name, i) => {
-      let card = this.cards.get(name);
-      if (!card) {
-        card = new Card(name);
-        this.cards.set(name, card);
-      }
-      if (this.nav.children[i] !== card.node) this.nav.insertBefore(card.node, this.nav.children[i] ?? null);
-    });
-    this.absent.arrange();
+    this.placedAt = -Infinity;
   }
 
   clock(now: number, linked: boolean): void {
-    for (const robot of this.fleet.robots.values()) {
-      this.cards.get(robot.name)?.update(robot, this.fleet, this.table, now, linked);
+    if (this.registry.version !== this.known) {
+      this.known = this.registry.version;
+      this.tools.offer();
+      this.arrange();
     }
+    const held = this.nav.matches(":hover, :focus-within") && this.placedAt > -Infinity;
+    if (now - this.placedAt >= PLACE_S && !held) this.place(now);
+    this.refresh = () => {
+      for (const name of this.seen) {
+        const robot = this.fleet.robots.get(name);
+        if (robot) this.cards.get(name)?.update(robot, this.fleet, this.table, now, linked);
+      }
+    };
+    this.refresh();
   }
 
-  /** Arrow keys move between the cards, which are links: Enter opens one. */
-  private key(event: KeyboardEvent): void {
-    const cards = [...this.nav.children] as HTMLElement[];
+  /** Arrow keys move between the cards, which are links: Enter opens one. A slash searches. */
+  key(event: KeyboardEvent): void {
+    const field = event.target instanceof Element && event.target.matches("input, select");
+    if (event.key === "/" && !field) {
+      event.preventDefault();
+      this.tools.focus();
+    }
+    if (field && !(event.key === "ArrowDown" && event.target instanceof HTMLInputElement)) return;
+    const cards = [...this.nav.querySelectorAll<HTMLElement>(".card")];
     const at = cards.indexOf(document.activeElement as HTMLElement);
-    // The number of cards in the first row.
-    const columns = Math.max(1, cards.filter((card) => card.offsetTop === cards[0]!.offsetTop).length);
-    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, ArrowDown: at + columns, ArrowUp: at - columns, Home: 0, End: cards.length - 1 }[event.key];
-    if (at < 0 || to === undefined) return;
+    const to = at < 0 ? (event.key.startsWith("Arrow") ? 0 : undefined) : neighbour(cards, at, event.key);
+    if (to === undefined) return;
     event.preventDefault();
     cards[to]?.focus();
   }
+
+  /** Put the cards in order, and fold the cars that are not heard. */
+  private place(now: number): void {
+    this.placedAt = now;
+    for (const [name, card] of this.cards) {
+      if (!this.fleet.robots.has(name)) this.remove(card);
+    }
+    const found = [...this.fleet.robots.values()].filter(({ name }) => this.tools.finds(name));
+    const folded = (robot: Robot): boolean => now - robot.heardAt > FOLD_S;
+    const nodes: HTMLElement[] = [];
+    for (const [heading, robots] of this.tools.arrange(found.filter((robot) => !folded(robot)), now)) {
+      if (heading !== "") nodes.push(this.heading(heading, robots.length));
+      nodes.push(...robots.map(({ name }) => this.card(name).node));
+    }
+    let next = this.nav.firstElementChild;
+    for (const node of nodes) {
+      if (node === next) next = next.nextElementSibling;
+      else this.nav.insertBefore(node, next);
+    }
+    while (next) {
+      const after: Element | null = next.nextElementSibling;
+      next.remove();
+      next = after;
+    }
+    const registered = Object.entries(this.registry.robots ?? {}).filter(([name]) => !this.fleet.robots.has(name) && this.tools.finds(name));
+    const away = [...registered, ...found.filter(folded).map((robot) => [robot.name, robot] as const)].sort(([a], [b]) => byName(a, b));
+    this.offline.show(away, this.fleet.robots.size === 0);
+    this.nothing.hidden = nodes.length > 0 || away.length > 0 || this.fleet.robots.size === 0;
+    // A page without cars has nothing to search.
+    this.tools.node.hidden = this.fleet.robots.size === 0 && registered.length === 0 && this.nothing.hidden;
+  }
+
+  private heading(name: string, cars: number): HTMLElement {
+    let heading = this.headings.get(name);
+    if (!heading) {
+      heading = { node: el("h2", { class: "group" }, name), count: new Text("note") };
+      heading.node.append(heading.count.node);
+      this.headings.set(name, heading);
+    }
+    heading.count.set(String(cars));
+    return heading.node;
+  }
+
+  private card(name: string): Card {
+    let card = this.cards.get(name);
+    if (!card) {
+      card = new Card(name);
+      this.cards.set(name, card);
+      this.watcher.observe(card.node);
+    }
+    return card;
+  }
+
+  private remove(card: Card): void {
+    this.watcher.unobserve(card.node);
+    card.node.remove();
+    this.cards.delete(card.name);
+    this.seen.delete(card.name);
+  }
 }
 
-class Card {
-  readonly node: HTMLElement;
-  private readonly state = new Text("card-state");
-  private readonly speed = new Text("num");
-  private readonly speedUnit = new Text("unit");
-  private readonly voltage = new Text("num");
-  private readonly temperature = new Text("num");
-  private readonly delay = new Text("num");
-  private readonly freshness = new Text("num");
-  private readonly fault = new Text("card-fault");
-  private readonly spark = new Sparkline();
-
-  constructor(name: string) {
-    const figure = (label: string, value: Text, unit: Node | string): HTMLElement =>
-      el("span", { class: "figure" }, el("span", { class: "figure-label" }, label), el("span", {}, value.node, unit));
-    const unit = (text: string): HTMLElement => el("span", { class: "unit" }, text);
-    this.node = el(
-      "a",
-      { class: "card", href: route({ view: "car", robot: name }), "data-robot": name },
-      el("span", { class: "card-head" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "card-name", title: name }, name), this.state.node),
-      el("span", { class: "card-main" }, el("span", { class: "card-speed" }, this.speed.node, this.speedUnit.node), this.spark.node),
-      el(
-        "span",
-        { class: "card-figures" },
-        figure("Battery", this.voltage, unit("V")),
-        figure("Temp.", this.temperature, unit("°C")),
-        figure("Delay", this.delay, unit("ms")),
-        figure("Age", this.freshness, ""),
-      ),
-      this.fault.node,
-    );
+/** The card that a key leads to; up and down it is the nearest one of the next row. */
+function neighbour(cards: readonly HTMLElement[], at: number, key: string): number | undefined {
+  const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: cards.length - 1 }[key];
+  if (to !== undefined) return to;
+  const { offsetTop: top, offsetLeft: left } = cards[at]!;
+  const step = { ArrowDown: 1, ArrowUp: -1 }[key];
+  if (step === undefined) return undefined;
+  let best: number | undefined;
+  for (let i = at + step; cards[i]; i += step) {
+    const card = cards[i]!;
+    if (card.offsetTop === top) continue;
+    if (best !== undefined && card.offsetTop !== cards[best]!.offsetTop) break;
+    if (best === undefined || Math.abs(card.offsetLeft - left) < Math.abs(cards[best]!.offsetLeft - left)) best = i;
   }
-
-  update(robot: Robot, fleet: Fleet, table: FieldTable, now: number, linked: boolean): void {
-    const fresh = robot.freshness(now);
-    const shown = linked || fresh === "live" ? fresh : "unlinked";
-    setAttribute(this.node, "data-state", shown);
-    this.state.set({ live: "online", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
-    this.freshness.set(age(now - (fresh === "gone" ? robot.heardAt : robot.takenAt)));
-    const fault = robot.fault(table);
-    // The state of a car that is gone is unknown.
-    this.fault.set(fresh === "gone" ? (fault ? `${fault}, when last heard` : "not heard from") : (fault ?? "no fault"));
-    setAttribute(this.node, "data-fault", String(fault !== undefined));
-    const vesc = robot.vesc(table);
-    const newest = (field: string): number => numeric(vesc?.sample.get(field));
-    const speed = fleet.speed(robot.name);
-    this.speed.set(speed ? number(linear(newest("speed"), speed), 1) : number(newest("speed"), 0));
-    this.speedUnit.set(speed ? "m/s" : "erpm");
-    this.voltage.set(number(newest("voltage_input"), 1));
-    this.temperature.set(number(hottest(newest), 0));
-    const delay = robot.newestDelay();
-    this.delay.set(delay ? milliseconds(delay.total) : NOTHING);
-    if (vesc) this.spark.draw(vesc.history, vesc.columns.get("speed"), now);
-  }
+  return best;
 }

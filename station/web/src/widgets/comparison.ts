@@ -2,7 +2,7 @@
 
 import type { Value } from "../base/contract";
 import { el, Text } from "../base/dom";
-import type { Stream } from "../live/robot";
+import type { Stream } from "../live/stream";
 import { NOTHING, number, write, type Spec } from "../base/format";
 
 interface Row {

@@ -4,7 +4,7 @@
 import { claimed, partsOf } from "../live/attachments";
 import { el, setAttribute, Text } from "../base/dom";
 import { STALE_S, type FieldTable } from "../base/contract";
-import { numeric, type Stream } from "../live/robot";
+import { numeric, type Stream } from "../live/stream";
 import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "./thumbnail";
 import { Sparkline } from "../charts/sparkline";

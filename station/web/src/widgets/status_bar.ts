@@ -2,6 +2,7 @@
 
 import type { Config, FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
+import type { Alarms } from "../live/alarms";
 import type { Fleet } from "../live/fleet";
 import { age, number } from "../base/format";
 import { now } from "../base/clock";
@@ -16,6 +17,7 @@ export class StatusBar {
   constructor(
     config: Config,
     private readonly fleet: Fleet,
+    private readonly alarms: Alarms,
     private readonly table: FieldTable,
   ) {
     write("empty-channel", `${config.namespace}.*`);
@@ -36,6 +38,7 @@ export class StatusBar {
     const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
     write("count", words.join(" · "));
     write("faulty", faulty === 0 ? "" : `${faulty} with a fault`);
+    this.badge(at);
     write("received", number(fleet.received));
     write("malformed", number(fleet.malformed));
     byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";
@@ -43,6 +46,18 @@ export class StatusBar {
     setAttribute(byId("link"), "data-state", link.kind);
     write("link-text", WORDS[link.kind]);
     this.announce(link, at);
+  }
+
+  /** The number of raised alarms, on every view. */
+  private badge(at: number): void {
+    this.alarms.clock(at);
+    const raised = this.alarms.raised(at);
+    const fresh = raised.filter((alarm) => alarm.fresh).length;
+    const badge = byId("alarms");
+    badge.hidden = raised.length === 0;
+    setAttribute(badge, "data-fresh", String(fresh > 0));
+    setAttribute(badge, "aria-label", `${raised.length} raised, ${fresh} of them not acknowledged`);
+    write("alarms", String(raised.length));
   }
 
   private announce(link: LinkState, at: number): void {

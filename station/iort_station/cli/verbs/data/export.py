@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.options import From, Last, Range, Robot, To
-from iort_station.cli.progress import reading, say
-from iort_station.errors import StationError
+from iort_station.cli.options import SHORT, Force, From, Last, Range, Robot, To, to_file
+from iort_station.cli.progress import reading
+from iort_station.cli.words import say
+from iort_station.errors import StationError, UsageError
+from iort_station.output import check_free
 
 commands = typer.Typer()
 
@@ -19,10 +21,11 @@ def export(
     context: typer.Context,
     robot: Robot,
     streams: Annotated[list[str], typer.Argument(help="One stream or more, for example vesc.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write: .mcap or .bag.")],
+    out: Annotated[Path, to_file("The file to write: .mcap or .bag.")],
     start: From = None,
     end: To = None,
     last: Last = None,
+    force: Force = False,
 ) -> None:
     """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
 
@@ -31,19 +34,24 @@ def export(
     fields. For CSV and Parquet, use iort query.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data.selection import select  # noqa: PLC0415 - see above
+    from iort_station.data.inventory import check_there  # noqa: PLC0415 - see above
+    from iort_station.data.selection import select  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
     from iort_station.recordings.export import write  # noqa: PLC0415 - as above
 
-    kind = recordings.KINDS.get(output.suffix)
+    kind = recordings.KINDS.get(out.suffix)
     if kind is None:
-        raise StationError(f"the file must end in {' or '.join(recordings.KINDS)}, got {output}")
-    cloud, when = context.obj.cloud(), Range.of(start, end, last)
+        raise UsageError(f"the file must end in {' or '.join(recordings.KINDS)}, got {out}")
+    check_free(out, force=force)
+    when = Range.of(start, end, last, SHORT)
+    cloud = context.obj.cloud()
     written = 0
-    with kind(output) as file:
+    with kind(out, force=force) as file:
         for stream in dict.fromkeys(streams):
             selection = select(robot, stream, when.start_us, when.end_us)
             with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
                 written += write(cloud, selection, file, say=say, progress=progress)
         if not written:
-            raise StationError(f"there are no samples to export; {output} is not written")
+            for stream in streams:
+                check_there(cloud, robot, stream)
+            raise StationError(f"there are no samples to export; {out} is not written")

@@ -9,10 +9,26 @@ from typing import Annotated, Any
 
 import typer
 
-from iort_station.cli.options import Every, From, Last, Range, Robot, Stream, To, names
-from iort_station.cli.progress import reading, say
+from iort_station.cli.options import (
+    SHORT,
+    Every,
+    Fields,
+    Force,
+    From,
+    Last,
+    Range,
+    Robot,
+    Stream,
+    To,
+    Where,
+    names,
+    to_file,
+)
+from iort_station.cli.progress import reading
+from iort_station.cli.words import say
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
+from iort_station.output import check_free
 
 commands = typer.Typer()
 
@@ -37,11 +53,11 @@ def plot(
     context: typer.Context,
     robot: Robot,
     stream: Stream,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")],
+    out: Annotated[Path, to_file("The picture: .png, .svg or .pdf.")],
     kind: Annotated[
         Kind, typer.Option(help="Fields over time, the way from above, or the distribution of values.")
     ] = Kind.time,
-    fields: Annotated[str | None, typer.Option(help="Comma-separated fields to draw.")] = None,
+    fields: Fields = None,
     start: From = None,
     end: To = None,
     last: Last = None,
@@ -53,8 +69,9 @@ def plot(
     align: Annotated[
         Align, typer.Option(help="Draw several runs by the clock, or from their start.")
     ] = Align.time,
-    where: Annotated[str | None, typer.Option(help="Filter, as in iort query.")] = None,
+    where: Where = None,
     every: Every = None,
+    force: Force = False,
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
@@ -64,10 +81,12 @@ def plot(
     # Together they take longer to load than most commands to run.
     from iort_station.cli import plots  # noqa: PLC0415 - see above
 
-    cloud = context.obj.cloud()
+    plots.check_ending(out)
+    check_free(out, force=force)
     if runs and (start, end, last) != (None, None, None):
-        raise StationError("give either --run or --from, --to and --last")
-    ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last)]
+        raise UsageError("give either --run or --from, --to and --last")
+    ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last, SHORT)]
+    cloud = context.obj.cloud()
     wanted = names(fields)
     drawn: list[plots.Run] = []
     for name in dict.fromkeys([robot, *(also or ())]):
@@ -87,8 +106,8 @@ def plot(
         figure = plots.over_time(drawn, shown, from_start=align is Align.start)
     else:
         figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
-    plots.save(figure, output)
-    say(f"{output}: {sum(len(run.result) for run in drawn):,} samples")
+    plots.save(figure, out, force=force)
+    say(f"{out}: {sum(len(run.result) for run in drawn):,} samples")
 
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
@@ -107,7 +126,7 @@ def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) ->
 def _run(text: str) -> Range:
     first, separator, last = text.partition("/")
     if not separator:
-        raise StationError(
+        raise UsageError(
             f"--run must be FROM/TO, for example 2026-05-04T10:00Z/2026-05-04T10:05Z, got {text!r}"
         )
     return Range.of(first, last, None)

@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import sys
 import time
-from contextlib import nullcontext
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import NO_SENSOR_DEGC
 from iort_station.cli.console import Console
-from iort_station.cli.options import Every, From, Last, Range, Robot, Stream, To, names
-from iort_station.cli.progress import reading, say
-from iort_station.errors import StationError
+from iort_station.cli.options import (
+    SHORT,
+    Every,
+    Fields,
+    Force,
+    From,
+    Last,
+    Range,
+    Robot,
+    Stream,
+    To,
+    Where,
+    names,
+    to_file,
+)
+from iort_station.cli.progress import reading
+from iort_station.cli.words import say
+from iort_station.errors import UsageError
+from iort_station.output import check_free, whole
 
 if TYPE_CHECKING:
     from iort_station.data import Result
@@ -48,13 +62,8 @@ def query(
     start: From = None,
     end: To = None,
     last: Last = None,
-    fields: Annotated[
-        str | None,
-        typer.Option(help=f"Comma-separated fields; {' and '.join(DERIVED)} are derived."),
-    ] = None,
-    where: Annotated[
-        str | None, typer.Option(help="Filter, for example 'speed_mps > 1.2 and fault_code == 0'.")
-    ] = None,
+    fields: Fields = None,
+    where: Where = None,
     every: Every = None,
     summary: Annotated[
         bool, typer.Option("--summary", help="The summary of each second instead of samples.")
@@ -64,9 +73,8 @@ def query(
     raw: Annotated[
         bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
     ] = False,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="The output file. Default: standard output.")
-    ] = None,
+    out: Annotated[Path | None, to_file("The file to write. Default: standard output.")] = None,
+    force: Force = False,
     on: Annotated[
         On, typer.Option(help="Select samples on this machine, or in the cloud's query function.")
     ] = On.client,
@@ -83,9 +91,12 @@ def query(
     from iort_station import data  # noqa: PLC0415 - see above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
 
-    if form is Format.parquet and output is None and sys.stdout.isatty():
-        raise StationError("a terminal cannot show Parquet: give --output FILE, or use a pipe")
-    cloud, when = context.obj.cloud(), Range.of(start, end, last)
+    if form is Format.parquet and out is None and sys.stdout.isatty():
+        raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
+    if out is not None:
+        check_free(out, force=force)
+    when = Range.of(start, end, last, SHORT)
+    cloud = context.obj.cloud()
     began = time.monotonic()
     with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
         result = data.query(
@@ -103,7 +114,12 @@ def query(
             progress=progress,
         )
     took_s = time.monotonic() - began
-    _write(result, Format.jsonl if as_json else form, output, raw=raw)
+    form = Format.jsonl if as_json else form
+    if out is None:
+        _write(result, form, sys.stdout, raw=raw)
+    else:
+        with whole(out, force=force) as part, part.open("w", encoding="utf-8", newline="") as file:
+            _write(result, form, file, raw=raw)
     if result.refused:
         say(f"{result.refused} stored items are not batches and are left out; the first: {result.reason}")
     if result.absent:
@@ -114,27 +130,21 @@ def query(
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
 
 
-def _write(result: Result, form: Format, output: Path | None, *, raw: bool) -> None:
+def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
     from iort_station.recordings import tabular  # noqa: PLC0415 - as above
 
     if form is Format.parquet:
-        if output is None:
-            tabular.to_parquet(result, sys.stdout.buffer)
-        else:
-            with output.open("wb") as file:
-                tabular.to_parquet(result, file)
-        return
-    with output.open("w", encoding="utf-8", newline="") if output else nullcontext(sys.stdout) as text:
-        if form is Format.csv:
-            tabular.to_csv(result, text, raw=raw)
-        elif form is Format.jsonl:
-            tabular.to_json_lines(result, text)
-        else:
-            # In a file, every column fits.
-            width = None if text.isatty() else 32 + 24 * len(result.columns)
-            console = Console(file=text, width=width)
-            shown = tables.terminal(result, console.width)
-            console.print(shown.table)
-            if shown.left_out:
-                say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --format csv")
+        tabular.to_parquet(result, file.buffer)
+    elif form is Format.csv:
+        tabular.to_csv(result, file, raw=raw)
+    elif form is Format.jsonl:
+        tabular.to_json_lines(result, file)
+    else:
+        # In a file, every column fits.
+        width = None if file.isatty() else 32 + 24 * len(result.columns)
+        console = Console(file=file, width=width)
+        shown = tables.terminal(result, console.width)
+        console.print(shown.table)
+        if shown.left_out:
+            say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --format csv")

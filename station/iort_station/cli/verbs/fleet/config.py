@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson
-from iort_station.errors import StationError
+from iort_station.cli.options import AsJson, Robot
+from iort_station.errors import StationError, UsageError
 from iort_station.fleet.shadow import Shadow, State, answered
 
 commands = typer.Typer()
@@ -21,7 +21,7 @@ _WITHDRAWN_S = 3.0
 @commands.command("config")
 def config(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     changes: Annotated[
         list[str] | None,
         typer.Argument(
@@ -85,7 +85,7 @@ def _change_and_wait(shadow: Shadow, wanted: Mapping[str, Any], seconds: float) 
 def _change(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise StationError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
+        raise UsageError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
     if name.startswith("fields."):
         return name, [field for field in value.split(",") if field]
     try:

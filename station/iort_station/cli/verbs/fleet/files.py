@@ -13,13 +13,12 @@ from typing import Annotated
 import typer
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
-from iort_station.cli.console import errors, out
-from iort_station.cli.options import AsJson, bounds
+from iort_station.cli import completion, console
+from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
-from iort_station.data.inventory import check_registered
-from iort_station.errors import StationError
-from iort_station.fleet import files
+from iort_station.errors import StationError, unknown
+from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
 from iort_station.times import iso_s
 
@@ -27,96 +26,92 @@ commands = typer.Typer(
     name="files", no_args_is_help=True, help="Bags, images and other files that robots have uploaded."
 )
 
-_Start = Annotated[str | None, typer.Option("--from", help="Written at or after: ISO 8601, now or -10m.")]
-_End = Annotated[str | None, typer.Option("--to", help="Written before.")]
-_Last = Annotated[str | None, typer.Option(help="Written in the last 5m, 2h, 7d.")]
 _Name = Annotated[str, typer.Option(help="Only names that match, for example '*.bag'.")]
 
 
 @commands.command("list")
 def list_(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     name: _Name = "*",
-    start: _Start = None,
-    end: _End = None,
-    last: _Last = None,
+    start: From = None,
+    end: To = None,
+    last: Last = None,
     as_json: AsJson = False,
 ) -> None:
     """List a robot's files in the order of their time. With --json, print a line of JSON for each.
 
     The files of a robot that is no longer registered stay, and are listed.
     """
-    one = None
-    for one in _chosen(context.obj.cloud(), robot, name, start, end, last):
+    when, one = Range.of(start, end, last), None
+    for one in _chosen(context.obj.cloud(), robot, name, when):
         text = f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}"
-        out.print(json.dumps(asdict(one)) if as_json else text, soft_wrap=True)
+        console.out.print(json.dumps(asdict(one)) if as_json else text, soft_wrap=True)
     if one is None:
-        errors.print("no matching files", soft_wrap=True)
+        console.errors.print("no matching files", soft_wrap=True)
 
 
 @commands.command("get")
 def get(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     which: Annotated[
-        list[str] | None, typer.Argument(help="Names or keys; a name means its newest file. Default: all.")
+        list[str] | None,
+        typer.Argument(
+            help="Names or keys; a name means its newest file. Default: all.",
+            autocompletion=completion.files,
+        ),
     ] = None,
     name: _Name = "*",
-    start: _Start = None,
-    end: _End = None,
-    last: _Last = None,
-    folder: Annotated[Path, typer.Option("--out", help="The folder to write the files into.")] = Path(),
+    start: From = None,
+    end: To = None,
+    last: Last = None,
+    out: Annotated[Path, to_file("The folder to write the files into.")] = Path(),
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Download files, and check the SHA-256 that the robot gave.
 
     Files of the same name get a folder for each time. An interrupted download continues.
     """
+    when = Range.of(start, end, last)
     cloud = context.obj.cloud()
-    found = list(_chosen(cloud, robot, name, start, end, last))
+    found = list(_chosen(cloud, robot, name, when))
     if which:
         found = [_newest(found, robot, one) for one in which]
     if not found:
         raise StationError(f"{robot} has no matching files")
     apart = len({one.name for one in found}) < len(found)
     for one in found:
-        into = folder / time.strftime("%Y%m%d-%H%M%S", time.gmtime(one.second)) if apart else folder
+        folder = out / time.strftime("%Y%m%d-%H%M%S", time.gmtime(one.second)) if apart else out
         with bar(one.name, one.size, DownloadColumn(), TransferSpeedColumn()) as progress:
-            path = files.download(cloud, one, into, progress)
-        out.print(json.dumps({**asdict(one), "path": str(path)}) if as_json else str(path), soft_wrap=True)
+            path = files.download(cloud, one, folder, progress, force=force)
+        text = json.dumps({**asdict(one), "path": str(path)}) if as_json else str(path)
+        console.out.print(text, soft_wrap=True)
 
 
 @commands.command("empty")
-def empty(
-    context: typer.Context,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
-) -> None:
+def empty(context: typer.Context, yes: Yes = False) -> None:
     """Delete every file of every robot, and the results of queries. Do so before you destroy the stacks."""
     cloud = context.obj.cloud()
-    if not yes:
-        typer.confirm(f"Delete every file of the deployment {cloud.namespace}, for good?", abort=True)
+    agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
     counts: list[int] = []
     files.empty(cloud, counts.append)
-    out.print(f"{sum(counts)} deleted")
+    console.out.print(f"{sum(counts)} deleted")
 
 
-def _chosen(
-    cloud: Cloud, robot: str, name: str, start: str | None, end: str | None, last: str | None
-) -> Iterator[StoredFile]:
-    start_us, end_us = bounds(start, end, last, time.time_ns() // 1000)
+def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[StoredFile]:
     one = None
-    for one in files.listed(cloud, robot, start_us=start_us, end_us=end_us):
+    for one in files.listed(cloud, robot, start_us=when.start_us, end_us=when.end_us):
         if fnmatch.fnmatch(one.name, name):
             yield one
     if one is None and next(files.listed(cloud, robot), None) is None:
-        check_registered(cloud, robot)
+        registry.get(cloud, robot)
 
 
 def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:
     for one in reversed(found):
         if which in (one.name, one.key):
             return one
-    raise StationError(
-        f"{robot} has no file {which} in this range; `iort files list {robot}` shows its files"
-    )
+    problem = f"{robot} has no file {which} in this range"
+    raise unknown(problem, [which], (one.name for one in found), f"iort files list {robot}")

@@ -9,22 +9,21 @@ import typer
 
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, out
-from iort_station.errors import StationError
+from iort_station.cli.options import Robot, Yes, agreed, to_file
+from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
 
 commands = typer.Typer()
 
 _Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
-_ClaimFolder = Annotated[Path, typer.Option("--out", help="The folder to write the claim into.")]
+_ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
 
 @commands.command("add")
 def add(
     context: typer.Context,
-    name: str,
-    folder: Annotated[
-        Path, typer.Option("--out", help="Where to write the robot's folder of configuration and keys.")
-    ] = Path(),
+    name: Annotated[str, typer.Argument(help="The robot's name.")],
+    folder: Annotated[Path, to_file("Where to write the robot's folder of configuration and keys.")] = Path(),
     speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
 ) -> None:
     """Register a robot and write its folder: car.yaml, certificate and key."""
@@ -45,7 +44,7 @@ def register(
 ) -> None:
     """Pre-register names. Any robot with one of the fleet's lasting claims can claim each name once."""
     if serial is not None and len(names) != 1:
-        raise StationError("--serial is for one machine: give one name with it")
+        raise UsageError("--serial is for one machine: give one name with it")
     cloud, vehicle = context.obj.cloud(), _vehicle(speed_to_erpm_gain)
     for name in names:
         claims.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
@@ -65,7 +64,7 @@ def claim(
     claim is for the pre-registered names (`iort robots register`), once for each.
     """
     if name is None and not lasting:
-        raise StationError("give the robot's name, or --lasting for a claim of many robots")
+        raise UsageError("give the robot's name, or --lasting for a claim of many robots")
     path = claims.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
     out.print(f"Copy {folder} to the robot, then run there:\n")
     out.print(f"  iort-agent provision --config {folder.name}/{path.name}")
@@ -74,7 +73,7 @@ def claim(
 @commands.command("rotate")
 def rotate(
     context: typer.Context,
-    name: str,
+    name: Robot,
     folder: _ClaimFolder = Path("claim"),
     finish: Annotated[
         bool, typer.Option("--finish", help="The robot has its new certificate: wait, and revoke the old.")
@@ -101,8 +100,9 @@ def rotate(
 
 
 @commands.command("revoke-claims")
-def revoke_claims(context: typer.Context) -> None:
+def revoke_claims(context: typer.Context, yes: Yes = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
+    agreed("Revoke every lasting claim?", yes=yes)
     out.print(f"lasting claims revoked: {claims.revoke_all(context.obj.cloud())}")
 
 

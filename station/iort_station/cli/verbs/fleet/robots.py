@@ -26,16 +26,19 @@ from iort_contract.tables import (
     ROBOT,
     STREAMS,
 )
+from iort_station.cli import completion
 from iort_station.cli.console import Console, errors, out, print_json
-from iort_station.cli.options import AsJson, since_us
-from iort_station.cli.progress import reading, say
-from iort_station.cli.verbs.fleet import provisioning
-from iort_station.errors import StationError
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
+from iort_station.cli.progress import reading
+from iort_station.cli.verbs.fleet import provisioning, tags
+from iort_station.cli.words import say
+from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
 from iort_station.times import iso_s, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
 commands.add_typer(provisioning.commands)
+commands.add_typer(tags.commands)
 # A pipe has no width at which a line must end.
 _PIPE_WIDTH = 10_000
 
@@ -43,14 +46,12 @@ _PIPE_WIDTH = 10_000
 @commands.command("set")
 def set_(
     context: typer.Context,
-    name: str,
+    name: Robot,
     parameters: Annotated[
         list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{' or '.join(robots.F1TENTH)}.")
     ],
-    since: Annotated[
-        str | None,
-        typer.Option(help="Recompute since 10m (ago), 2h, 3d, or ISO 8601. Default: everything stored."),
-    ] = None,
+    start: From = None,
+    last: Last = None,
     also: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,11 +64,11 @@ def set_(
 ) -> None:
     """Correct a robot's vehicle parameters, and recompute the speed in its summaries.
 
-    Queries of samples use the new parameters at once, for all times. Summaries before --since stay as
+    Queries of samples use the new parameters at once, for all times. Summaries before --from stay as
     they are. A second run changes nothing; after an interruption it does the rest.
     """
     vehicle = robots.checked_vehicle(dict(_parameter(text) for text in parameters))
-    from_us = None if since is None else since_us(since)
+    from_us = Range.of(start, None, last).start_us
     cloud = context.obj.cloud()
     before = registry.set_vehicle(cloud, name, vehicle)
     for key, value in vehicle.items():
@@ -113,7 +114,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
 @commands.command("show")
 def show(
     context: typer.Context,
-    name: str,
+    name: Robot,
     as_json: AsJson = False,
 ) -> None:
     """Show a robot: its connection, its share of Lambda 2, its provisioning, its certificates."""
@@ -148,23 +149,26 @@ def show(
 @commands.command("remove")
 def remove(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="The robot; not with --all.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="The robot; not with --all.", autocompletion=completion.robots)
+    ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Remove every robot and lasting claim, before `make destroy`.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before --all.")] = False,
+    yes: Yes = False,
 ) -> None:
     """Revoke a robot's certificates, end its session and forget it. Its data stays."""
     if everything == (name is not None):
-        raise StationError("give a robot's name, or --all")
+        raise UsageError("give a robot's name, or --all")
     cloud = context.obj.cloud()
     if name is not None:
+        registry.get(cloud, name)
+        agreed(f"Remove {name} and revoke its certificates?", yes=yes)
         robots.remove(cloud, name)
         out.print(f"{name} is removed")
         return
     names = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
-    if not yes and not typer.confirm(f"Remove {len(names)} robots and every lasting claim?"):
-        raise typer.Exit(1)
+    agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
     for one in names:
         robots.remove(cloud, one)
         out.print(f"{one} is removed")
@@ -176,7 +180,7 @@ def _parameter(text: str) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError as error:
-        raise StationError(f"must be PARAMETER=NUMBER, got {text!r}") from error
+        raise UsageError(f"must be PARAMETER=NUMBER, got {text!r}") from error
 
 
 def _connection(row: Mapping[str, Any]) -> str:

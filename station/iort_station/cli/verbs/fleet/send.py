@@ -13,8 +13,8 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS, Command, encode_command
 from iort_contract.topics import ACCEPTED, CMD, build_topic
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson
-from iort_station.errors import StationError
+from iort_station.cli.options import AsJson, Robot
+from iort_station.errors import StationError, UsageError
 from iort_station.fleet.shadow import Shadow, outcome
 
 commands = typer.Typer()
@@ -23,7 +23,7 @@ commands = typer.Typer()
 @commands.command("send")
 def send(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     name: Annotated[str, typer.Argument(help="The command: a key of downlink.cmd in the robot's car.yaml.")],
     message: Annotated[str, typer.Argument(help="The ROS message as JSON, with the fields of its type.")],
     lease_ms: Annotated[
@@ -82,7 +82,7 @@ def _message(text: str) -> dict[str, Any]:
     try:
         message = json.loads(text)
     except ValueError as error:
-        raise StationError(f"MESSAGE must be JSON, got {text}: {error}") from error
+        raise UsageError(f"MESSAGE must be JSON, got {text}: {error}") from error
     if not isinstance(message, dict):
-        raise StationError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
+        raise UsageError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
     return message

@@ -10,7 +10,8 @@ from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot
-from iort_station.cli.progress import bar, say
+from iort_station.cli.progress import bar
+from iort_station.cli.words import say
 from iort_station.errors import StationError
 from iort_station.recordings import adopt
 from iort_station.recordings.adopt import Adoption

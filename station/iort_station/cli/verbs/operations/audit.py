@@ -12,8 +12,9 @@ from rich.text import Text
 
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
+from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, bounds
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
 from iort_station.data import inventory
 from iort_station.errors import StationError
 from iort_station.operations import accounts, audit
@@ -28,14 +29,18 @@ _LISTED = 20
 @commands.command("audit")
 def audit_(
     context: typer.Context,
-    robot: str,
+    robot: Robot,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--stream", help="Only this stream; may be repeated. Default: all known."),
+        typer.Option(
+            "--stream",
+            help="Only this stream; may be repeated. Default: all known.",
+            autocompletion=completion.streams,
+        ),
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", help="Start time: ISO 8601, now or -10m.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help="End time (exclusive).")] = None,
-    last: Annotated[str | None, typer.Option(help="The time up to now: 5m, 2h, 7d.")] = None,
+    start: From = None,
+    end: To = None,
+    last: Last = None,
     late: Annotated[str, typer.Option(help="A batch that is slower than this is late.")] = "5s",
     from_start: Annotated[
         bool, typer.Option("--from-start", help="Count numbers before the first stored one as missing.")
@@ -48,7 +53,7 @@ def audit_(
     agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
     and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
-    within = bounds(start, end, last, time.time_ns() // 1000)
+    within, late_us = Range.of(start, end, last), duration_us(late)
     cloud = context.obj.cloud()
     try:
         check_robot(robot)
@@ -60,16 +65,20 @@ def audit_(
     told = accounts.accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
-            counted = _counting(audit.headers(cloud, robot, name, *within), name, status)
-            one = audit.audit(name, counted, late_ms=duration_us(late) // 1000, from_start=from_start)
+            counted = _counting(
+                audit.headers(cloud, robot, name, within.start_us, within.end_us), name, status
+            )
+            one = audit.audit(name, counted, late_ms=late_us // 1000, from_start=from_start)
             # The agent counts a whole run, so a part of one cannot be compared.
-            if within == (None, None):
+            if within == Range(None, None):
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
                 found.append(one)
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
+    if not found:
+        inventory.check_recorded(cloud, robot)
     if as_json:
         print_json({"streams": [_as_json(one) for one in found], "not_recorded": causes})
     elif not found:

@@ -13,10 +13,11 @@ from rich.table import Table
 from iort_contract.catalog.streams import RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
+from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson
-from iort_station.data.inventory import check_registered
+from iort_station.cli.options import AsJson, Robot
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener
@@ -29,15 +30,17 @@ _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 @commands.command("trace")
 def trace_(
     context: typer.Context,
-    robot: str,
-    stream: Annotated[str, typer.Option(help="The stream whose live updates to follow.")] = VESC_STREAM,
+    robot: Robot,
+    stream: Annotated[
+        str, typer.Option(help="The stream whose live updates to follow.", autocompletion=completion.streams)
+    ] = VESC_STREAM,
     updates: Annotated[int, typer.Option(min=1, help="How many updates to wait for.")] = 50,
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for them at most.")] = 15.0,
     as_json: AsJson = False,
 ) -> None:
     """Measure the delay of a robot's live updates, hop by hop, from the sample in the car to this machine."""
     cloud = context.obj.cloud()
-    check_registered(cloud, robot)
+    registry.get(cloud, robot)
     found: list[trace.Times] = []
     enough = threading.Event()
 

@@ -30,7 +30,7 @@ def dashboard(
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
-    from iort_station.page.answers import answers  # noqa: PLC0415 - see above
+    from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
     from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
@@ -39,6 +39,7 @@ def dashboard(
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
+        actions=actions(cloud),
         host=host,
         port=port,
         names=name or (),

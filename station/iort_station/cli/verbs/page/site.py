@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import out
+from iort_station.cli.options import Yes, agreed
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.page import config
@@ -28,10 +29,12 @@ def site(
     remove: Annotated[
         bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
     ] = False,
+    yes: Yes = False,
 ) -> None:
     """Upload the page to the stack iort-site, which serves it. Deploy with -c site=true first."""
     cloud = context.obj.cloud()
     if remove:
+        agreed(f"Take the page of the deployment {cloud.namespace} down?", yes=yes)
         gone = upload(cloud.client("s3"), cloud.output("site", "PageBucket"), {})
         out.print(f"{len(gone)} files deleted")
         return

@@ -20,7 +20,7 @@ from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import out
 from iort_station.cli.options import Token
-from iort_station.cli.progress import say
+from iort_station.cli.words import say
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.listener import Listener

@@ -1,0 +1,86 @@
+"""The sections of car.yaml, from the agent's schema: a table each for docs/reference/car-yaml.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from iort_agent.common.schema import Place, Rule, rules_of
+from iort_agent.config import Config
+from iort_agent.errors import ConfigError
+
+_PLACE = Place(Path("car.yaml"), "key")
+
+
+class Section(NamedTuple):
+    """A mapping of car.yaml: its path, what it is, and a row for each key."""
+
+    path: str
+    meaning: str
+    rows: list[tuple[str, str, str]]
+
+
+def sections() -> list[Section]:
+    """Every section, each before those within it."""
+    return list(_sections("", Config))
+
+
+def _sections(path: str, cls: type[Any]) -> Iterator[Section]:
+    rules, fields = rules_of(cls), dataclasses.fields(cls)
+    rows = [(f"`{field.name}`", _default(field), _allowed(rules[field.name])) for field in fields]
+    meaning = re.sub(r"``(.+?)``", r"`\1`", " ".join((cls.__doc__ or "").split()))
+    yield Section(path, meaning, rows)
+    for field in fields:
+        for suffix, inner in _nested(rules[field.name]):
+            yield from _sections(f"{path}.{field.name}{suffix}".lstrip("."), inner)
+
+
+def _nested(rule: Rule, suffix: str = "") -> Iterator[tuple[str, type[Any]]]:
+    """The sections that a rule reads: its closure has their classes, or the rules of its items.
+
+    A rule of its own names the classes in its code.
+    """
+    found = inspect.getclosurevars(rule)
+    for name, value in {**found.globals, **found.nonlocals}.items():
+        if _is_section(value):
+            yield suffix, value
+        elif name == "classes" and isinstance(value, Mapping):
+            yield from ((f"{suffix}, type {kind}", cls) for kind, cls in value.items())
+        elif name in found.nonlocals and inspect.isfunction(value) and value.__name__.endswith("rule"):
+            yield from _nested(value, suffix)
+
+
+def _is_section(value: Any) -> bool:
+    return inspect.isclass(value) and dataclasses.is_dataclass(value) and value is not Place
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    value = field.default
+    if value is dataclasses.MISSING:
+        return "**required**"
+    if value is None or dataclasses.is_dataclass(value) or value == ():
+        return ""
+    if isinstance(value, tuple):
+        return ", ".join(value)
+    return str(value).lower() if isinstance(value, bool) else str(value).removesuffix(".0")
+
+
+def _allowed(rule: Rule) -> str:
+    """What the rule's own errors name as allowed: of what no rule accepts, and of a text that few accept."""
+    allowed = _named(rule, object())
+    if allowed == "a text":
+        allowed = _named(rule, "?") or allowed
+    return "a mapping, below" if "with some of the keys" in allowed else allowed
+
+
+def _named(rule: Rule, value: Any) -> str:
+    try:
+        rule(value, _PLACE)
+    except ConfigError as error:
+        named = re.search(r"must be (.+?), got ", str(error))
+        return named[1] if named else ""
+    return ""

@@ -1,0 +1,124 @@
+"""`iort runs`: when a robot's agent ran, and what it recorded."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from iort_contract.messages.page import Run
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.words import say
+from iort_station.cloud import Cloud
+from iort_station.data.runs import runs as find
+from iort_station.operations import audit
+from iort_station.operations.audit import Missing
+from iort_station.times import between, iso, iso_s
+
+commands = typer.Typer()
+# The missing batches of a run and stream.
+Gaps = dict[tuple[str, str], list[Missing]]
+
+
+@commands.command(
+    "runs", epilog="Example: iort runs car7 --last 7d --gaps lists the runs of a week, with what is missing"
+)
+def runs(
+    context: typer.Context,
+    robot: Robot,
+    start: From = None,
+    end: To = None,
+    last: Last = None,
+    count: Annotated[int, typer.Option(min=1, max=1000, help="The most runs to list; the newest.")] = 20,
+    with_gaps: Annotated[
+        bool, typer.Option("--gaps", help="Count missing batches; reads every batch of the listed runs.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the runs of a robot's agent, newest first: start, duration, samples and losses.
+
+    The command reads about four batches of each stream and run, never all samples. Samples are counted by the
+    agent, up to its last report (every 30 s, and at a proper end). Lost is what the agent says it could not
+    record.
+    """
+    within, cloud = Range.of(start, end, last), context.obj.cloud()
+    gaps: Gaps = {}
+    with errors.status("reading") as status:
+        found = find(cloud, robot, start_us=within.start_us, end_us=within.end_us, count=count)
+        for run in found["runs"] if with_gaps else ():
+            status.update(f"counting the batches of {run['run'][:8]}")
+            gaps |= _gaps(cloud, robot, run)
+    if as_json:
+        listed = [_as_json(run, gaps if with_gaps else None) for run in found["runs"]]
+        print_json({"robot": robot, "runs": listed, "more_runs": found["older"]})
+        return
+    if not found["runs"]:
+        errors.print(f"{robot} has no runs in this range")
+        return
+    out.print(_table(found["runs"], gaps if with_gaps else None))
+    for (boot, stream), missing in gaps.items():
+        for gap in missing:
+            after = "the start" if gap.after_us is None else iso(gap.after_us)
+            before = "the end" if gap.before_us is None else iso(gap.before_us)
+            out.print(f"{boot[:8]} {stream}: {gap.batches:,} batches missing between {after} and {before}")
+    if found["older"]:
+        say(f"there are older runs: --count {2 * count}, or --to {iso_s(found['runs'][-1]['from_us'])}")
+
+
+def _gaps(cloud: Cloud, robot: str, run: Run) -> Gaps:
+    return {
+        (run["run"], stream): one.missing
+        for stream, part in run["streams"].items()
+        for one in audit.audit(
+            stream, audit.headers(cloud, robot, stream, part["from_us"], part["to_us"])
+        ).runs
+        if one.boot == run["run"]
+    }
+
+
+def _table(found: list[Run], gaps: Gaps | None) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading, justify in (
+        ("start (UTC)", "left"),
+        ("duration", "right"),
+        ("run", "left"),
+        ("state", "left"),
+    ):
+        table.add_column(heading, justify=justify, no_wrap=True)  # type: ignore[arg-type]  # rich's Literal
+    for heading in ("stream", "samples", "batches", "missing", "lost"):
+        if heading != "missing" or gaps is not None:
+            table.add_column(heading, justify="left" if heading == "stream" else "right")
+    for run in found:
+        lasted = timedelta(seconds=round((run["to_us"] - run["from_us"]) / 1e6))
+        head = [iso_s(run["from_us"]).replace("T", " ")[:-1], str(lasted), run["run"][:8], run["state"]]
+        lost = f"{run['lost']:,}" if run["lost"] else ""
+        if not run["streams"]:
+            table.add_row(*head, "nothing recorded", *[""] * (2 + (gaps is not None)), lost)
+        for stream, part in run["streams"].items():
+            samples = "-" if part["samples"] is None else f"{part['samples']:,}"
+            missing = [] if gaps is None else [f"{_count(gaps, run['run'], stream):,}"]
+            table.add_row(*head, stream, samples, f"{part['batches']:,}", *missing, lost)
+            head, lost = [""] * len(head), ""
+    return table
+
+
+def _as_json(run: Run, gaps: Gaps | None) -> dict[str, Any]:
+    streams = {
+        stream: {
+            **between(part),
+            "samples": part["samples"],
+            "batches": part["batches"],
+            "missing": None if gaps is None else _count(gaps, run["run"], stream),
+        }
+        for stream, part in run["streams"].items()
+    }
+    seconds = (run["to_us"] - run["from_us"]) / 1e6
+    said = {"run": run["run"], **between(run), "seconds": seconds, "state": run["state"], "lost": run["lost"]}
+    return {**said, "streams": streams}
+
+
+def _count(gaps: Gaps, boot: str, stream: str) -> int:
+    return sum(gap.batches for gap in gaps.get((boot, stream), ()))

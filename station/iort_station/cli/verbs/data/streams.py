@@ -1,0 +1,49 @@
+"""`iort streams`: what is stored of a robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from rich.padding import Padding
+from rich.table import Table
+
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson, Robot
+from iort_station.data.overview import StreamOverview, overview
+from iort_station.times import between, iso_s
+
+commands = typer.Typer()
+
+
+@commands.command(
+    "streams",
+    epilog="Example: iort streams car7 shows what to ask for in iort query car7 vesc --fields speed",
+)
+def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> None:
+    """List a robot's streams: their fields with units, their runs, their first and last sample.
+
+    The command reads some batches of each run, never all samples. The fields are those of the newest batch.
+    """
+    cloud = context.obj.cloud()
+    with errors.status("reading"):
+        found = overview(cloud, robot)
+    if as_json:
+        print_json({"robot": robot, "streams": [_as_json(one) for one in found]})
+        return
+    if not found:
+        errors.print(f"{robot} has sent nothing yet")
+    for one in found:
+        table = Table(box=None, pad_edge=False, show_header=False)
+        for name, unit in one.fields.items():
+            table.add_row(name, unit)
+        counted = f"{one.runs}{'+' if one.older else ''} {'run' if one.runs == 1 else 'runs'}"
+        extent = f"{iso_s(one.extent['from_us'])} to {iso_s(one.extent['to_us'])}"
+        out.print(f"{one.stream}: {counted}, {extent}", style="bold", soft_wrap=True)
+        out.print(Padding(table, (0, 0, 1, 2)))
+
+
+def _as_json(one: StreamOverview) -> dict[str, Any]:
+    fields = [{"name": name, "unit": unit or None} for name, unit in one.fields.items()]
+    counted = {"runs": one.runs, "more_runs": one.older}
+    return {"stream": one.stream, **between(one.extent), **counted, "fields": fields}

@@ -1,0 +1,41 @@
+"""Files to write: none replaces another unasked, and a part is never taken for the whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from iort_station.errors import StationError
+
+
+def cache(environment: Mapping[str, str]) -> Path:
+    """The user's folder for what can be made again."""
+    home = environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".cache"
+    return Path(home) / "iort"
+
+
+def check_free(path: Path, *, force: bool) -> None:
+    """Raise `StationError` if there is a file already, unless ``force``."""
+    if path.exists() and not force:
+        raise StationError(f"{path} exists: give another --out, or overwrite it with --force")
+
+
+@contextmanager
+def whole(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """The file to write, which is renamed to ``path`` after the block. A block that raises changes nothing.
+
+    Raises `StationError` if ``path`` exists, unless ``force``.
+    """
+    check_free(path, force=force)
+    if path.exists() and not path.is_file():
+        # A device or a pipe.
+        yield path
+        return
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

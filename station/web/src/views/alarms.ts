@@ -1,0 +1,194 @@
+// The alarms: what is wrong, since when, what to do, where to look; and who has seen it.
+
+import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
+import { el, Text } from "../base/dom";
+import { clockTime, dayTime, zone } from "../base/format";
+import { route } from "../base/route";
+import type { Alarms, CarState, Raised } from "../live/alarms";
+
+// The part of a car's past that a link shows. A cloud's alarm goes off minutes after its cause.
+const BEFORE_S = 60;
+const CLOUD_BEFORE_S = 300;
+const AFTER_S = 60;
+const NAME_KEY = "iort.name";
+const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;
+
+export class AlarmsView {
+  readonly node: HTMLElement;
+  private readonly note = new Text("history-note", "p", { role: "status" });
+  private readonly name = el("input", { id: "acknowledge-as", name: "acknowledge-as", autocomplete: "name", maxlength: "64" });
+  private readonly list = el("ul", { class: "raised" });
+  private readonly none = el("p", { class: "unserved" }, "No alarm is raised.");
+  private readonly quiet = el("tbody");
+  private readonly count = new Text("count-quiet");
+  private readonly cards = new Map<string, { readonly drawn: string; readonly node: HTMLElement }>();
+  private rejected: RejectedAnswer | undefined;
+  private rejectedAt = NaN;
+  private quietDrawn: unknown;
+  private failure = "";
+
+  constructor(
+    config: Config,
+    private readonly alarms: Alarms,
+  ) {
+    this.name.value = stored();
+    this.name.addEventListener("change", () => store(this.name.value));
+    const told = el("p", { class: "unserved" }, "This page was put on the web as it is: it sees only what the cars send. Run ", el("code", {}, "iort dashboard"), " for the cloud's alarms.");
+    const others = el(
+      "details",
+      { class: "panel quiet" },
+      el("summary", {}, this.count.node),
+      el("div", { class: "log" }, el("table", {}, el("thead", {}, el("tr", {}, ...["Alarm", "Meaning", "State", "What to do"].map((text) => el("th", { scope: "col" }, text)))), this.quiet)),
+    );
+    this.node = el(
+      "article",
+      { class: "alarms-view" },
+      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Alarms"), this.note.node),
+      ...(config.answers ? [el("p", { class: "range" }, el("label", {}, "acknowledge as ", this.name))] : [told]),
+      this.none,
+      this.list,
+      ...(config.answers ? [others] : []),
+    );
+  }
+
+  /** Update what changes; an alarm that has not changed keeps its node, and with it the focus. */
+  clock(now: number): void {
+    const { entries, error, askedAt, user } = this.alarms;
+    this.name.placeholder = user;
+    this.note.set(this.failure || error || (entries ? `as of ${clockTime(askedAt)} ${zone(askedAt)}` : ""));
+    const raised = this.alarms.raised(now);
+    if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt) void this.find(askedAt);
+    this.none.hidden = raised.length > 0 || (entries === undefined && error !== "");
+    const shown = raised.map((alarm) => this.card(alarm));
+    if (shown.some((node, i) => this.list.children[i] !== node) || this.list.children.length !== shown.length) this.list.replaceChildren(...shown);
+    for (const key of this.cards.keys()) if (!raised.some((alarm) => alarm.key === key)) this.cards.delete(key);
+    if (this.quietDrawn !== entries) {
+      this.quietDrawn = entries;
+      const others = (entries ?? []).filter(({ state }) => state !== "ALARM");
+      this.count.set(`${others.length} others`);
+      this.quiet.replaceChildren(...others.map(row));
+    }
+  }
+
+  private async find(askedAt: number): Promise<void> {
+    this.rejectedAt = askedAt;
+    try {
+      this.rejected = await ask<RejectedAnswer>("rejected", {});
+      this.failure = "";
+    } catch (error) {
+      this.failure = error instanceof AnswerError ? error.message : String(error);
+    }
+  }
+
+  private card(alarm: Raised): HTMLElement {
+    const messages = alarm.entry?.evidence === "quarantine" ? this.rejected : undefined;
+    const drawn = JSON.stringify([alarm, messages]);
+    const before = this.cards.get(alarm.key);
+    if (before?.drawn === drawn) return before.node;
+    const { key, meaning, advice, entry, cars, fresh } = alarm;
+    const seen = entry?.acknowledged;
+    const button = el("button", { type: "button", class: "tool" }, "Acknowledge");
+    button.addEventListener("click", () => entry && void this.acknowledge(entry, button));
+    const since = entry?.state === "ALARM" ? `raised since ${dayTime(entry.since_s)} ${zone(entry.since_s)}` : "raised by live values";
+    const node = el(
+      "li",
+      { class: "panel alarm", "data-alarm": key, "data-fresh": String(fresh) },
+      el("header", {}, el("h3", {}, capital(meaning)), el("code", { class: "note" }, key), el("span", { class: "note" }, since)),
+      el("p", {}, el("b", {}, "What to do: "), ...marked(advice)),
+      ...(cars.length > 0 ? [el("ul", { class: "cases" }, ...cars.map(live))] : []),
+      ...(entry?.state === "ALARM" ? evidence(entry, messages) : []),
+      el(
+        "p",
+        { class: "seen" },
+        ...(seen ? [`Acknowledged by ${seen.by}, ${dayTime(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])] : []),
+        ...(entry?.state === "ALARM" && fresh ? [button] : []),
+      ),
+    );
+    this.cards.set(key, { drawn, node });
+    return node;
+  }
+
+  private async acknowledge(entry: AlarmEntry, button: HTMLButtonElement): Promise<void> {
+    button.disabled = true;
+    try {
+      await this.alarms.acknowledge(entry, this.name.value);
+      this.failure = "";
+    } catch (error) {
+      this.failure = error instanceof AnswerError ? error.message : String(error);
+      button.disabled = false;
+    }
+  }
+}
+
+/** Where more is known about an alarm of the cloud. */
+function evidence({ evidence, robots, named, since_s }: AlarmEntry, messages: RejectedAnswer | undefined): HTMLElement[] {
+  if (evidence === "logs") return [el("p", {}, el("a", { class: "tool", href: route({ view: "cloudwatch" }) }, "Newest warnings and errors"))];
+  if (evidence === "quarantine") {
+    if (!messages) return [];
+    const { rejected, found } = messages;
+    const told = found === 0 ? "Nothing is in quarantine now." : found > rejected.length ? `The newest ${rejected.length} of ${found} messages in quarantine:` : "In quarantine:";
+    return [el("p", {}, told), el("ul", { class: "cases" }, ...rejected.map(message))];
+  }
+  if (robots.length === 0) return [];
+  const links = robots.map((robot) => el("li", {}, past(robot, since_s - CLOUD_BEFORE_S, since_s + AFTER_S, robot)));
+  return [el("p", {}, named ? "The cars that an alert has named, at that time:" : "The cars that were connected, at that time:"), el("ul", { class: "cases across" }, ...links)];
+}
+
+function live({ robot, text, since }: CarState): HTMLElement {
+  return el(
+    "li",
+    {},
+    el("a", { class: "tool", href: route({ view: "car", robot }) }, robot),
+    el("b", {}, text),
+    ` since ${clockTime(since)} `,
+    past(robot, since - BEFORE_S, since + AFTER_S, "That moment"),
+  );
+}
+
+function message({ id, robot, topic, source, reason, last_s, seen }: Rejected): HTMLElement {
+  const at = `${dayTime(last_s)}${seen > 1 ? `, ${seen} times` : ""}`;
+  return el(
+    "li",
+    {},
+    robot === "-" ? el("span", { class: "note" }, at) : past(robot, last_s - BEFORE_S, last_s + AFTER_S, `${robot}, ${at}`),
+    el("span", {}, reason),
+    el("span", { class: "note" }, `${source} ${topic}`),
+    el("code", {}, `iort errors ${id}`),
+  );
+}
+
+/** A link to a car's past. */
+function past(robot: string, from_s: number, to_s: number, text: string): HTMLElement {
+  const at = (seconds: number): string => new Date(seconds * 1000).toISOString();
+  return el("a", { class: "tool", href: route({ view: "history", robot, query: { from: at(from_s), to: at(to_s) } }) }, text);
+}
+
+function row({ key, meaning, state, since_s, advice }: AlarmEntry): HTMLElement {
+  return el("tr", {}, el("td", {}, el("code", {}, key)), el("td", { class: "words" }, meaning), el("td", {}, `${STATES[state]} since ${dayTime(since_s)}`), el("td", { class: "words" }, ...marked(advice)));
+}
+
+/** A text with its `code`. */
+function marked(text: string): (HTMLElement | string)[] {
+  return text.split("`").map((part, i) => (i % 2 === 1 ? el("code", {}, part) : part));
+}
+
+function capital(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+function stored(): string {
+  try {
+    return localStorage.getItem(NAME_KEY) ?? "";
+  } catch {
+    return "";
+  }
+}
+
+function store(name: string): void {
+  try {
+    localStorage.setItem(NAME_KEY, name);
+  } catch {
+    // The name lasts until the page is closed.
+  }
+}

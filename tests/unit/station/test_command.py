@@ -1,0 +1,104 @@
+"""The command `iort`: its verbs are loaded when used, and wrong use has a status of its own."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from iort_station.cli import lazy, options
+from iort_station.cli.lazy import Verb
+from iort_station.cli.main import app, main
+from iort_station.cli.verbs import VERBS
+from iort_station.errors import UsageError
+
+# Each takes longer to import than `iort --help` may take.
+HEAVY = {
+    "boto3",
+    "botocore.session",
+    "matplotlib",
+    "numpy",
+    "pandas",
+    "pubnub",
+    "pyarrow",
+    "pydantic",
+    "rich",
+}
+PROGRAM = """
+import json, sys
+from iort_station.cli.main import main
+sys.argv = ["iort", *sys.argv[1:]]
+try:
+    main()
+finally:
+    print(json.dumps(sorted(sys.modules)), file=sys.stderr)
+"""
+
+
+def loaded(*arguments):
+    """The modules that a command has imported at its end."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=True
+    )
+    return set(json.loads(done.stderr.splitlines()[-1]))
+
+
+def test_help_imports_no_verb_and_nothing_heavy():
+    found = loaded("--help")
+    assert not found & HEAVY
+    assert not [name for name in found if name.startswith(f"{lazy.verbs.__name__}.")]
+
+
+@pytest.mark.parametrize("file", VERBS)
+def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
+    summary = VERBS[file]
+    verb = Verb(file, summary)
+    assert verb.load().name == verb.name
+    assert len(f"  replay-errors  {summary}") <= 80
+    assert summary.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["query", "car", "vesc", "--last", "soon"], 2, "duration must be"),
+        (["query", "car", "vesc", "--last", "1m", "--to", "now"], 2, "give --last, or --from and --to"),
+        (["plot", "car", "vesc", "--out", "speed.gif"], 2, "must end in .pdf, .png, .svg"),
+        (["--local", "--embedded", "nowhere.json", "robots", "list"], 1, "no embedded cloud is running"),
+        (["querry"], 2, "Did you mean 'query'?"),
+    ],
+)
+def test_wrong_use_ends_with_status_2(arguments, status, said, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["iort", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == status
+    assert said in capsys.readouterr().err
+
+
+def test_no_verb_shows_a_flag_as_a_boolean():
+    root = typer.main.get_command(app)
+    for verb in root.commands.values():
+        with typer.Context(verb.load(), info_name=verb.name) as context:
+            assert "bool" not in context.get_help()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_who_is_asked_can_agree_or_not(monkeypatch):
+    options.agreed("Delete it?", yes=True)
+    monkeypatch.setattr(sys, "stdin", Terminal("y\n"))
+    options.agreed("Delete it?", yes=False)
+    monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
+    with pytest.raises(typer.Abort):
+        options.agreed("Delete it?", yes=False)
+    monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))
+    with pytest.raises(UsageError, match=r"^Delete it\? Nobody can answer here: give --yes$"):
+        options.agreed("Delete it?", yes=False)

@@ -1,0 +1,158 @@
+"""A lab whose page has something on every view: its addresses, and its server's answers."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+from iort_contract.catalog.metrics import METRICS, alarm_of
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.page.server import PageServer
+from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from iort_contract.messages.page import AlarmEntry, HistoryAnswer
+    from local.pubnub.standin import PubNubStandIn
+
+# Every view of the page. A new view belongs here: tests then look at it.
+VIEWS = {
+    "fleet": "#/",
+    "car": "#/car/car-1",
+    "history": "#/history/car-1",
+    "alarms": "#/alarms",
+    "cloudwatch": "#/cloudwatch",
+}
+TRACEBACK = """[ERROR] ValueError: the gain of car-7 must not be 0
+Traceback (most recent call last):
+  File "/var/task/functions/live.py", line 61, in handler
+    publish(event)
+ValueError: the gain of car-7 must not be 0"""
+NOW_S = time.time()
+
+
+def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
+    entry = alarm_of(key)
+    assert entry
+    return {
+        "name": f"iort-{key}",
+        "key": key,
+        "about": "",
+        "state": state,
+        "reason": "Threshold crossed",
+        "since_s": NOW_S - 600,
+        "meaning": entry.meaning,
+        "advice": entry.advice,
+        "evidence": entry.evidence,
+        "threshold": 80.0 if key == "TemperatureDegC" else 10.5,
+        "robots": [],
+        "named": False,
+        "acknowledged": None,
+        **given,
+    }  # type: ignore[typeddict-item]  # of any state
+
+
+class Lab:
+    """What the lab's server answers; a test may change it."""
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, str]] = []
+        self.alarms = [
+            alarm("FaultSamples", robots=["car-1", "car-2"], named=True),
+            alarm("Quarantined"),
+            alarm("SummarizeErrors", acknowledged={"by": "ada", "at_s": NOW_S - 60}),
+            *(alarm(name, "OK") for name, metric in METRICS.items() if metric.alarm and name[0] in "TBP"),
+        ]
+
+    def acknowledge(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.asked.append(dict(asked))
+        seen = {"by": asked["by"] or "operator@lab", "at_s": time.time()}
+        self.alarms = [
+            alarm(**{**one, "acknowledged": seen}) if one["key"] == asked["alarm"] else one
+            for one in self.alarms
+        ]
+        return seen
+
+    def server(self, pubnub: PubNubStandIn) -> PageServer:
+        return PageServer(
+            namespace="iort",
+            subscribe_key=SUBSCRIBE_KEY,
+            origin=pubnub.origin,
+            tls=False,
+            vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
+            answers=self.answers(),
+            actions={"acknowledge": self.acknowledge},
+        )
+
+    def answers(self) -> dict[str, Any]:
+        presence = {"online": False, "since_ms": round(NOW_S - 3600) * 1000}
+        return {
+            "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
+            "vehicles": lambda _: {"vehicles": {}},
+            "streams": lambda _: {"streams": [VESC_STREAM]},
+            "runs": lambda _: {"runs": []},
+            "history": history,
+            "dashboards": lambda _: {"dashboards": ["iort-platform"]},
+            "dashboard": self.dashboard,
+            "log": lambda _: {
+                "columns": ["@timestamp", "@log", "@message"],
+                "rows": [["2026-05-04 10:00:00.123", "123456789012:/aws/lambda/live", TRACEBACK]],
+                "found": 1,
+                "from_s": 0,
+                "to_s": 60,
+            },
+            "alarms": lambda _: {"alarms": self.alarms, "user": "operator@lab"},
+            "rejected": lambda _: {
+                "found": 1,
+                "rejected": [
+                    {
+                        "id": "0a1b2c",
+                        "robot": "car-1",
+                        "source": "stream",
+                        "topic": "record/iort/car-1/vesc",
+                        "reason": "column speed must have 10 values, got 9",
+                        "last_s": NOW_S - 300,
+                        "seen": 2,
+                    }
+                ],
+            },
+        }
+
+    def dashboard(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        to_s = int(NOW_S)
+        times = [to_s - 600 + 60 * i for i in range(10)]
+        line = {"label": "Published", "right": False, "times_s": times, "values": [*range(10)]}
+        drawn: dict[str, Any] = {"width": 24, "height": 5, "text": "", "period_s": 60}
+        widgets = [
+            {"kind": "text", "title": "", "text": "# The platform\nEverything at a glance."},
+            {"kind": "alarms", "title": "Alarms", "alarms": self.alarms},
+            {"kind": "number", "title": "Messages", "series": [line]},
+            {
+                "kind": "series",
+                "title": "Live samples",
+                "series": [line, {**line, "label": "Stale", "right": True}],
+            },
+            {"kind": "log", "title": "Newest warnings and errors"},
+        ]
+        return {
+            "name": asked["name"],
+            "from_s": to_s - 3600,
+            "to_s": to_s,
+            "widgets": [
+                {"series": [], "alarms": [], **drawn, **widget, "number": i, "x": 0, "y": 5 * i}
+                for i, widget in enumerate(widgets)
+            ],
+        }
+
+
+def history(asked: Mapping[str, str]) -> HistoryAnswer:
+    start_s, end_s = int(asked["from_us"]) / 1e6, int(asked["to_us"]) / 1e6
+    times = [start_s + (end_s - start_s) * i / 200 for i in range(200)]
+    fields = {
+        name: {"mean": [value * math.sin(i / 9) for i in range(200)]}
+        for name, value in SAMPLE.items()
+        if isinstance(value, (int, float))
+    }
+    return {"times_s": times, "fields": fields, "samples": 200, "ros2": False, "row_s": 0}  # type: ignore[typeddict-item]  # means alone
