@@ -30,6 +30,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import delivery
 from iort_station.page.answers import actions, answers
+from iort_station.page.downloads import downloads
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
 from local.cloud import FOLDER, EmbeddedCloud
@@ -138,6 +139,7 @@ class _Demo:
                     **embedded.keys.reading(),
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
+                    downloads=downloads(embedded.cloud),
                     actions=actions(embedded.cloud),
                     port=self._options.port,
                 )

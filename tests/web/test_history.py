@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+import pyarrow.parquet as pq
 import pytest
+from mcap.reader import make_reader
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
 from iort_station.page.answers import answers
+from iort_station.page.downloads import downloads
 from iort_station.page.server import PageServer
 from tests.browser import plain, until
 from tests.fakes import TELEMETRY, item_of
@@ -56,7 +60,9 @@ class Past:
         )
         agent = Batch("00000001", 0, [START, START + SECOND // 2], {"cpu_percent": [3.5, 4.5]})
         cloud.table.put(TELEMETRY, item_of(agent, build_topic(RECORD, "car", "agent")))
-        self.answers: dict[str, Callable[[Mapping[str, str]], Any]] = {**answers(cloud)}  # type: ignore[arg-type]  # a fake
+        served = answers(cloud)  # type: ignore[arg-type]  # a fake
+        self.answers = {name: served[name] for name in ("streams", "runs", "history", "vehicles")}
+        self.downloads = downloads(cloud)  # type: ignore[arg-type]  # as above
         history = self.answers["history"]
 
         def watched(asked: Mapping[str, str]) -> Any:
@@ -74,7 +80,7 @@ def past() -> Past:
 @pytest.fixture
 def server(pubnub: PubNubStandIn, past: Past) -> Iterator[PageServer]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=past.answers, **told) as server:
+    with PageServer(namespace="iort", answers=past.answers, downloads=past.downloads, **told) as server:
         yield server
 
 
@@ -161,7 +167,7 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(
     assert shown(page) == pytest.approx([0, 59.981])
     page.go_back()
     until(lambda: shown(page)[0] > 14, "the browser's Back")
-    assert int(past.asked[-1]["to_us"]) - int(past.asked[-1]["from_us"]) < 16 * SECOND
+    until(lambda: int(past.asked[-1]["from_us"]) > START + 14 * SECOND, "its data")
 
 
 def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page: Page) -> None:
@@ -225,6 +231,40 @@ def test_the_playback_is_as_fast_as_chosen(page: Page) -> None:
     until(lambda: scrub.evaluate("(slider) => slider.value === slider.max"), "the end")
     assert 1.5 < (page.evaluate("performance.now()") - began) / 1000 < 20
     assert page.get_by_role("button", name="Play").is_visible()
+
+
+def test_the_range_is_saved_as_csv_parquet_and_mcap(page: Page, server: PageServer) -> None:
+    # 50 samples: both ends are whole milliseconds.
+    link = f"{server.url}#/history/car?from=2023-11-14T23:13:30.000Z&to=2023-11-14T23:13:31.000Z"
+    page.goto(link)
+    loaded(page, "50 samples")
+    saved = {}
+    for label in ("CSV", "Parquet", "MCAP"):
+        with page.expect_download() as begun:
+            page.get_by_role("button", name=label, exact=True).click()
+        saved[label] = begun.value.path()
+        assert begun.value.suggested_filename == f"car-vesc-20231114T231330Z.{label.lower()}"
+    rows = list(csv.DictReader(saved["CSV"].read_text().splitlines()))
+    assert [row["voltage_input"] for row in rows[:2]] == ["11.9", "11.8998"]
+    assert rows[0]["time"] == "2023-11-14T23:13:30.000000Z"
+    columns = pq.read_table(saved["Parquet"]).to_pydict()
+    assert columns["voltage_input"] == [float(row["voltage_input"]) for row in rows]
+    with saved["MCAP"].open("rb") as file:
+        assert [message.log_time for _, _, message in make_reader(file).iter_messages()] == [
+            LATER_US * 1000 + (10_000 + 20 * i) * 1_000_000 for i in range(50)
+        ]
+
+
+def test_a_download_says_what_is_wrong_before_it_sends_anything(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("iort_station.page.downloads.MOST_SAMPLES", 1000)
+    monkeypatch.setattr("iort_station.page.downloads.MOST_BYTES", 1000)
+    note = page.locator(".download .note")
+    page.get_by_role("button", name="CSV").click()
+    until(lambda: "more than 1,000 samples: choose a shorter one" in note.inner_text(), "the reason")
+    page.get_by_role("button", name="MCAP").click()
+    until(lambda: "over 1,000 bytes: choose a shorter one" in note.inner_text(), "the other reason")
 
 
 def test_another_stream_is_loaded_at_once_and_kept_in_the_address(page: Page, past: Past) -> None:

@@ -21,7 +21,8 @@ export class RangeForm {
   private readonly to = el("input", { type: "datetime-local", step: "1", id: "to", name: "to" });
   private readonly zone = new Text("zone");
   private readonly select = el("select", { id: "stream", name: "stream" });
-  private readonly out = el("button", { type: "button", class: "tool", title: "Also: a double click on a chart" }, "Zoom out");
+  /** Goes back to the range before the zoom. */
+  readonly out = el("button", { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" }, "Zoom out");
 
   constructor(events: RangeFormEvents) {
     this.node = el(
@@ -36,7 +37,6 @@ export class RangeForm {
       el("label", {}, "to ", this.to, " ", this.zone.node),
       el("label", {}, "stream ", this.select),
       el("button", { type: "submit", class: "tool primary" }, "Load"),
-      this.out,
     );
     this.node.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -63,7 +63,7 @@ export class RangeForm {
     const digits = to - from < FINE_S ? 23 : 19;
     this.from.value = local(from).slice(0, digits);
     this.to.value = local(to).slice(0, digits);
-    this.out.disabled = !zoomed;
+    this.out.hidden = !zoomed;
     this.sayZone();
   }
 

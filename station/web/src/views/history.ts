@@ -76,7 +76,7 @@ export class HistoryView {
     this.pictures = new Pictures(table);
     const download = new Download(() => this.asked());
     this.result.append(this.playback.node, this.pictures.node, this.charts.chips, this.charts.node, download.node, this.comparison.node);
-    const served = [this.form.node, this.runs.node, this.note.node, this.result];
+    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result];
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
     this.node = el(
       "article",

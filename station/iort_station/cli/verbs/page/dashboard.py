@@ -31,6 +31,7 @@ def dashboard(
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.downloads import downloads  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
@@ -39,6 +40,7 @@ def dashboard(
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
+        downloads=downloads(cloud),
         actions=actions(cloud),
         host=host,
         port=port,
