@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from iort_contract import checks, limits, topics
+from iort_contract.catalog import vesc
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
@@ -65,6 +66,7 @@ def _constants() -> Iterator[str]:
         limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
         topics: ("NAME",),
         checks: ("BOOT", "FIELD_NAME"),
+        vesc: ("TACHOMETER_COUNTS",),
     }.items():
         for name in names:
             value = getattr(module, name)

@@ -21,7 +21,7 @@ from iort_station.page.server import PageServer
 from tests.browser import plain, until
 from tests.fakes import TELEMETRY, item_of
 from tests.unit.station.test_data import START, cloud_of
-from tests.web.cars import SUBSCRIBE_KEY
+from tests.web.cars import GAIN, SUBSCRIBE_KEY
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
@@ -37,7 +37,7 @@ NEWEST = "from=2023-11-14T23:13:20.000Z&to=2023-11-14T23:13:49.981Z"
 
 
 def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
-    """A run of 50 samples a second."""
+    """A run of 50 samples a second, which gets faster by 0.1 m/s a second."""
     for second in range(seconds):
         times = [start_us + second * SECOND + i * 20_000 for i in range(50)]
         at = [(t - start_us) / SECOND for t in times]
@@ -45,7 +45,8 @@ def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
             "voltage_input": [12 - each / 100 for each in at],
             "current_motor": [20 * math.sin(each) for each in at],
             "speed": [4614 * each / 10 for each in at],
-            "displacement": [float(int(461.4 * each)) for each in at],
+            # The way of that speed: t² / 20 m, in counts.
+            "displacement": [float(int(each**2 / 20 * 461.4)) for each in at],
         }
         yield Batch(boot, second, times, columns)
 
@@ -80,6 +81,7 @@ def past() -> Past:
 @pytest.fixture
 def server(pubnub: PubNubStandIn, past: Past) -> Iterator[PageServer]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    told["vehicles"] = {"car": {"speed_to_erpm_gain": GAIN}}
     with PageServer(namespace="iort", answers=past.answers, downloads=past.downloads, **told) as server:
         yield server
 
@@ -148,9 +150,9 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(
     until(lambda: shown(page)[1] < 40, "the zoom")
     assert shown(page) == pytest.approx([15, 30], abs=0.3)
     until(lambda: re.search(r"samples in [\d.]+ m?s\.", page.inner_text(".history-note")), "single samples")
-    # Speed is the time since the start: every chart shows the same range.
+    # Ten times the speed is the time since the start: every chart shows the same range.
     low, high = plain(page.locator("section[aria-label=Speed] .note").inner_text()).split(" to ")
-    assert [float(low) / 461.4, float(high) / 461.4] == pytest.approx([15, 30], abs=0.3)
+    assert [float(low) * 10, float(high) * 10] == pytest.approx([15, 30], abs=0.3)
     chart(page, "Speed").click(position={"x": 40, "y": 40})
     page.get_by_role("button", name="Battery voltage").click()
     link = page.url
@@ -274,3 +276,44 @@ def test_another_stream_is_loaded_at_once_and_kept_in_the_address(page: Page, pa
     until(lambda: len(past.asked) == 3 and page.evaluate("iort.link") == "live", "the address' stream")
     assert [asked["stream"] for asked in past.asked] == [VESC_STREAM, "agent", "agent"]
     assert "?stream=agent&from=" in page.url
+
+
+def middle(page: Page, at: float, unit: str) -> list[float]:
+    """Both cars' speeds in the middle of the chart, which is at ``at``."""
+
+    def there() -> bool:
+        box = chart(page, "Speed").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        match = re.fullmatch(rf"at ([\d.]+) {unit}", page.inner_text(".compare-view .history-status .num"))
+        return match is not None and abs(float(match[1]) - at) < 0.1
+
+    until(there, f"{at} {unit}")
+    texts = page.locator("section.panel[aria-label=Speed] .reading .num").all_inner_texts()
+    return [float(text) for text in texts]
+
+
+def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer, past: Past) -> None:
+    page.locator(".runs summary").click()
+    for box in page.locator(".runs input").all():
+        box.check()
+    page.get_by_role("link", name="Compare 2 runs").click()
+    note = page.locator(".compare-view .history-note")
+    until(lambda: "4500 samples" in plain(note.inner_text()), "the two runs")
+    # A lap is a range: twenty seconds from the start, and as many ten seconds later.
+    laps = (
+        "car/2023-11-14T22:13:20.000Z/2023-11-14T22:13:40.000Z",
+        "car/2023-11-14T22:13:30.000Z/2023-11-14T22:13:50.000Z",
+    )
+    page.goto(f"{server.url}#/compare?runs={','.join(laps)}&stream=vesc")
+    until(lambda: "2000 samples" in plain(note.inner_text()), "both laps")
+    assert middle(page, 10, "s") == pytest.approx([1, 2], abs=0.02)
+    page.locator("#compare-axis").select_option("distance")
+    # From 1 m/s the second lap has 40 m. By v² = v0² + 2 a s:
+    assert middle(page, 20, "m") == pytest.approx([2, math.sqrt(5)], abs=0.02)
+    drag(page, "Speed", 0.2, 0.3)
+    until(lambda: "zoom=" in page.url, "the zoom")
+    page.reload()
+    assert middle(page, 10, "m") == pytest.approx([math.sqrt(2), math.sqrt(3)], abs=0.02)
+    page.locator("#compare-stream").select_option("agent")
+    until(lambda: "car has no distance in agent" in note.inner_text(), "the reason")

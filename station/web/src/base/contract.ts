@@ -8,6 +8,7 @@ export const GONE_S = 4.5;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
+export const TACHOMETER_COUNTS = 6;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
 export const CAR_ALARMS = {

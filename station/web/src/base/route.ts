@@ -9,7 +9,7 @@ const PARAMETERS = {
   fleet: ["find", "sort", "group"],
   car: [],
   history: ["stream", "from", "to", "fields", "at"],
-  compare: ["runs", "stream", "fields", "x"],
+  compare: ["runs", "stream", "fields", "x", "zoom"],
   cloudwatch: [],
   alarms: [],
 } as const;

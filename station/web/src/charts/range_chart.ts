@@ -37,8 +37,8 @@ export interface RangeChartOptions {
   readonly hole_s: number;
   /** Draw a band from minimum to maximum of the first curve: columns two and three of the data. */
   readonly band?: boolean;
-  /** x is a plain number, not a time. */
-  readonly plain?: boolean;
+  /** The unit of x; without it x is a time. */
+  readonly unit?: string;
   readonly onCursor?: (index: number | null) => void;
   readonly hands?: Hands;
 }
@@ -92,9 +92,9 @@ export class RangeChart {
           points: { size: 7, width: 0 },
           ...(options.sync ? { sync: { key: options.sync, setSeries: false } } : {}),
         },
-        scales: { x: { time: !options.plain, auto: false, range: () => [...this.range] }, y: { range: rounded }, right: { range: rounded } },
+        scales: { x: { time: options.unit === undefined, auto: false, range: () => [...this.range] }, y: { range: rounded }, right: { range: rounded } },
         axes: [
-          axis(colours, 1.5, 0.3, { space: rem(5), values: (_, splits) => (options.plain ? labels(splits) : timeLabels(splits)) }),
+          axis(colours, 1.5, 0.3, { space: rem(5), values: (_, splits) => (options.unit === undefined ? timeLabels(splits) : labels(splits).map((text) => `${text} ${options.unit}`)) }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
           ...(right ? [axis(colours, 3.1, 0.4, { side: 1, scale: "right", space: rem(2.2), grid: { show: false }, values: (_, splits) => labels(splits) })] : []),
         ],
