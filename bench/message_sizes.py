@@ -14,7 +14,7 @@ from decimal import Decimal
 from typing import Any
 
 from bench.load.simulated import simulated_drive
-from iort_agent.sources.vehicle import VehicleConfig
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_contract.catalog.derived import Vehicle as Gain
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.catalog.vesc import VESC_STREAM

@@ -30,6 +30,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "dashboard": lambda: _driven(dashboard.SECONDS * 2),
         "utilisation": _utilisation,
         "query": lambda: _query(cloud),
+        "command": lambda: _items(write=60 * (_BATCH_WRITES + _SUMMARY_WRITES), read=60 * _BATCH_WRITES),
         # A metric of its own, for the hour that AWS bills.
         "abilities": lambda: [*_items(metric=1 / 730, message=500, write=500), *_invoked(100, 512)],
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),

@@ -85,7 +85,12 @@ class CommandLine:
 
 def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:
     """The synthesized stacks of the checkout: kept ones, or new ones from ``synthesize``."""
-    sources = [root / name for name in _MADE_OF]
+    return kept(folder, namespace, sources(root), synthesize)
+
+
+def sources(root: Path) -> list[Path]:
+    """The files of a checkout from which its stacks are synthesized."""
+    found = [root / name for name in _MADE_OF]
     for name in _MADE_OF_FOLDERS:
-        sources += sorted((root / name).rglob("*.py"))
-    return kept(folder, namespace, sources, synthesize)
+        found += sorted((root / name).rglob("*.py"))
+    return found

@@ -22,7 +22,7 @@ import iort_station.errors
 from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_contract.catalog.derived import DERIVED
-from iort_contract.catalog.streams import AGENT_FIELDS
+from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_station.cli.main import app
 from iort_station.cost import report
@@ -32,7 +32,6 @@ from scripts import agent_reference, cloud_tables
 from scripts.page_contract import formula, page_contract
 
 __all__ = [
-    "agent",
     "alarms",
     "car_yaml",
     "cost",
@@ -49,6 +48,7 @@ __all__ = [
     "page_contract",
     "rules",
     "settings",
+    "stream",
 ]
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -100,9 +100,9 @@ def derived() -> None:
     _table(("derived field", "unit", "meaning", "formula"), rows, right=False)
 
 
-def agent() -> None:
-    """The agent's own figures, from the catalogue."""
-    rows = [(f"`{field.name}`", field.unit, field.meaning) for field in AGENT_FIELDS.values()]
+def stream(name: str) -> None:
+    """The fields of a stream, from the catalogue."""
+    rows = [(f"`{field.name}`", field.unit or "-", field.meaning) for field in CATALOG[name].fields]
     _table(("field", "unit", "meaning"), rows, right=False)
 
 

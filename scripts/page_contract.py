@@ -14,13 +14,15 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
-from iort_contract.catalog.streams import CATALOG
+from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import page
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3
+# Their fields have names that other streams use for something else.
+_NAMED = (POSE_STREAM, LOG_STREAM)
 
 
 class Symbol:
@@ -72,6 +74,8 @@ def _constants() -> Iterator[str]:
             value = getattr(module, name)
             literal = f"/^(?:{value.pattern})$/" if isinstance(value, re.Pattern) else json.dumps(value)
             yield f"export const {name} = {literal};"
+    yield f"export const POSE_STREAM = {json.dumps(POSE_STREAM)};"
+    yield f"export const LOG_STREAM = {json.dumps(LOG_STREAM)};"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
     # The alarms that the page can see in a car's live values.
@@ -86,6 +90,10 @@ def _constants() -> Iterator[str]:
         "version": limits.SCHEMA_VERSION,
         "stream": VESC_STREAM,
         "fields": {field.name: _described(field) for field in _fields()},
+        "streams": {
+            stream.name: {field.name: _described(field) for field in stream.fields}
+            for stream in map(CATALOG.__getitem__, _NAMED)
+        },
         "ros_units": ROS_UNITS,
         "faults": {str(code): name for code, name in FAULTS.items()},
     }
@@ -94,8 +102,9 @@ def _constants() -> Iterator[str]:
 
 
 def _fields() -> Iterator[Field | Derived]:
-    for stream in CATALOG.values():
-        yield from stream.fields
+    for name, stream in CATALOG.items():
+        if name not in _NAMED:
+            yield from stream.fields
     yield from DERIVED.values()
 
 
@@ -121,6 +130,8 @@ export interface FieldTable {
   /** The stream with the VESC's fields. */
   readonly stream: string;
   readonly fields: Readonly<Record<string, FieldEntry>>;
+  /** Stream -> its fields, whose names mean something else elsewhere. */
+  readonly streams: Readonly<Record<string, Readonly<Record<string, FieldEntry>>>>;
   /** Field -> unit of the fields x, y and z within it. */
   readonly ros_units: Readonly<Record<string, string>>;
   readonly faults: Readonly<Record<string, string>>;

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,26 +19,26 @@ from tests.browser import browser, open_page  # noqa: F401 - fixtures
 # The duration of an example depends only on the machine.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("iort")
-# `make test-fast`; CI generates the usual number.
+# `make test-fast`; CI generates the usual number. tests/examples.py scales a test's own number with it.
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
-# starts its own cloud, the synthesized app, the browser. The longest groups start first, because their
-# folders are collected first. A node id's beginning decides, and the first that fits.
+# starts its own cloud, the synthesized app, the browser. They start first, in this order: a long group that
+# starts last runs alone. A node id's beginning decides, and the first that fits.
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
     "tests/local/data/": "cloud of the data",
+    "tests/ros/test_two_robots.py": "cloud of the data",
     "tests/local/faults/": "cloud of the faults",
-    "tests/local/gaps/": "cloud of the robots",
-    "tests/local/pubnub/": "PubNub",
-    "tests/local/robots/": "cloud of the robots",
     "tests/ros/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
-    "tests/ros/test_two_robots.py": "cloud of the data",
+    "tests/local/gaps/": "cloud of the robots",
+    "tests/local/robots/": "cloud of the robots",
+    "tests/web/": "page",
     "tests/stacks/": "app",
     "tests/unit/functions/test_admit.py": "app",
-    "tests/web/": "page",
+    "tests/local/pubnub/": "PubNub",
 }
 
 
@@ -49,6 +50,12 @@ def group(nodeid: str) -> str:
         if nodeid.startswith(path):
             return name
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests of the groups first."""
+    order = {name: i for i, name in enumerate(dict.fromkeys(GROUPS.values()))}
+    items.sort(key=lambda item: order.get(group(item.nodeid), len(order)))
 
 
 def pytest_configure() -> None:
@@ -69,6 +76,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return group(nodeid)
 
     return Groups(config, log)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def services_read_once() -> Iterator[None]:
+    """botocore reads megabytes of JSON about its services for each new session; in tests all share it."""
+    if not find_spec("botocore"):
+        yield
+        return
+    import botocore.session
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(botocore.session, "create_loader", cache(botocore.session.create_loader))
+        yield
 
 
 def skips_fail() -> bool:

@@ -18,7 +18,7 @@ from typing import Any
 import urllib3
 
 from bench.load import camera
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel
 from iort_contract.limits import Value
@@ -42,9 +42,10 @@ class SimulatedCar:
         self._gain = VehicleConfig().speed_to_erpm_gain
         self._boot = secrets.token_hex(4)
         self._seqs: dict[str, int] = {}
-        self._x_m = self._y_m = self._heading = self._driven_m = self._speed_mps = 0.0
+        self._driven_m = self._speed_mps = 0.0
         for _ in range(seed * 97 % 500):
             self._vehicle.step(_STEP_S)
+        self._heading = self._vehicle.pose.heading_rad
 
     def updates(self, dt: float) -> list[dict[str, Any]]:
         """Drive on for ``dt`` seconds; return one live update for each stream."""
@@ -57,14 +58,10 @@ class SimulatedCar:
         return updates
 
     def _sense(self, speed_mps: float, dt: float) -> list[dict[str, Any]]:
-        # A lap of about 50 m, narrower on one side.
         self._driven_m += speed_mps * dt
-        turn = self._driven_m / 50 * 2 * math.pi
-        x_m, y_m = 10 * math.cos(turn), 6 * math.sin(turn) * (1 + 0.3 * math.cos(turn))
-        heading = math.atan2(y_m - self._y_m, x_m - self._x_m)
-        turned = (heading - self._heading + math.pi) % (2 * math.pi) - math.pi
-        yaw_rate = turned / dt if self._driven_m > speed_mps * dt * 2 else 0.0
-        self._x_m, self._y_m, self._heading = x_m, y_m, heading
+        x_m, y_m, heading = self._vehicle.pose
+        yaw_rate = math.remainder(heading - self._heading, 2 * math.pi) / dt
+        self._heading = heading
         longitudinal = (speed_mps - self._speed_mps) / dt
         self._speed_mps = speed_mps
         pose: dict[str, Value] = {

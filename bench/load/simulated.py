@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.limits import Value
 
 RATE_HZ = 50

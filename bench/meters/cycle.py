@@ -23,7 +23,7 @@ from iort_agent.clock import SystemClock
 from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.intake import Intake, TopicConfig
-from iort_agent.sources.sim import SimConfig
+from iort_agent.sources.sim.source import PoseConfig, SimConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
 from tests.agent_fakes import Loopback
@@ -40,7 +40,7 @@ def main() -> None:
             endpoint="",
             certificate=Path(),
             private_key=Path(),
-            sources=(SimConfig(),),
+            sources=(SimConfig(pose=PoseConfig(rate_hz=0)),),
             queue=QueueConfig(path=Path(folder) / "spool.db"),
         )
         spool = make_spool(config.queue, clock)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from bench.report.result import Section
 from bench.sections import (
     abilities,
+    command,
     cost,
     dashboard,
     fairness,
@@ -26,6 +27,7 @@ SECTIONS: dict[str, Run] = {
     "dashboard": dashboard.run,
     "utilisation": utilisation.run,
     "query": query.run,
+    "command": command.run,
     "abilities": abilities.run,
     "cost": cost.run,
     "outage": outage.run,

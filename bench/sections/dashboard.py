@@ -58,7 +58,7 @@ def run(target: Target, say: Say) -> Section:
     section = Section("dashboard", "To the dashboard")
     bundle = target.robot(
         ROBOT,
-        sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}],
+        sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
         metrics={"every_s": 1},
         ping={"rate_hz": 1},
     )

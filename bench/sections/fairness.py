@@ -63,7 +63,9 @@ def run(target: Target, say: Say) -> Section:
         section.notes.append("Not run on AWS: the messages refused would count against your alarms.")
         return section
     car = target.robot(
-        "bench-fair", sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}], metrics={"every_s": 1}
+        "bench-fair",
+        sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
+        metrics={"every_s": 1},
     )
     other = target.robot("bench-hostile")
     topic = build_topic(LIVE, other.robot, VESC_STREAM, target.cloud.namespace)

@@ -55,7 +55,7 @@ def run(target: Target, say: Say) -> Section:
     """Drive, cut the connection, restore it; then count the stored samples and the live updates."""
     section = Section("outage", "Outage: no broker for 60 s at 50 Hz")
     seconds = BEFORE_S + CUT_S + AFTER_S
-    source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
+    source = {"type": "sim", "rate_hz": RATE_HZ, "duration_s": seconds, "pose": {"rate_hz": 0}}
     bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
     with (
         _way(target, bundle) as (cut, mend),

@@ -25,7 +25,7 @@ from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target, temporary_function
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live

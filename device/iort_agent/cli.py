@@ -16,7 +16,8 @@ from typing import Any, Callable, Sequence
 
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.common.logs import LOG_LEVELS, neutral, set_up
+from iort_agent.common.log_lines import neutral
+from iort_agent.common.logs import set_up
 from iort_agent.common.state import document
 from iort_agent.common.version import agent_version
 from iort_agent.config import Config, load_config
@@ -26,6 +27,7 @@ from iort_agent.runtime import Runtime
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
 from iort_agent.status.text import render as render_status
+from iort_contract.messages.settings import LOG_LEVELS
 
 _log = logging.getLogger("iort-agent")
 

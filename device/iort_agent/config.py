@@ -6,11 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from iort_agent.common.logs import LOG_LEVELS
 from iort_agent.common.schema import (
     Place,
+    allowed,
     any_path,
-    choice,
     existing_path,
     items,
     load,
@@ -31,6 +30,7 @@ from iort_agent.spool.config import QueueConfig
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.settings import SETTINGS
 from iort_contract.topics import check_namespace, check_robot
 
 
@@ -61,7 +61,7 @@ class Config:
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
     share: tuple[tuple[str, ShareConfig], ...] = setting(share_rule(), ())
     status_socket: Path | None = setting(any_path(), None)
-    log_level: str = setting(choice(*LOG_LEVELS), "info")
+    log_level: str = setting(allowed(SETTINGS["log_level"]), "info")
 
 
 def load_config(file: Path) -> Config:

@@ -10,7 +10,7 @@ from iort_agent.agent import Agent
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
-from iort_contract.catalog.streams import AGENT_STREAM, OWN_STREAMS
+from iort_contract.catalog.streams import AGENT_STREAM, LOG_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 
@@ -61,8 +61,10 @@ class Runtime:
         for thread in (*sources, watcher, ticker, pinger):
             thread.join()
         agent.pings.close(min(_LAST_PONGS_S, drain_s))
-        delivered = self._drain(drain_s)
+        agent.streams.flush()
         self._check_sources()
+        self._send_log()
+        delivered = self._drain(drain_s)
         if agent.downlink is not None:
             agent.downlink.close()
         self._end_uploads(uploader, uploads_stop, drain_s)
@@ -74,6 +76,7 @@ class Runtime:
 
     def tick(self) -> None:
         """Let streams and lanes do what is due; `run` calls it several times a second."""
+        self._send_log()
         self.agent.streams.tick()
         self.agent.record.tick()
         self.agent.live.tick()
@@ -97,6 +100,12 @@ class Runtime:
             if metrics.enabled and now - measured >= metrics.every_s:
                 measured = now
                 self._measure()
+
+    def _send_log(self) -> None:
+        """Emit the agent's own warnings and errors. Where they are logged, a lane's lock may be held."""
+        troubles = self.agent.troubles
+        for t_us, line in troubles.lines.take() if troubles is not None else ():
+            self.agent.streams.emit(LOG_STREAM, t_us, line)
 
     def _measure(self) -> None:
         """Record a sample of the agent's own stream."""

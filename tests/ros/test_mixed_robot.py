@@ -36,8 +36,8 @@ from tests.ros.mixed_rosbridge import GraphServer
 from tests.ros1_types import as_json
 
 RECORD = Path("/usr/lib/rosbag/record")
-DURATION_S = float(os.environ.get("IORT_MIXED_S") or 30)
-OUTAGE_S = max(10.0, DURATION_S / 5)
+DURATION_S = float(os.environ.get("IORT_MIXED_S") or 20)
+OUTAGE_S = max(5.0, DURATION_S / 5)
 SECOND_S = 5.0
 # A killed agent loses its open batches, which are one second long.
 OPEN_S = 2.5

@@ -6,8 +6,12 @@ neither boto3 nor moto is installed.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
 
 import pytest
 from pytest_socket import disable_socket, enable_socket
@@ -21,15 +25,20 @@ def no_network():
     enable_socket()
 
 
+@cache
+def kept_by(module: ModuleType) -> list[Callable[[], None]]:
+    """What clears the caches of a function's module."""
+    return [value.cache_clear for value in vars(module).values() if hasattr(value, "cache_clear")]
+
+
 @pytest.fixture(autouse=True)
 def new_environment():
     """Every test is a new environment of the functions: they have read no variable and made no client."""
     yield
     for name, module in list(sys.modules.items()):
         if name.startswith("functions."):
-            for made in vars(module).values():
-                if hasattr(made, "cache_clear"):
-                    made.cache_clear()
+            for clear in kept_by(module):
+                clear()
 
 
 @pytest.fixture(autouse=True)
@@ -52,14 +61,26 @@ def aws(monkeypatch):
 
 @pytest.fixture(scope="session")
 def tables():
-    """The properties of the storage stack's tables, by logical id. One stack is synthesized, not the app."""
-    from aws_cdk import App, assertions
+    """The properties of the storage stack's tables, by logical id.
 
-    from stacks.settings import Settings
-    from stacks.storage import Storage
+    One stack is synthesized, not the app, and only if its sources have changed since the last time.
+    """
+    from local.deployment import ROOT, sources
+    from local.kept import kept
 
-    template = assertions.Template.from_stack(Storage(App(), Settings()))
-    found = template.find_resources("AWS::DynamoDB::Table")
+    def synthesize(folder):
+        from aws_cdk import App, assertions
+
+        from stacks.settings import Settings
+        from stacks.storage import Storage
+
+        template = assertions.Template.from_stack(Storage(App(), Settings()))
+        folder.mkdir()
+        (folder / "tables.json").write_text(json.dumps(template.find_resources("AWS::DynamoDB::Table")))
+
+    found = json.loads(
+        (kept(ROOT / "build" / "tables", "tables", sources(ROOT), synthesize) / "tables.json").read_text()
+    )
     return {logical: resource["Properties"] for logical, resource in found.items()}
 
 

@@ -24,9 +24,9 @@ def test_every_view_counts_the_alarms_and_each_says_what_to_do(
     with lab.server(pubnub) as server:
         page = open_page(server.url)
         badge = page.locator("#alarms")
-        for view in VIEWS.values():
-            page.goto(server.url + view)
-            until(lambda: badge.inner_text() == "3", f"the badge on {view}")
+        for view, (address, _) in VIEWS.items():
+            page.goto(server.url + address)
+            until(lambda: badge.inner_text() == "3", f"the badge on the view {view}")
         assert badge.get_attribute("aria-label") == "3 raised, 2 of them not acknowledged"
         page.locator("#to-alarms").click()
         faulty = page.locator("[data-alarm=FaultSamples]")

@@ -45,7 +45,13 @@ class Logs:
     def log(self, asked: Any) -> dict[str, Any]:
         self.queries.append(dict(asked))
         assert self.done.wait(60)
-        return {"columns": ["@message"], "rows": [[asked["minutes"]]], "found": 1, "from_s": 0, "to_s": 60}
+        return {
+            "columns": ["@message"],
+            "rows": [[f"{asked['minutes']}\n  in details"]],
+            "found": 1,
+            "from_s": 0,
+            "to_s": 60,
+        }
 
 
 def test_the_page_waits_for_a_log_query_across_dashboard_updates(
@@ -74,5 +80,8 @@ def test_the_page_waits_for_a_log_query_across_dashboard_updates(
         logs.done.set()
         line = page.locator(".log-widget td.words")
         until(lambda: line.count() == 1, "the matches")
+        # The details of a line wait for a click.
         assert line.inner_text() == "15"
+        line.locator("summary").click()
+        assert line.inner_text().split("\n") == ["15", "  in details"]
         assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]

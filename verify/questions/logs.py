@@ -85,7 +85,12 @@ def metric(target: Target) -> Seen:
 @question(
     "logs.lines",
     expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
-    relied_on_by=("stacks/monitoring/dashboards.py", "functions/shared/metrics.py"),
+    relied_on_by=(
+        "stacks/monitoring/dashboards.py",
+        "functions/shared/metrics.py",
+        "station/iort_station/operations/log_records.py",
+        "local/patches/log_records.patch",
+    ),
 )
 def lines(target: Target) -> Seen:
     """With logs in JSON, printed lines stay unchanged; warnings and uncaught errors are lines with their

@@ -7,6 +7,7 @@ from iort_contract.catalog.vesc import VESC
 from iort_contract.topics import PING_PATHS
 
 RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM = "rtt", "agent", "types", "account"
+LOG_STREAM, POSE_STREAM = "log", "pose"
 # One sample per pong, with null in the other paths' fields.
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 
@@ -14,6 +15,26 @@ CATALOG = {
     stream.name: stream
     for stream in (
         VESC,
+        Stream(
+            POSE_STREAM,
+            "where the car is, in the frame of its track or map",
+            (
+                Field("x", "m", "position of the rear axle's middle", "motion"),
+                Field("y", "m", "position of the rear axle's middle", "motion"),
+                Field("heading", "rad", "direction of travel: 0 along x, pi/2 along y, -pi to pi", "motion"),
+            ),
+        ),
+        Stream(
+            LOG_STREAM,
+            "the agent's own warnings and errors; recorded and live",
+            (
+                Field("level", "", "`warning`, `error` or `critical`"),
+                Field("logger", "", "the part of the agent, such as `iort_agent.mqtt.aws`"),
+                Field("text", "", "the line, with the exception's if it has one; at most 1,000 characters"),
+                Field("left_out", "lines", "lines that were too many to send, since the line before"),
+            ),
+            own=True,
+        ),
         Stream(
             RTT_STREAM,
             "round trips of pings",

@@ -218,7 +218,8 @@ class Dashboard(TypedDict):
 
 
 class Logs(TypedDict):
-    """Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows."""
+    """Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. The first line of
+    a cell says what happened."""
 
     columns: list[str]
     rows: list[list[str]]

@@ -9,17 +9,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
+from iort_agent.common.log_lines import LogLines, neutral
+
 _SYSLOG_LEVELS = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 _KEPT = 5
-LOG_LEVELS = ("debug", "info", "warning", "error")
-
-
-def neutral(text: str) -> str:
-    """The text on one line, with escapes for line ends and control characters. Names and answers from
-    elsewhere may contain them."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @dataclass(frozen=True)
@@ -32,17 +25,22 @@ class Trouble:
 
 
 class Troubles(logging.Handler):
-    """Keeps the latest warnings, and separately the latest errors, so that no warning displaces an error."""
+    """Keeps the latest warnings, and separately the latest errors, so that no warning displaces an error.
+
+    ``lines`` are those to send.
+    """
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self._warnings: deque[Trouble] = deque(maxlen=_KEPT)
         self._errors: deque[Trouble] = deque(maxlen=_KEPT)
+        self.lines = LogLines()
 
     def emit(self, record: logging.LogRecord) -> None:
         lines = self._errors if record.levelno >= logging.ERROR else self._warnings
         text = neutral(record.getMessage())
         lines.append(Trouble(round(record.created, 3), record.levelname.lower(), text))
+        self.lines.add(record)
 
     def last(self) -> list[Trouble]:
         """The kept lines, the newest last."""

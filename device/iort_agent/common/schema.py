@@ -16,6 +16,7 @@ import yaml
 
 from iort_agent.errors import ConfigError
 from iort_contract.limits import ContractError
+from iort_contract.messages.settings import Choice, Flag, Number
 
 T = TypeVar("T")
 # YAML may have read a value as another type than its writer meant.
@@ -108,6 +109,13 @@ def choice(*names: str) -> Rule:
         return str(value)
 
     return rule
+
+
+def allowed(values: Flag | Number | Choice) -> Rule:
+    """The values of a setting that may change at run time."""
+    if isinstance(values, Number):
+        return number(values.low, values.high, unit=values.unit)
+    return choice(*values.names) if isinstance(values, Choice) else flag()
 
 
 def text(check: Callable[[str], str] | None = None) -> Rule:

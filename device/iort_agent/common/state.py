@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
 
 from iort_agent.common.logs import Trouble
+from iort_contract.messages.shadow import OverShare
 
 T = TypeVar("T")
 
@@ -125,15 +126,6 @@ class RoundTrips:
     lost: int
     p50_ms: Optional[float]
     p95_ms: Optional[float]
-
-
-@dataclass(frozen=True)
-class OverShare:
-    """Batches over the robot's share of the cloud, and the cloud's time of the first and the last one."""
-
-    since_ms: int
-    last_ms: int
-    batches: int
 
 
 @dataclass(frozen=True)

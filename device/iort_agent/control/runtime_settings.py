@@ -1,72 +1,58 @@
-"""The settings that the operator may change while the agent runs: their names and rules.
-
-A name is a dotted path, the same in car.yaml and in the shadow. ``fields.<stream>`` selects a stream's
-fields.
-"""
+"""Applies the settings that the operator may change while the agent runs."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Iterable, Iterator, Mapping
+from typing import Any, Iterable, Mapping
 
-from iort_agent.common.logs import LOG_LEVELS
-from iort_agent.common.schema import Place, Rule, choice, did_you_mean, items, rules_of, text
+from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig, RuntimeSettings
+from iort_agent.lanes.config import RuntimeSettings
 from iort_contract.checks import check_field
+from iort_contract.messages.settings import CHANGEABLE, FIELD_LIST, FIELDS, SETTINGS
+from iort_contract.messages.shadow import Rejection
 from iort_contract.topics import check_stream
 
 _PLACE = Place(Path("shadow agent"))
-FIELDS = "fields"
-_FIELD_LIST = items(text(check_field), what="a list of field names; an empty one means all fields")
-RULES: dict[str, Rule] = {
-    "record.enabled": rules_of(RecordConfig)["enabled"],
-    "live.enabled": rules_of(LiveConfig)["enabled"],
-    "live.rate_hz": rules_of(LiveConfig)["rate_hz"],
-    "ping.rate_hz": rules_of(PingConfig)["rate_hz"],
-    "log_level": choice(*LOG_LEVELS),
-}
-_SECTIONS = {name.split(".")[0] for name in RULES if "." in name} | {FIELDS}
+_FIELD_LIST = items(text(check_field), what=FIELD_LIST)
 
 
 def overlay(
-    base: RuntimeSettings, desired: Mapping[str, Any], known_fields: Mapping[str, Iterable[str]]
-) -> tuple[RuntimeSettings, dict[str, dict[str, Any]]]:
-    """The base with the desired settings that are allowed; value and reason of each rejected one, by name.
+    base: RuntimeSettings,
+    in_force: RuntimeSettings,
+    desired: Mapping[str, Any],
+    known_fields: Mapping[str, Iterable[str]],
+) -> tuple[RuntimeSettings, dict[str, Rejection]]:
+    """The base with the desired settings, and the rejected ones by name; these keep what is ``in_force``.
 
     ``known_fields`` holds the fields of the streams seen so far; only these can be selected.
     """
     values: dict[str, Any] = {}
     fields = dict(base.fields)
-    rejected: dict[str, dict[str, Any]] = {}
-    for name, value in _flat(desired):
+    rejected: dict[str, Rejection] = {}
+    for name, value in desired.items():
+        stream = name[len(FIELDS) + 1 :] if name.startswith(f"{FIELDS}.") else None
+        attribute = name.replace(".", "_")
         try:
-            if name.startswith(f"{FIELDS}."):
-                stream = name[len(FIELDS) + 1 :]
+            if stream is not None:
                 names = _selection(stream, value, known_fields.get(stream))
                 if names:
                     fields[stream] = names
-            elif name in RULES:
-                values[name.replace(".", "_")] = RULES[name](value, _PLACE.child(name))
+            elif name in SETTINGS:
+                values[attribute] = allowed(SETTINGS[name])(value, _PLACE.child(name))
             else:
-                allowed = [*RULES, f"{FIELDS}.<stream>"]
-                hint = did_you_mean(name, allowed)
+                hint = did_you_mean(name, CHANGEABLE)
                 raise _PLACE.child(name).problem(
-                    f"cannot be changed{hint}; must be one of {', '.join(allowed)}"
+                    f"cannot be changed{hint}; must be one of {', '.join(CHANGEABLE)}"
                 )
-        except ConfigError as error:  # noqa: PERF203 - one wrong setting must not reject the others
-            rejected[name] = {"value": value, "reason": str(error)}
+        except ConfigError as error:
+            rejected[name] = Rejection(value, str(error))
+            if stream is not None:
+                fields.update({stream: in_force.fields[stream]} if stream in in_force.fields else {})
+            elif name in SETTINGS:
+                values[attribute] = getattr(in_force, attribute)
     return dataclasses.replace(base, fields=fields, **values), rejected
-
-
-def _flat(desired: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in desired.items():
-        if name in _SECTIONS and isinstance(value, dict):
-            for inner, item in value.items():
-                yield f"{name}.{inner}", item
-        else:
-            yield name, value
 
 
 def _selection(stream: str, value: Any, known: Iterable[str] | None) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
 """The named shadow `agent`: the operator's desired settings come in, the settings in force go out.
 
-The desired settings overlay the configuration file; a removed one (null) restores the file's value. The agent
-fetches the whole shadow after every connect and after a missed change, and follows every accepted change in
-between. It does not use deltas: a desired value that equals the reported one makes no delta, although it may
-end a rejection.
+The desired settings overlay the configuration file. A removed one (null) restores the file's value, and a
+rejected one leaves the value in force. The agent fetches the whole shadow after every connect and after a
+missed change, and follows every accepted change in between. It does not use deltas: a desired value that
+equals the reported one makes no delta, although it may end a rejection.
 """
 
 from __future__ import annotations
@@ -12,14 +12,20 @@ import json
 import logging
 from typing import Any, Callable, Mapping
 
-from iort_agent.common.state import OverShare
 from iort_agent.control.runtime_settings import overlay
 from iort_agent.errors import UplinkError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.messages.commands import Command
-from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
-from iort_contract.topics import ACCEPTED, COMMANDS, SHADOW
+from iort_contract.messages.shadow import (
+    Outcome,
+    OverShare,
+    Rejection,
+    Reported,
+    decode_desired,
+    encode_reported,
+)
+from iort_contract.topics import ACCEPTED, SHADOW
 
 _log = logging.getLogger(__name__)
 
@@ -27,8 +33,6 @@ _AGAIN_S = 30.0
 # AWS limits a shadow document to 8 KB. A rejected value is quoted up to this length.
 _MAX_VALUE_CHARS = 200
 _NOT_FOUND = 404
-# Larger than any count, and than any time of a calendar.
-_MOST = 10**15
 
 
 class Shadow:
@@ -59,8 +63,8 @@ class Shadow:
         }
         self.over_share: OverShare | None = None
         self._desired: dict[str, Any] = {}
-        self._rejected: dict[str, dict[str, Any]] = {}
-        self._answers: dict[str, dict[str, Any]] = {}
+        self._rejected: dict[str, Rejection] = {}
+        self._answers: dict[str, Outcome] = {}
         # The reported part of the shadow, as far as known; None before it was fetched.
         self._reported: dict[str, Any] | None = None
         self._version = 0
@@ -88,7 +92,7 @@ class Shadow:
     def answer(self, name: str, command: Command, rejection: str | None) -> None:
         """Report the outcome of a command; only the newest of each name is kept."""
         outcome = ACCEPTED if rejection is None else _quoted(rejection)
-        self._answers[name] = {"session": command.session, "seq": command.seq, "outcome": outcome}
+        self._answers[name] = Outcome(command.session, command.seq, outcome)
         self._report_at = self._clock.monotonic()
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
@@ -143,43 +147,33 @@ class Shadow:
 
     def _follow(self) -> None:
         """Apply the desired settings that are allowed, and report."""
-        self._note_over_share(_mapping(self._desired.get(OVER_SHARE)))
-        desired = {name: value for name, value in self._desired.items() if name != OVER_SHARE}
-        settings, rejected = overlay(self._base, desired, self._known_fields())
+        desired = decode_desired(self._desired)
+        if desired.over_share is not None:
+            self._note_over_share(desired.over_share)
+        settings, rejected = overlay(self._base, self.settings, desired.settings, self._known_fields())
         for name, rejection in rejected.items():
             if self._rejected.get(name) != rejection:
-                _log.warning("rejected: %s", rejection["reason"])
+                _log.warning("rejected: %s", rejection.reason)
         self._rejected = rejected
         if settings != self.settings:
-            _log.info("now in force: %s", json.dumps(settings.as_document()))
+            _log.info("now in force: %s", json.dumps(settings.by_name()))
             self.settings = settings
             self._apply(settings)
         self._report_at = self._clock.monotonic()
 
-    def _note_over_share(self, said: Mapping[str, Any]) -> None:
+    def _note_over_share(self, said: OverShare) -> None:
         """Note that the cloud put off batches, and log it once."""
-        values = [said.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
-        numbers = [value for value in values if type(value) is int and 0 <= value < _MOST]
-        if len(numbers) < len(values):
-            return
-        before, self.over_share = self.over_share, OverShare(*numbers)
-        if before is None or before.since_ms != self.over_share.since_ms:
+        before, self.over_share = self.over_share, said
+        if before is None or before.since_ms != said.since_ms:
             _log.warning(
                 "more is recorded than this robot's share of the cloud: summaries are made later, "
                 "and nothing is lost"
             )
 
     def _state(self) -> dict[str, Any]:
-        rejected = {
-            name: {**rejection, "value": _quoted(rejection["value"])}
-            for name, rejection in self._rejected.items()
-        }
-        return {
-            **self.settings.as_document(),
-            "rejected": rejected,
-            COMMANDS: dict(self._answers),
-            AGENT_VERSION: self._agent_version,
-        }
+        rejected = {name: one._replace(value=_quoted(one.value)) for name, one in self._rejected.items()}
+        settings = self.settings.by_name()
+        return encode_reported(Reported(settings, rejected, dict(self._answers), self._agent_version))
 
     def _publish(self, topic: str, payload: bytes) -> None:
         self._link.publish(topic, payload, qos=1, done=_log_error)

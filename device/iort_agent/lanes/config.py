@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Mapping
 
-from iort_agent.common.schema import choice, flag, items, number, setting
-from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ
+from iort_agent.common.schema import allowed, choice, items, number, setting
+from iort_contract.limits import LIVE_MAX_RATE_HZ
+from iort_contract.messages.settings import FIELDS, SETTINGS
 from iort_contract.topics import PING_PATHS
 
 
@@ -14,7 +15,7 @@ from iort_contract.topics import PING_PATHS
 class RecordConfig:
     """The record lane. A batch spans at most ``batch_s``; with 0 each sample is sent by itself."""
 
-    enabled: bool = setting(flag(), default=True)
+    enabled: bool = setting(allowed(SETTINGS["record.enabled"]), default=True)
     batch_s: float = setting(number(0, 1, unit="s"), default=1.0)
 
 
@@ -22,18 +23,15 @@ class RecordConfig:
 class LiveConfig:
     """The live lane. ``rate_hz`` is the most messages a second of each stream."""
 
-    enabled: bool = setting(flag(), default=True)
-    rate_hz: float = setting(
-        number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, unit="Hz"),
-        LIVE_MAX_RATE_HZ,
-    )
+    enabled: bool = setting(allowed(SETTINGS["live.enabled"]), default=True)
+    rate_hz: float = setting(allowed(SETTINGS["live.rate_hz"]), LIVE_MAX_RATE_HZ)
 
 
 @dataclass(frozen=True)
 class PingConfig:
     """The pings. ``rate_hz`` is the number a second over each path; 0 sends none."""
 
-    rate_hz: float = setting(number(0, 20, unit="Hz"), 0.0)
+    rate_hz: float = setting(allowed(SETTINGS["ping.rate_hz"]), 0.0)
     paths: tuple[str, ...] = setting(
         items(
             choice(*PING_PATHS),
@@ -56,12 +54,9 @@ class RuntimeSettings:
     log_level: str
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def as_document(self) -> dict[str, Any]:
-        """The document that the shadow reports."""
+    def by_name(self) -> dict[str, Any]:
+        """The settings by the names that the shadow has."""
         return {
-            "record": {"enabled": self.record_enabled},
-            "live": {"enabled": self.live_enabled, "rate_hz": self.live_rate_hz},
-            "ping": {"rate_hz": self.ping_rate_hz},
-            "log_level": self.log_level,
-            "fields": {stream: list(names) for stream, names in sorted(self.fields.items())},
+            **{name: getattr(self, name.replace(".", "_")) for name in SETTINGS},
+            **{f"{FIELDS}.{stream}": list(names) for stream, names in sorted(self.fields.items())},
         }

@@ -8,7 +8,7 @@ from iort_agent.sources import SourceConfig
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.sources.rosbridge.source import RosbridgeConfig
-from iort_agent.sources.sim import SimConfig
+from iort_agent.sources.sim.source import SimConfig
 from iort_agent.sources.vesc.serial_line import VescConfig
 
 SOURCES: Mapping[str, type[SourceConfig]] = {

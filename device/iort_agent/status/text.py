@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any, Iterator, Mapping
 
-from iort_agent.common.logs import neutral
+from iort_agent.common.log_lines import neutral
 from iort_agent.common.state import Files, LiveLane, Queue, RecordLane, Status
 
 # A stream that is silent for longer is marked.

@@ -16,6 +16,8 @@ from iort_station.errors import StationError
 
 # Sources that take samples at a rate of their own, with its default; a test compares them with the agent's.
 _OWN_RATE_HZ = {"sim": 50.0, "vesc": 50.0}
+# A simulated car's poses, a stream beside its samples.
+_POSE_RATE_HZ = 20.0
 
 
 def as_configured(usage: Usage, file: Path) -> Usage:
@@ -43,7 +45,9 @@ def _rates_hz(source: _Section) -> list[float | None]:
     """The rate of each stream of a source; None if the file does not tell it."""
     kind = source.values.get("type")
     if kind in _OWN_RATE_HZ:
-        return [source.number("rate_hz", _OWN_RATE_HZ[kind])]
+        rate_hz = source.number("rate_hz", _OWN_RATE_HZ[kind])
+        poses_hz = source.section("pose").number("rate_hz", _POSE_RATE_HZ) if kind == "sim" else 0.0
+        return [rate_hz, min(rate_hz, poses_hz)] if poses_hz else [rate_hz]
     topics = source.section("topics").values.values()
     names = {str(topic.get("stream") if isinstance(topic, dict) else topic) for topic in topics}
     return [None] * max(1, len(names))

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.ros_types import ROS_UNITS, TYPE_UNITS
-from iort_contract.catalog.streams import CATALOG, OWN_STREAMS
+from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.limits import MessageError
 from iort_contract.messages.message_type import MessageType
@@ -32,7 +32,7 @@ def unit(stream: str, name: str, *, ros2: bool = False, kind: MessageType | None
 def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> str:
     if field in DERIVED:
         return DERIVED[field].unit
-    if stream in OWN_STREAMS and (found := CATALOG[stream].unit(field)):
+    if kind is None and stream in CATALOG and (found := CATALOG[stream].unit(field, ros2=ros2)):
         return found
     if kind is not None and (found := _by_type(kind, field, ros2=ros2)):
         return found

@@ -7,13 +7,20 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from email.utils import parsedate_to_datetime
 from typing import Any, NamedTuple, TypeVar
 
 from iort_contract.limits import ContractError
-from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
-from iort_contract.topics import COMMANDS, SHADOW, check_robot
+from iort_contract.messages.shadow import (
+    Desired,
+    OverShare,
+    Reported,
+    decode_desired,
+    decode_reported,
+    nested,
+)
+from iort_contract.topics import SHADOW, check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -21,43 +28,24 @@ from iort_station.fleet import registry
 _POLL_S = 0.3
 # HTTP's Date has whole seconds, so smaller differences may be rounding.
 _CLOCK_S = 2.0
-# Every valid count and time is smaller.
-_MOST = 10**14
 _Found = TypeVar("_Found")
 
 
-class Rejection(NamedTuple):
-    """A desired setting that the robot rejected, and the reason."""
-
-    name: str
-    value: Any
-    reason: str
-
-
 class State(NamedTuple):
-    """The shadow's version and content; empty if the robot has none yet."""
+    """The shadow's desired and reported parts; empty if the robot has none yet."""
 
-    version: int
-    desired: Mapping[str, Any]
-    reported: Mapping[str, Any]
+    desired: Desired = Desired()
+    reported: Reported = Reported()
 
-    def settings(self) -> dict[str, Any]:
-        """The settings in use, by dotted name, as the robot last reported them."""
-        own = {k: v for k, v in self.reported.items() if k not in {"rejected", COMMANDS, AGENT_VERSION}}
-        return dict(sorted(_flat(own)))
-
-    def desired_settings(self) -> dict[str, Any]:
-        """The desired settings, by dotted name."""
-        return dict(_flat({name: value for name, value in self.desired.items() if name != OVER_SHARE}))
-
-    def rejections(self) -> list[Rejection]:
-        """The desired settings that the robot rejects; entries of another form are ignored."""
-        found = _mapping(self.reported.get("rejected"))
-        return [
-            Rejection(name, one.get("value"), str(one.get("reason", "")))
-            for name, one in sorted(found.items())
-            if isinstance(one, dict)
-        ]
+    def pending(self) -> dict[str, Any]:
+        """The desired settings, by name, that the robot has neither applied nor rejected."""
+        in_force, rejected = self.reported.settings, self.reported.rejected
+        return {
+            name: value
+            for name, value in self.desired.settings.items()
+            # An empty list of fields means all, which is not reported.
+            if name not in rejected and in_force.get(name, []) != value
+        }
 
 
 class Shadow:
@@ -84,14 +72,7 @@ class Shadow:
 
     def desire(self, wanted: Mapping[str, Any]) -> None:
         """Set desired settings by dotted name; None returns to the file's value."""
-        desired: dict[str, Any] = {}
-        for name, value in wanted.items():
-            first, _, rest = name.partition(".")
-            if rest:
-                desired.setdefault(first, {})[rest] = value
-            else:
-                desired[first] = value
-        payload = json.dumps({"state": {"desired": desired}})
+        payload = json.dumps({"state": {"desired": nested(wanted)}})
         self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=payload)
 
     def wait(self, found: Callable[[State], _Found | None], seconds: float) -> _Found | None:
@@ -103,40 +84,24 @@ class Shadow:
         return value
 
 
-class OverShare(NamedTuple):
-    """The batches that the cloud put off: their number, and the first and last time."""
-
-    batches: int
-    since_ms: int
-    last_ms: int
-
-
 def over_share(cloud: Cloud, robot: str) -> OverShare | None:
     """Lambda 2's last report on a robot over its share; None if it has none."""
-    said = _read(cloud.client("iot-data"), robot).desired.get(OVER_SHARE)
-    names = (PUT_OFF, PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS)
-    # The robot can write this too, so it may be anything.
-    if not isinstance(said, dict) or not all(
-        type(said.get(name)) is int and 0 <= said[name] < _MOST for name in names
-    ):
-        return None
-    return OverShare(*(said[name] for name in names))
+    return _read(cloud.client("iot-data"), robot).desired.over_share
 
 
 def _read(data: Any, robot: str) -> State:
     try:
         answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
     except data.exceptions.ResourceNotFoundException:
-        return State(0, {}, {})
-    document = json.loads(answer["payload"].read())
-    state = document.get("state", {})
-    return State(document.get("version", 0), state.get("desired") or {}, state.get("reported") or {})
+        return State()
+    state = json.loads(answer["payload"].read()).get("state", {})
+    return State(decode_desired(state.get("desired")), decode_reported(state.get("reported")))
 
 
 def answered(wanted: Mapping[str, Any], state: State) -> bool | None:
     """True once each desired setting is in use or rejected, otherwise None. A withdrawn setting is answered
     once it is no longer rejected."""
-    settings, rejected = state.settings(), {one.name: one for one in state.rejections()}
+    settings, rejected = state.reported.settings, state.reported.rejected
     for name, value in wanted.items():
         if name in rejected:
             if value is None or not _same(rejected[name].value, value):
@@ -148,29 +113,14 @@ def answered(wanted: Mapping[str, Any], state: State) -> bool | None:
 
 def outcome(state: State, name: str, session: str, seq: int) -> str | None:
     """The robot's report on a command; None until it reports."""
-    found = _mapping(_mapping(state.reported.get(COMMANDS)).get(name))
-    if (found.get("session"), found.get("seq")) != (session, seq):
-        return None
-    return str(found.get("outcome"))
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    """A reported object; an empty one for any other value."""
-    return value if isinstance(value, dict) else {}
+    found = state.reported.commands.get(name)
+    return found.outcome if found is not None and found[:2] == (session, seq) else None
 
 
 def _same(quoted: Any, value: Any) -> bool:
     # The robot cuts long values in its report.
     cut = isinstance(quoted, str) and quoted.endswith("...") and quoted != value
     return json.dumps(value).startswith(quoted[:-3]) if cut else bool(quoted == value)
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _check_clock(date: str | None, began_s: float, ended_s: float) -> None:

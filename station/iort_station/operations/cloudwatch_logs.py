@@ -15,9 +15,10 @@ from iort_contract.messages.page import Logs
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.operations.cloudwatch import body_of
+from iort_station.operations.log_records import readable
 
 # The most rows of a widget, and the most characters of a cell.
-MAX_ROWS, MAX_TEXT = 100, 2_000
+MAX_ROWS, MAX_TEXT = 100, 4_000
 # Logs Insights sends no event when a query ends.
 _POLL_S, _PATIENCE_S = 0.3, 60.0
 _UNDER_WAY = {"Scheduled", "Running", "Unknown"}
@@ -58,7 +59,7 @@ def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | N
     columns = list(dict.fromkeys(field for row in found for field in row))
     return {
         "columns": columns,
-        "rows": [[row.get(field, "")[:MAX_TEXT] for field in columns] for row in found[:MAX_ROWS]],
+        "rows": [[_cell(field, row.get(field, "")) for field in columns] for row in found[:MAX_ROWS]],
         "found": len(found),
         "from_s": to_s - minutes * 60,
         "to_s": to_s,
@@ -72,6 +73,10 @@ def parsed(query: str) -> tuple[list[str], str]:
         groups.append(source["group"])
         query = query[source.end() :]
     return groups, query.strip()
+
+
+def _cell(field: str, value: str) -> str:
+    return (readable(value) if field == "@message" else value)[:MAX_TEXT]
 
 
 def _awaited(client: Any, query_id: str) -> Mapping[str, Any]:

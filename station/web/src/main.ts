@@ -60,7 +60,7 @@ class Page {
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
-    this.carView = new CarView(this.fleet, table, this.tools);
+    this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
     this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
@@ -95,6 +95,8 @@ class Page {
     this.cloudWatchView.show(view === "cloudwatch");
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
+    if (this.route.view === "car") this.carView.open(this.route.robot, this.route.query);
+    else this.carView.open(undefined);
     this.arrange();
   }
 
@@ -106,7 +108,7 @@ class Page {
     if (this.route.view === "car" && robot) {
       this.carView.show(this.fleet.robots.get(robot));
       const link = (text: string, label: string, name: string): HTMLElement =>
-        el("a", { class: "tool", href: route({ view: "car", robot: name }), "aria-label": label }, text);
+        el("a", { class: "tool", href: route({ view: "car", robot: name, query: this.carView.query }), "aria-label": label }, text);
       const [before, after] = this.neighbours(robot);
       this.tools.replaceChildren(
         el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
@@ -137,7 +139,7 @@ class Page {
     if (this.route.view !== "car") return;
     const [before, after] = this.neighbours(this.route.robot);
     const to = { ArrowLeft: before, ArrowRight: after }[event.key];
-    if (to !== undefined) location.hash = route({ view: "car", robot: to });
+    if (to !== undefined) location.hash = route({ view: "car", robot: to, query: this.carView.query });
   }
 
   private readonly frame = (): void => {

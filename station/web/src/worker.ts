@@ -2,9 +2,9 @@
 // does not have to.
 
 import { now } from "./base/clock";
-import { PubNubLink } from "./live/pubnub_link";
-import { parseUpdate } from "./live/update";
-import type { Arrival, FromWorker, Listening, ToWorker } from "./live/worker_messages";
+import { PubNubLink } from "./link/pubnub_link";
+import { parseUpdate } from "./link/update";
+import type { Arrival, FromWorker, Listening, ToWorker } from "./link/worker_messages";
 
 // Messages of this time are handed over together, because each handover wakes the page.
 const TOGETHER_MS = 25;

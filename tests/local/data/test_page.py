@@ -68,7 +68,8 @@ def test_the_page_shows_the_cars_values_live_and_later(embedded, bundle, open_pa
         sample = page.evaluate(f"iort.robots['{car.robot}'].streams.{VESC_STREAM}.sample")
 
         # The terminal shows the same values.
-        line = next(line for line in map(json.loads, watched.stdout) if line["t"] == newest.t_us)
+        lines = (line for line in map(json.loads, watched.stdout) if line["stream"] == VESC_STREAM)
+        line = next(line for line in lines if line["t"] == newest.t_us)
         assert (line["robot"], line["sample"]) == (car.robot, sample)
         until(lambda: shown(page, "voltage_input") == f"{sample['voltage_input']:.2f}", "the voltage")
 

@@ -16,7 +16,7 @@ from unittest.mock import MagicMock, Mock, patch
 
 from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
-from ministack.services import iot, iot_data, sqs
+from ministack.services import cloudwatch_logs, iot, iot_data, lambda_svc, sqs
 
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",
@@ -231,3 +231,16 @@ def log_levels() -> bool:
             timeout=60,
         )
     return "[WARNING]" not in done.stderr
+
+
+def log_records() -> bool:
+    """Write the log of a function that failed, and count its events."""
+    written = []
+    with (
+        patch.object(cloudwatch_logs, "_append_log_events", lambda _stream, events: written.extend(events)),
+        request_scope("000000000000", "eu-west-1"),
+    ):
+        text = 'Traceback (most recent call last):\n  File "x.py", line 1\nValueError: text'
+        lambda_svc._emit_lambda_logs({"config": {}}, "id", text, True, 0)
+    # Beside the lines of Lambda itself: START, END and REPORT.
+    return len(written) != 4

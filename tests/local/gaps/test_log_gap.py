@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 from ministack.core import lambda_runtime
+from ministack.services import lambda_svc
 
 from local.gaps.functions import log_end
 
@@ -68,3 +69,10 @@ def test_output_after_the_end_belongs_to_the_next_invocation(installed):
     worker = SimpleNamespace(config={"Runtime": "python3.13"}, _stderr_queue=lines)
     log = lambda_runtime.Worker._drain_stderr_bounded
     assert [log(worker) for _ in range(3)] == ["one\ntwo", "three", ""]
+
+
+def test_a_traceback_is_one_event():
+    trace = 'Traceback (most recent call last):\n  File "x.py", line 1, in f\n    g()\nValueError: text'
+    failed = f"[ERROR]\t10:00Z\tit failed\n{trace}"
+    records = ["[INFO]\tbefore", trace, "  indented", failed, "after"]
+    assert lambda_svc._log_records("\n".join(records)) == records

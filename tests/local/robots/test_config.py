@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
+from tests.local.conftest import until
 from tests.local.robots.test_shadow import driving
 
 
@@ -22,35 +23,41 @@ def test_a_running_agent_applies_a_setting_and_answers(iort, bundle):
         assert changed.exit_code == 0, changed.output + str(changed.exception)
         assert settings(changed)["live.rate_hz"] == 2
         assert settings(changed)["fields.vesc"] == ["speed", "voltage_input"]
-        refused = iort("config", car.robot, "live.rate_hz=50", "ping.rate_hz=1", "--seconds", "120", "--json")
+        invalid = iort("config", car.robot, "live.rate_hz=50", "ping.rate_hz=1")
+        assert isinstance(invalid.exception, UsageError)
+        assert "must be a number from 0.01 to 10 (Hz), got 50; nothing is changed" in str(invalid.exception)
+        # Only the robot knows the fields of its streams.
+        refused = iort(
+            "config", car.robot, "fields.vesc=sped", "ping.rate_hz=1", "--seconds", "120", "--json"
+        )
         assert refused.exit_code == 1
         answer = json.loads(refused.output)
-        assert answer["answered"]
-        assert answer["refused"].keys() == {"live.rate_hz"}
-        assert answer["refused"]["live.rate_hz"]["value"] == 50
-        assert "from 0.01 to 10 (Hz)" in answer["refused"]["live.rate_hz"]["reason"]
+        assert answer["rejected"].keys() == {"fields.vesc"}
+        assert answer["rejected"]["fields.vesc"]["value"] == ["sped"]
+        assert "did you mean speed?" in answer["rejected"]["fields.vesc"]["reason"]
+        assert answer["settings"]["fields.vesc"] == ["speed", "voltage_input"]
         assert answer["settings"]["ping.rate_hz"] == 1
-        # A query without a change still shows the earlier rejection, but succeeds.
+        # The rejected change is withdrawn, and the last accepted one is desired again.
+        until(lambda: "rejected" not in iort("config", car.robot).output)
         shown = iort("config", car.robot)
-        assert shown.exit_code == 0
-        assert "ping.rate_hz=1" in shown.output
-        assert "live.rate_hz=10.0  (car.yaml's: the change is rejected)" in shown.output
-        assert f"`iort config {car.robot} --unset live.rate_hz` withdraws it" in shown.stderr
+        assert "fields.vesc=speed,voltage_input\n" in shown.output
         withdrawn = iort("config", car.robot, "--unset", "live.rate_hz", "--unset", "fields.vesc",
                          "--seconds", "120", "--json")  # fmt: skip
         assert withdrawn.exit_code == 0, withdrawn.output
         assert settings(withdrawn)["live.rate_hz"] == 10
+        assert "fields.vesc" not in settings(withdrawn)
         # The agent accepts only the commands in its car.yaml, and this file has none.
         unheard = iort("send", car.robot, "drive", "{}", "--seconds", "0")
         assert "downlink.cmd.drive" in str(unheard.exception)
 
 
-def test_a_change_for_an_offline_robot_stays_requested(iort, bundle):
+def test_a_change_for_an_offline_robot_is_pending(iort, bundle):
     car = bundle()
     asked = iort("config", car.robot, "live.rate_hz=3", "--seconds", "0.1")
-    assert isinstance(asked.exception, StationError)
-    assert "The change stays requested; --unset" in str(asked.exception)
-    assert "has reported no settings yet" in asked.output
+    assert asked.exit_code == 0
+    assert "live.rate_hz=?  (pending: 3)" in asked.stdout
+    assert f"pending: {car.robot} is offline, and applies it when it is back" in asked.stderr
+    assert json.loads(iort("config", car.robot, "--json").output)["pending"] == {"live.rate_hz": 3}
 
 
 @pytest.mark.parametrize(

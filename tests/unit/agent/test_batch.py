@@ -9,7 +9,7 @@ from operator import itemgetter
 from typing import Any, Mapping
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_agent.lanes.batch_encoder import MAX_VALUES, BatchEncoder, StreamCounts, _Open
@@ -18,6 +18,7 @@ from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
 from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of
 from iort_contract.ros1.message import RosMessage, RosType
 from tests.agent_fakes import ManualClock
+from tests.examples import examples
 from tests.unit.contract.ros1_messages import text
 
 T0 = 1_700_000_000_000_000
@@ -76,7 +77,7 @@ def drives(draw: Any) -> list[tuple[int, Mapping[str, Any], float]]:
     return out
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(drives(), st.sampled_from([0.0, 0.1, 0.5, 1.0]))
 def test_every_sample_comes_out_once_and_as_it_was(
     drive: list[tuple[int, dict[str, Any], float]], batch_s: float

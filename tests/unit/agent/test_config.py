@@ -9,7 +9,7 @@ import pytest
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.sim import SimConfig
+from iort_agent.sources.sim.source import SimConfig
 
 GOOD = """\
 robot: car1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_agent.lanes.record import RecordLane
@@ -13,6 +13,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.spool.memory import MemorySpool
 from tests.agent_fakes import Loopback, ManualClock
+from tests.examples import examples
 
 
 class Rig:
@@ -196,7 +197,7 @@ actions = st.lists(
 )
 
 
-@settings(max_examples=400)
+@examples(400)
 @given(actions, st.integers(1, 5))
 def test_whatever_happens_everything_arrives_and_first_arrivals_are_in_order_without_failures(
     script: list[str], window: int

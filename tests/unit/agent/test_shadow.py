@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.common.state import OverShare
 from iort_agent.control.runtime_settings import overlay
 from iort_agent.control.shadow import Shadow, _difference, _merged
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.commands import Command
+from iort_contract.messages.shadow import OverShare, Reported, decode_desired, encode_reported
 from tests.agent_fakes import Loopback, ManualClock, link_of
 
 BASE = RuntimeSettings(
     record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"
 )
 PREFIX = "$aws/things/car1/shadow/name/agent"
-DOCUMENT = BASE.as_document()
+DOCUMENT = encode_reported(Reported(BASE.by_name(), agent_version="1.2.3"))
 
 
 class Rig:
@@ -83,7 +83,7 @@ class Rig:
 def test_without_a_shadow_the_agent_creates_it() -> None:
     rig = Rig()
     said = {key: value for key, value in DOCUMENT.items() if value != {}}
-    assert rig.reported == {**said, "agent_version": "1.2.3"}
+    assert rig.reported == said
     assert rig.applied == []
 
 
@@ -135,6 +135,17 @@ def test_a_wrong_setting_is_rejected_with_a_reason_and_the_others_apply(
     assert f"shadow agent: {name}" in rig.reported["rejected"][key]["reason"]
     assert rig.applied[-1].ping_rate_hz == 5
     assert rig.reported["live"] == DOCUMENT["live"]
+
+
+def test_a_rejected_setting_leaves_the_last_accepted_value_in_force() -> None:
+    rig = Rig()
+    rig.desire(live={"rate_hz": 2}, fields={"vesc": ["speed"]})
+    rig.desire(live={"rate_hz": 50}, fields={"vesc": ["sped"]})
+    assert rig.reported["rejected"].keys() == {"live.rate_hz", "fields.vesc"}
+    assert rig.applied[-1].live_rate_hz == 2
+    assert rig.reported["fields"] == {"vesc": ["speed"]}
+    rig.desire(live=None, fields=None)
+    assert rig.applied[-1] == BASE
 
 
 def test_a_desired_value_that_is_in_force_ends_the_rejection() -> None:
@@ -255,7 +266,7 @@ def test_merging_the_difference_into_the_old_gives_the_new(old: dict[str, Any], 
 
 @given(OBJECT)
 def test_no_desired_value_raises(desired: dict[str, Any]) -> None:
-    settings, rejected = overlay(BASE, desired, {})
+    settings, rejected = overlay(BASE, BASE, decode_desired(desired).settings, {})
     assert 0.01 <= settings.live_rate_hz <= 10
     json.dumps(rejected)
 

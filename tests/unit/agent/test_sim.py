@@ -9,19 +9,22 @@ from typing import Any
 
 import pytest
 
-from iort_agent.sources.sim import SimConfig
-from iort_agent.sources.vehicle import VehicleConfig
-from iort_contract.catalog.vesc import VESC_FIELDS
+from iort_agent.sources.sim.circuit import HALL, Circuit, wrapped
+from iort_agent.sources.sim.source import PoseConfig, SimConfig
+from iort_agent.sources.sim.vehicle import VehicleConfig
+from iort_contract.catalog.streams import CATALOG, POSE_STREAM
+from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from tests.agent_fakes import ManualClock
 
+NO_POSE = PoseConfig(rate_hz=0)
 T0 = 1_700_000_000_000_000
 
 
-def drive(**settings: Any) -> list[tuple[str, int, Any]]:
+def drive(stream: str = VESC_STREAM, **settings: Any) -> list[tuple[str, int, Any]]:
     out: list[tuple[str, int, Any]] = []
     source = SimConfig(**settings).build(ManualClock(now_us=T0))
     source.run(lambda *sample: out.append(sample), threading.Event())
-    return out
+    return [sample for sample in out if sample[0] == stream]
 
 
 @pytest.mark.parametrize(("rate_hz", "duration_s", "count"), [(50, 60, 3000), (7, 3, 21), (1000, 2, 2000)])
@@ -39,7 +42,7 @@ def test_a_slow_reader_does_not_shift_later_samples() -> None:
         times.append(t_us - T0)
         clock.advance(0.2 if len(times) == 10 else 0.001)
 
-    SimConfig(duration_s=1).build(clock).run(emit, threading.Event())
+    SimConfig(duration_s=1, pose=NO_POSE).build(clock).run(emit, threading.Event())
     assert len(times) == 50
     assert abs(times[-1] - 980_000) < 1000
 
@@ -52,21 +55,49 @@ def test_stops_when_asked() -> None:
         if len(seen) == 7:
             stop.set()
 
-    SimConfig().build(ManualClock()).run(emit, stop)
+    SimConfig(pose=NO_POSE).build(ManualClock()).run(emit, stop)
     assert len(seen) == 7
 
 
 def test_the_fields_are_those_of_the_ros_1_driver() -> None:
     expected = [name for name, field in VESC_FIELDS.items() if 1 in field.ros]
-    for stream, _, values in drive(duration_s=1):
-        assert stream == "vesc"
+    for _, _, values in drive(duration_s=1):
         assert sorted(values) == sorted(expected)
         assert len(expected) == 13
 
 
 def test_the_same_seed_drives_the_same_lap() -> None:
-    assert drive(duration_s=20, seed=5) == drive(duration_s=20, seed=5)
-    assert drive(duration_s=20, seed=5) != drive(duration_s=20, seed=6)
+    for stream in (VESC_STREAM, POSE_STREAM):
+        assert drive(stream, duration_s=20, seed=5) == drive(stream, duration_s=20, seed=5)
+        assert drive(stream, duration_s=20, seed=5) != drive(stream, duration_s=20, seed=6)
+
+
+def test_poses_come_at_their_own_rate_with_the_times_of_samples() -> None:
+    times = {t_us for _, t_us, _ in drive(duration_s=60)}
+    poses = drive(POSE_STREAM, duration_s=60)
+    assert len(poses) == 60 * 20
+    assert {t_us for _, t_us, _ in poses} < times
+    assert {tuple(values) for _, _, values in poses} == {tuple(f.name for f in CATALOG[POSE_STREAM].fields)}
+    # The poses change nothing of the drive.
+    assert drive(duration_s=20) == drive(duration_s=20, pose=NO_POSE)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_car_keeps_to_its_track_as_fast_as_its_motor_says(seed: int) -> None:
+    circuit = Circuit(HALL)
+    poses = [
+        values for _, _, values in drive(POSE_STREAM, duration_s=120, seed=seed, pose=PoseConfig(rate_hz=50))
+    ]
+    place = 0
+    for pose in poses:
+        place = circuit.nearest(pose["x"], pose["y"], place)
+        off_m = math.hypot(pose["x"] - circuit.x_m[place], pose["y"] - circuit.y_m[place])
+        assert off_m < circuit.narrowest_m - 0.15, "half a car's width from the wall"
+        assert abs(wrapped(pose["heading"] - circuit.heading_rad[place])) < 0.6
+    driven_m = sum(math.hypot(b["x"] - a["x"], b["y"] - a["y"]) for a, b in zip(poses[::5], poses[5::5]))
+    counts = drive(duration_s=120, seed=seed)[-1][2]["distance_traveled"]
+    assert driven_m == pytest.approx(counts / 6 * 60 / VehicleConfig().speed_to_erpm_gain, rel=0.02)
+    assert driven_m > 8 * circuit.length_m
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -26,6 +26,7 @@ from iort_agent.spool.interface import FULL, PROCESS, REJECT_NEW, Entry
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool, make_spool
 from tests.agent_fakes import ManualClock
+from tests.examples import examples
 from tests.unit.agent.test_spool import BOOT, fill, following, kept
 
 ROOT = Path(__file__).parents[3]
@@ -383,7 +384,7 @@ class Life(RuleBasedStateMachine):
 
 
 TestLife = Life.TestCase
-TestLife.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestLife.settings = settings(examples(150), stateful_step_count=40)
 
 
 # --- kill -9 ------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from bench.ros import mixed_robot
 from bench.sections import (
     SECTIONS,
     abilities,
+    command,
     fairness,
     mixed,
     outage,
@@ -257,6 +258,18 @@ def test_the_target_of_summaries_beside_worst_case_batches_is_twice_the_delay_of
     values = [(ratio.value, ratio.reached) for ratio in section.ratios]
     assert values == [(1.5, True), (1.0, True), (2.5, False), (0.5, False)]
     assert section.tables[0].rows[2][:2] == [kinds[1], "20"]
+
+
+def test_a_command_is_compared_with_python_of_the_same_turn():
+    section = Section("command", "")
+    found = {
+        "python -c pass": [command.Times(0.04, 0.02), command.Times(0.08, 0.04)],
+        **{name: [command.Times(0.5, 0.2), command.Times(0.9, 0.4)] for name in command.TARGETS},
+    }
+    found["iort --help"] = [command.Times(0.5, 0.3), command.Times(0.9, 0.6)]
+    command.report(section, found)
+    assert [(ratio.value, ratio.reached) for ratio in section.ratios[:2]] == [(15.0, False), (10.0, True)]
+    assert section.tables[0].rows[1] == ["iort --help", "0.700 s", "0.450 s", "0.25 s"]
 
 
 def test_the_documentation_lists_every_section():

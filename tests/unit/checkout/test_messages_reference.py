@@ -11,7 +11,8 @@ import pytest
 from awsiot import iotidentity
 
 from functions.echo import pong
-from iort_agent.control.runtime_settings import FIELDS, RULES, RuntimeSettings, overlay
+from iort_agent.control.runtime_settings import RuntimeSettings, overlay
+from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
@@ -45,8 +46,9 @@ from iort_contract.messages.live import (
     live_update,
 )
 from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.messages.settings import CHANGEABLE
+from iort_contract.messages.shadow import decode_desired, decode_reported, encode_reported
 from iort_contract.tables import (
-    AGENT_VERSION,
     OVER_SHARE,
     PUT_OFF,
     PUT_OFF_LAST_MS,
@@ -54,7 +56,7 @@ from iort_contract.tables import (
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
 )
-from iort_contract.topics import ACCEPTED, COMMANDS, build_topic
+from iort_contract.topics import ACCEPTED, build_topic
 from iort_station.fleet.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -123,12 +125,13 @@ SAMPLES: dict[str, accounts.Account | MessageType] = {
         "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
     ),
 }
+STREAMS = (LOG_STREAM, POSE_STREAM)
 SHADOW = ("desired", "reported")
 PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
 
 
 def test_each_example_is_compared_with_the_code() -> None:
-    assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *SHADOW, *PROVISIONING, "update"}
+    assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *STREAMS, *SHADOW, *PROVISIONING, "update"}
     assert PAGE.count("```json\n") == len(EXAMPLES)
 
 
@@ -249,19 +252,25 @@ def test_the_samples_of_a_robots_own_streams_equal_the_pages_examples(
         assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
 
 
+@pytest.mark.parametrize("stream", STREAMS)
+def test_the_samples_of_a_stream_have_the_catalogues_fields(stream: str) -> None:
+    assert list(EXAMPLES[stream]) == [field.name for field in CATALOG[stream].fields]
+
+
 def test_the_agent_reads_and_writes_the_shadows_documents_of_the_page() -> None:
     base = RuntimeSettings(True, True, 10.0, 0, "info")
-    settings, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
+    wanted = decode_desired(EXAMPLES["desired"]["state"]["desired"])
+    settings, rejected = overlay(base, base, wanted.settings, {})
     assert rejected == {}
-    reported = EXAMPLES["reported"]["state"]["reported"]
-    assert {key: reported[key] for key in settings.as_document()} == settings.as_document()
-    assert reported.keys() == {*settings.as_document(), "rejected", COMMANDS, AGENT_VERSION}
-    state = State(1, {}, reported)
-    assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
-    assert [refusal.name for refusal in state.rejections()] == ["live.rate_hz"]
+    example = EXAMPLES["reported"]["state"]["reported"]
+    reported = decode_reported(example)
+    assert reported.settings == dict(sorted(settings.by_name().items()))
+    assert encode_reported(reported) == example
+    assert outcome(State(reported=reported), "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
+    assert list(reported.rejected) == ["live.rate_hz"]
     desired, reported_keys = section("## The shadow").split("<!-- example: reported -->")
-    assert {name for row in rows(desired) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
-    assert {name for row in rows(reported_keys) for name in named(row[0])} == reported.keys()
+    assert {name for row in rows(desired) for name in named(row[0])} == set(CHANGEABLE)
+    assert {name for row in rows(reported_keys) for name in named(row[0])} == example.keys()
 
 
 def test_the_messages_of_provisioning_equal_those_of_awss_client() -> None:

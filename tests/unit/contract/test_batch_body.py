@@ -10,13 +10,14 @@ import zlib
 from decimal import Decimal
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError
 from iort_contract.messages.batch import decode_batch, encode_batch
 from iort_contract.messages.live import decode_live, encode_live
+from tests.examples import examples
 from tests.unit.contract.contract_values import BOOT, DEEP, GOOD, GOOD_LIVE, decode_or_refuse, json_values
 
 
@@ -32,7 +33,7 @@ def test_any_body_is_decoded_or_refused(body):
     decode_or_refuse(decode_batch, enveloped(body))
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(st.data(), json_values)
 def test_body_with_one_part_replaced(data, value):
     body = {"dt": [0, 5], "fields": {"a": [1, 2.5], "b": ["x", None]}}

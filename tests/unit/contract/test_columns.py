@@ -11,7 +11,7 @@ import tracemalloc
 import zlib
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iort_contract.catalog.streams import AGENT_FIELDS, RTT_FIELDS
@@ -20,6 +20,7 @@ from iort_contract.checks import wire_column
 from iort_contract.codec.columns import DICTIONARY, PLAIN_CODEC, packed, unpacked
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from tests.examples import examples
 
 BOOT = "0123abcd"
 EDGE = 2**53
@@ -48,7 +49,7 @@ def bits(values):
     return [(type(v), struct.pack("<d", v) if type(v) is float else v) for v in values]
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(columns())
 @example([0.1, 0.2, 0.30000000000000004])
 @example([1e300, 1, -1e300])
@@ -64,7 +65,7 @@ def test_a_column_is_restored_bit_for_bit(column):
     assert bits(unpacked("a", [None, *values], len(values))) == bits(values)
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(columns(), st.integers(0, 2**40))
 def test_both_codecs_decode_to_the_same_batch(column, seq):
     n = len(column)

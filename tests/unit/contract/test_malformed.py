@@ -8,12 +8,13 @@ import math
 from decimal import Decimal
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import decode_batch, encode_batch
 from iort_contract.messages.live import decode_live, decode_pong, encode_live
+from tests.examples import examples
 from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
 
 DECODERS = [decode_batch, decode_live, decode_pong]
@@ -75,7 +76,7 @@ def test_any_table_item_is_decoded_or_refused(decoder, item):
     decode_or_refuse(decoder, item)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(st.data(), python_values | awkward)
 def test_a_message_with_one_key_replaced_is_decoded_or_refused(data, value):
     envelope = data.draw(envelopes())
@@ -84,7 +85,7 @@ def test_a_message_with_one_key_replaced_is_decoded_or_refused(data, value):
         decode_or_refuse(decoder, envelope)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.data(), json_values)
 def test_a_text_with_one_key_replaced_is_decoded_or_refused(data, value):
     envelope = data.draw(envelopes())
@@ -103,7 +104,7 @@ def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
             decoder(json.dumps(envelope))
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(batches(), st.data())
 def test_a_damaged_message_is_decoded_or_refused(batch, data):
     message = bytearray(encode_batch(batch))
@@ -113,7 +114,7 @@ def test_a_damaged_message_is_decoded_or_refused(batch, data):
     decode_or_refuse(decode_batch, bytes(message[:at]))
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.data())
 def test_damaged_compressed_samples_are_decoded_or_refused(data):
     envelope = json.loads(encode_batch(GOOD))

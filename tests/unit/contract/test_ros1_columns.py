@@ -11,7 +11,7 @@ import zlib
 from typing import Any, Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
@@ -30,6 +30,7 @@ from iort_contract.ros1.decode import HEADER as HEAD
 from iort_contract.ros1.definition import layout, parse
 from iort_contract.ros1.message import MAX_LAYOUT, Messages, RosMessage, RosType, cut, filled, type_id
 from iort_contract.ros1.serialized import pack, unpack
+from tests.examples import examples
 from tests.unit.contract.contract_values import BOOT, json_values
 from tests.unit.contract.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
 
@@ -124,7 +125,7 @@ def test_messages_that_a_column_would_change_are_kept_as_bytes(odd: bytes) -> No
     assert decoded.columns["n"][::2] == [3, 4]
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.lists(st.binary(min_size=23, max_size=23), min_size=1, max_size=8))
 def test_any_bytes_of_a_numeric_type_are_restored(raws: list[bytes]) -> None:
     batch = batch_of(FLAT, raws)
@@ -404,7 +405,7 @@ def test_messages_too_large_for_a_batch_are_split_into_readable_halves() -> None
     assert again(alone, {}) == [b"x" * MAX_COLUMNS_BYTES]
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=6), st.text(max_size=9), st.text(max_size=9))
 def test_any_messages_are_unpacked_as_they_were_packed(raws: list[bytes], type_id: str, about: str) -> None:
     found = unpack(pack(Messages(type_id, about, raws)), len(raws))
@@ -465,7 +466,7 @@ def test_the_part_after_the_columns_must_be_text() -> None:
                 decode_batch(envelope)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.sampled_from([FLAT, STAMPED_FLAT, NAMES]), st.data())
 def test_a_damaged_batch_of_messages_is_read_or_refused(kind: RosType, data: Any) -> None:
     raws = {FLAT: [flat()] * 2, STAMPED_FLAT: [stamped(0), stamped(1)], NAMES: [u32(0, 0)] * 2}[kind]

@@ -6,11 +6,12 @@ from collections import defaultdict
 from itertools import cycle, groupby, islice, pairwise
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.messages.batch import split_batch
 from iort_contract.statistics import missing_before
+from tests.examples import examples
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,
@@ -48,7 +49,7 @@ def drives(draw):
     return batches
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@examples(150)
 @given(drives(), st.randoms(use_true_random=False), st.data())
 def test_the_summary_does_not_depend_on_order_grouping_or_repetition_of_records(drive, rng, data):
     expected = Stream()
@@ -128,7 +129,7 @@ def assert_summary(summary, drive):
                 assert f"{name}_last" not in item
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(drives())
 def test_a_batch_sent_in_two_halves_gives_the_same_samples(drive):
     whole, halved = Stream(), Stream()

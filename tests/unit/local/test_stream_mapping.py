@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.shared import tables as tables_module
@@ -17,6 +17,7 @@ from functions.shared.summary.processing import process
 from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
 from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard
+from tests.examples import examples
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 
 S = 1_000_000
@@ -267,7 +268,7 @@ def histories(draw):
     return kinds, faults, jams
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@examples(150)
 @given(
     histories(),
     st.integers(1, 6),

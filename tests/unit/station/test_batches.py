@@ -9,7 +9,7 @@ import struct
 import zlib
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.message_sizes import stored_bytes
@@ -21,6 +21,7 @@ from iort_contract.ros1.message import Messages, RosType
 from iort_station.data.batches import RefusedItems, blocks, decode_each, decode_together, stored
 from iort_station.data.blocks import join
 from iort_station.data.selection import Selection
+from tests.examples import examples
 from tests.fakes import item_of_message
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import text, u32
@@ -139,7 +140,6 @@ def test_messages_are_read_as_samples_or_skipped():
     assert refused.count == 0
 
 
-@settings(max_examples=100)
 @given(st.lists(columns(), min_size=1, max_size=4), st.data())
 def test_the_station_and_the_contract_read_the_same_batches(parts, data):
     """A page of valid and invalid batches in both codecs, with columns that change their type."""
@@ -186,7 +186,7 @@ def columns_of(n):
     return st.lists(st.none() | number, min_size=n, max_size=n) | st.lists(number, min_size=n, max_size=n)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(st.data())
 def test_the_numpy_back_end_and_the_list_back_end_agree(data):
     """Both refuse a run of batches, or both decode it to the same values."""

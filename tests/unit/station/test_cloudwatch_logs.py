@@ -9,6 +9,7 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.operations import cloudwatch_logs
+from iort_station.operations.log_records import readable
 
 NOW_S = 1_700_000_000
 NAME = "iort-platform"
@@ -59,6 +60,45 @@ def test_the_widgets_own_query_is_sent_for_its_log_groups() -> None:
     assert told["columns"] == ["@timestamp", "@message", "@log"]
     assert told["rows"] == [["t1", "one", ""], ["", "x" * cloudwatch_logs.MAX_TEXT, "1:a"]]
     assert (told["found"], told["from_s"], told["to_s"]) == (2, NOW_S - 900, NOW_S)
+
+
+TRACE = 'Traceback (most recent call last):\n  File "live.py", line 61, in handler\n    publish(event)'
+
+
+@pytest.mark.parametrize(
+    ("message", "head"),
+    [
+        # The embedded cloud's, Lambda's in text with its own spaces, a logged one, and one after another.
+        (f"{TRACE}\nValueError: no gain", "ValueError: no gain"),
+        (
+            f"[ERROR] ValueError: no gain\n{TRACE}".replace("  ", "\u00a0\u00a0"),
+            "[ERROR] ValueError: no gain",
+        ),
+        (
+            f"[ERROR]\t10:00Z\tnot sent\n{TRACE}\nKeyError: 'gain'",
+            "[ERROR] 10:00Z not sent: KeyError: 'gain'",
+        ),
+        (f"{TRACE}\nKeyError: 1\n\nDuring handling ...\n\n{TRACE}\nOSError: two", "OSError: two"),
+        ("[WARNING]\tno traceback", "[WARNING]\tno traceback"),
+        ("{no JSON", "{no JSON"),
+    ],
+)
+def test_the_first_line_of_a_text_record_is_what_happened(message: str, head: str) -> None:
+    first, _, details = readable(message).partition("\n")
+    assert first == head
+    assert details in ("", message.strip())
+    assert ("Traceback" in details) == ("Traceback" in message)
+
+
+def test_the_first_line_of_a_json_record_is_what_happened() -> None:
+    frames = ['  File "live.py", line 61, in handler\n    publish(event)\n']
+    failed = {"errorType": "ValueError", "errorMessage": "no gain", "stackTrace": frames, "requestId": "r"}
+    uncaught = readable(json.dumps({"timestamp": "t", "log_level": "ERROR", **failed}))
+    assert uncaught == f"[ERROR] ValueError: no gain\n{frames[0].rstrip()}\nrequestId: r"
+    logged = readable(json.dumps({"level": "ERROR", "message": "not sent", **failed}))
+    assert logged.startswith("[ERROR] not sent: ValueError: no gain\n")
+    assert readable('{"level": "WARN", "message": "late"}') == "[WARN] late"
+    assert readable('{"_aws": {}, "Lost": 1}') == '{"_aws": {}, "Lost": 1}'
 
 
 def test_rows_over_the_limit_are_counted_and_left_out() -> None:

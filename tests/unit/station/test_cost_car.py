@@ -9,7 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_agent.config import Config, load_config
+from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
+from iort_agent.sources.sim.source import SimConfig
 from iort_station.cli.main import app
 from iort_station.cost.car import _OWN_RATE_HZ, as_configured
 from iort_station.cost.usage import Usage
@@ -25,9 +27,10 @@ ROS = (
 # Every key that the command reads, with and without its default.
 FILES = (
     SIM,
+    "sources: [{type: sim, rate_hz: 10, pose: {rate_hz: 0}}]\n",
     RECORDING,
     ROS,
-    "sources: [{type: vesc, port: /dev/vesc}, {type: bag, path: drive.bag, stream: log}]\n",
+    "sources: [{type: vesc, port: /dev/vesc}, {type: bag, path: drive.bag, stream: tool}]\n",
     f"{SIM}live: {{rate_hz: 2}}\nrecord: {{batch_s: 0.5}}\nping: {{rate_hz: 1}}\nmetrics: {{every_s: 60}}\n",
     f"{ROS}live: {{enabled: false}}\nmetrics: {{enabled: false}}\n",
 )
@@ -47,12 +50,17 @@ def car(tmp_path):
     return write
 
 
+def rates_of(source: SourceConfig) -> list[float | None]:
+    if isinstance(source, SimConfig):
+        return [source.rate_hz, min(source.rate_hz, source.pose.rate_hz)][: len(source.streams())]
+    return [getattr(source, "rate_hz", None) for _ in set(source.streams())]
+
+
 def in_the_agent(config: Config) -> dict[str, object]:
-    streams = [source for source in config.sources for _ in set(source.streams())]
-    known = [getattr(source, "rate_hz", None) for source in streams]
+    known = [rate for source in config.sources for rate in rates_of(source)]
     return {
-        "streams": len(streams),
-        "rate_hz": sum(rate or Usage().rate_hz for rate in known) / len(streams),
+        "streams": len(known),
+        "rate_hz": sum(rate or Usage().rate_hz for rate in known) / len(known),
         "live_hz": sum(min(config.live.rate_hz, rate or 1e9) for rate in known) * config.live.enabled,
         "batch_s": config.record.batch_s,
         "ping_hz": config.ping.rate_hz,
@@ -89,9 +97,9 @@ def test_the_command_reads_a_file_without_the_robots_certificate(tmp_path):
     done = CliRunner().invoke(app, given, env={"XDG_CACHE_HOME": str(tmp_path)})
     assert done.exit_code == 0, done.output
     usage = json.loads(done.output)["usage"]
-    assert usage["live_hz"] == 2 + 2 * 4
-    # One sample each half second, and two topics of unknown rate.
-    assert (usage["streams"], usage["rate_hz"]) == (3, (2 + 50 + 50) / 3)
+    assert usage["live_hz"] == 2 + 2 + 2 * 4
+    # One sample and one pose each half second, and two topics of unknown rate.
+    assert (usage["streams"], usage["rate_hz"]) == (4, (2 + 2 + 50 + 50) / 4)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from iort_contract.messages.shadow import OverShare, Reported, decode_desired, decode_reported
 from iort_station.errors import StationError
-from iort_station.fleet.shadow import OverShare, State, _check_clock, answered, outcome, over_share
+from iort_station.fleet.shadow import State, _check_clock, answered, outcome, over_share
 
 REPORTED = {
     "live": {"enabled": True, "rate_hz": 10},
@@ -18,18 +19,21 @@ REPORTED = {
     "rejected": {"ping.rate_hz": {"value": 99, "reason": "ping.rate_hz: found 99"}},
     "commands": {"drive": {"session": "feedbeef", "seq": 3, "outcome": "accepted"}},
 }
-STATE = State(5, {}, REPORTED)
+STATE = State(reported=decode_reported(REPORTED))
 
 
 def test_settings_and_rejections_are_read_from_the_report():
-    assert STATE.settings() == {
+    assert STATE.reported.settings == {
         "fields.vesc": ["speed"], "live.enabled": True, "live.rate_hz": 10, "log_level": "info",
     }  # fmt: skip
-    assert STATE.rejections() == [("ping.rate_hz", 99, "ping.rate_hz: found 99")]
-    assert State(0, {}, {}).settings() == {}
-    assert State(1, {"live": {"rate_hz": 5}, "log_level": "debug"}, {}).desired_settings() == {
-        "live.rate_hz": 5, "log_level": "debug",
-    }  # fmt: skip
+    assert STATE.reported.rejected == {"ping.rate_hz": (99, "ping.rate_hz: found 99")}
+
+
+def test_a_desired_setting_is_pending_until_the_robot_applies_or_rejects_it():
+    desired = {"live": {"rate_hz": 5, "enabled": True}, "ping": {"rate_hz": 99}, "fields": {"imu": []}}
+    state = State(decode_desired(desired), STATE.reported)
+    assert state.pending() == {"live.rate_hz": 5}
+    assert State(decode_desired(desired)).pending().keys() == {"live.rate_hz", "live.enabled", "ping.rate_hz"}
 
 
 class ShadowMissingError(Exception):
@@ -57,9 +61,7 @@ class Data:
 
 def test_the_clouds_notice_of_a_share_is_no_desired_setting():
     said = {"since_ms": 1, "last_ms": 2, "batches": 3}
-    assert State(1, {"over_share": said, "log_level": "debug"}, {}).desired_settings() == {
-        "log_level": "debug"
-    }
+    assert decode_desired({"over_share": said, "log_level": "debug"}).settings == {"log_level": "debug"}
     assert over_share(Data({"over_share": said}), "car") == OverShare(batches=3, since_ms=1, last_ms=2)
     assert over_share(Data(None), "car") is None
     # The robot can also write here.
@@ -90,15 +92,16 @@ def test_an_answer_is_recognised_for_each_desired_setting(desired, said):
 def test_a_long_rejected_value_is_recognised_by_its_beginning():
     long = ["x" * 300]
     rejected = {"fields.vesc": {"value": ('["' + "x" * 300)[:200] + "...", "reason": "no"}}
-    assert answered({"fields.vesc": long}, State(1, {}, {"rejected": rejected}))
-    assert answered({"fields.vesc": ["y" * 300]}, State(1, {}, {"rejected": rejected})) is None
+    state = State(reported=decode_reported({"rejected": rejected}))
+    assert answered({"fields.vesc": long}, state)
+    assert answered({"fields.vesc": ["y" * 300]}, state) is None
 
 
 def test_the_outcome_of_a_command_is_read_by_run_and_number():
     assert outcome(STATE, "drive", "feedbeef", 3) == "accepted"
     assert outcome(STATE, "drive", "feedbeef", 4) is None
     assert outcome(STATE, "drive", "0badcafe", 3) is None
-    assert outcome(State(0, {}, {}), "drive", "feedbeef", 3) is None
+    assert outcome(State(), "drive", "feedbeef", 3) is None
 
 
 def test_a_wrong_clock_is_refused():
@@ -113,6 +116,4 @@ def test_a_wrong_clock_is_refused():
 
 @pytest.mark.parametrize("said", ["x", 7, [1], {"drive": "x"}])
 def test_an_invalid_report_is_read_as_empty(said):
-    state = State(1, {}, {"commands": said, "rejected": said})
-    assert outcome(state, "drive", "feedbeef", 3) is None
-    assert state.rejections() == []
+    assert decode_reported({"commands": said, "rejected": said}) == Reported()

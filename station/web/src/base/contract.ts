@@ -9,6 +9,8 @@ export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TACHOMETER_COUNTS = 6;
+export const POSE_STREAM = "pose";
+export const LOG_STREAM = "log";
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
 export const CAR_ALARMS = {
@@ -207,6 +209,40 @@ export const FIELD_TABLE: FieldTable = {
       "label": "Battery power"
     }
   },
+  "streams": {
+    "pose": {
+      "x": {
+        "unit": "m",
+        "meaning": "position of the rear axle's middle"
+      },
+      "y": {
+        "unit": "m",
+        "meaning": "position of the rear axle's middle"
+      },
+      "heading": {
+        "unit": "rad",
+        "meaning": "direction of travel: 0 along x, pi/2 along y, -pi to pi"
+      }
+    },
+    "log": {
+      "level": {
+        "unit": "",
+        "meaning": "`warning`, `error` or `critical`"
+      },
+      "logger": {
+        "unit": "",
+        "meaning": "the part of the agent, such as `iort_agent.mqtt.aws`"
+      },
+      "text": {
+        "unit": "",
+        "meaning": "the line, with the exception's if it has one; at most 1,000 characters"
+      },
+      "left_out": {
+        "unit": "lines",
+        "meaning": "lines that were too many to send, since the line before"
+      }
+    }
+  },
   "ros_units": {
     "linear_acceleration": "m/s^2",
     "angular_velocity": "rad/s",
@@ -267,6 +303,8 @@ export interface FieldTable {
   /** The stream with the VESC's fields. */
   readonly stream: string;
   readonly fields: Readonly<Record<string, FieldEntry>>;
+  /** Stream -> its fields, whose names mean something else elsewhere. */
+  readonly streams: Readonly<Record<string, Readonly<Record<string, FieldEntry>>>>;
   /** Field -> unit of the fields x, y and z within it. */
   readonly ros_units: Readonly<Record<string, string>>;
   readonly faults: Readonly<Record<string, string>>;
@@ -449,7 +487,7 @@ export interface Dashboard {
   readonly widgets: readonly Widget[];
 }
 
-/** Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. */
+/** Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. The first line of a cell says what happened. */
 export interface Logs {
   readonly columns: readonly string[];
   readonly rows: readonly (readonly string[])[];

@@ -24,14 +24,15 @@ export interface Spec extends Linear {
 export const NOTHING = "–";
 
 const DIGITS: Readonly<Record<string, number>> = {
-  V: 2, A: 2, degC: 1, erpm: 0, deg: 1, counts: 0, Ah: 4, Wh: 3, id: 0, "m/s": 2, W: 1, ms: 0, "%": 1, "m/s^2": 2, "rad/s": 2, m: 2, MB: 1, batches: 0, bytes: 0,
+  V: 2, A: 2, degC: 1, erpm: 0, deg: 1, counts: 0, Ah: 4, Wh: 3, id: 0, "m/s": 2, W: 1, ms: 0, "%": 1, "m/s^2": 2, "rad/s": 2, m: 2, rad: 3, MB: 1, batches: 0, bytes: 0,
 };
 const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "", "m/s^2": "m/s²" };
 const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
 
-/** The format of a field; `ros2` selects the ROS 2 driver's units. */
-export function spec(field: string, table: FieldTable, ros2 = false): Spec {
-  const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
+/** The format of a field of a stream; `ros2` selects the ROS 2 driver's units. */
+export function spec(field: string, table: FieldTable, ros2 = false, stream = ""): Spec {
+  const fields = (Object.hasOwn(table.streams, stream) ? table.streams[stream] : undefined) ?? table.fields;
+  const known = Object.hasOwn(fields, field) ? fields[field] : undefined;
   const label = known?.label ?? humanise(field);
   if (!known) {
     const plain = rosUnit(field, table);

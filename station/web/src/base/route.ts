@@ -7,7 +7,7 @@ import { readRange, writeTime, type Range } from "./range";
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
   fleet: ["find", "sort", "group"],
-  car: [],
+  car: ["window", "charts"],
   history: ["stream", "from", "to", "fields", "at"],
   compare: ["runs", "stream", "fields", "x", "zoom"],
   cloudwatch: [],

@@ -29,7 +29,7 @@ export function startTheme(button: HTMLElement): void {
   apply();
 }
 
-/** Call the listener with every change, until the returned function is called. */
+/** Call the listener after every change; returns what ends that. */
 export function onTheme(listener: () => void): () => void {
   listeners.add(listener);
   return () => listeners.delete(listener);

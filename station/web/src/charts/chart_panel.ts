@@ -19,8 +19,6 @@ export interface ChartPanelOptions {
   readonly title: string;
   readonly readings: readonly Reading[];
   readonly chart: LiveChartOptions;
-  /** Called when the viewer closes the panel; without it, the panel cannot be closed. */
-  readonly onClose?: () => void;
 }
 
 export class ChartPanel {
@@ -33,18 +31,15 @@ export class ChartPanel {
   private as: Linear = AS_SENT;
 
   constructor(
-    host: HTMLElement,
     private readonly options: ChartPanelOptions,
   ) {
-    const { title, readings, chart, onClose } = options;
+    const { title, readings, chart } = options;
     this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
     this.units = readings.map(({ unit }) => {
       const text = new Text("unit");
       text.set(unit);
       return text;
     });
-    const close = onClose && el("button", { type: "button", class: "close", "aria-label": `Close ${title}` }, "×");
-    close?.addEventListener("click", onClose!);
     const heading = el(
       "header",
       {},
@@ -60,11 +55,9 @@ export class ChartPanel {
           this.units[i]!.node,
         ),
       ),
-      ...(close ? [close] : []),
     );
     const plot = el("div", { class: "plot", "aria-hidden": "true" });
     this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
-    host.append(this.node);
     this.chart = new LiveChart(plot, {
       ...chart,
       onPoint: (point) => {
@@ -90,6 +83,14 @@ export class ChartPanel {
     this.read(values.map((value) => linear(value, this.as)));
     this.note.set("");
     this.chart.wake();
+  }
+
+  span(window_s: number): void {
+    this.chart.span(window_s);
+  }
+
+  destroy(): void {
+    this.chart.destroy();
   }
 
   due(now: number): boolean {

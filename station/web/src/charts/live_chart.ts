@@ -1,7 +1,7 @@
-// A scrolling chart of the last 30 seconds by uPlot, drawn only when it would change.
+// A scrolling chart of the last seconds or minutes by uPlot, drawn only when it would change.
 
 import uPlot from "uplot";
-import { WINDOW_S } from "../live/bounds";
+import { markLabels, marks, WINDOWS } from "./windows";
 import { AS_SENT, linear, type Linear } from "../base/format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import type { Ring } from "../live/ring";
@@ -36,13 +36,18 @@ const HOLE_S = 1;
 // A chart is not drawn for a smaller step, nor more than 25 times a second.
 const STEP_PX = 0.75;
 const FRAME_S = 0.04;
+// Longer windows are drawn too seldom to ease their axis.
+const EASED_S = 60;
 
 const shared = uPlot.sync("charts");
 
 export class LiveChart {
   private readonly plot: uPlot;
+  private readonly offTheme: () => void;
   private shown: Shown | undefined;
   private as: Linear = AS_SENT;
+  private filled: number | undefined;
+  private window_s: number = WINDOWS[0];
   private dirty = true;
   private drawnAt = -Infinity;
   private drawnEmpty = false;
@@ -75,8 +80,8 @@ export class LiveChart {
         scales: { x: { time: false, auto: false }, y: { auto: true, range: (_, low, high) => this.range(low, high) } },
         axes: [
           axis(colours, 1.5, 0.3, {
-            splits: (_, __, low) => [0, 10, 20, 30].map((step) => low + step),
-            values: () => ["\u221230 s", "\u221220", "\u221210", "now"],
+            splits: (_, __, low) => marks(this.window_s).map((mark) => low + mark),
+            values: () => markLabels(this.window_s),
           }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
         ],
@@ -104,7 +109,7 @@ export class LiveChart {
       this.visible = visible;
       this.dirty = true;
     });
-    onTheme(() => {
+    this.offTheme = onTheme(() => {
       this.readColours();
       this.dirty = true;
     });
@@ -112,30 +117,41 @@ export class LiveChart {
 
   /** Set the data, undefined for none, and its scale. */
   show(shown: Shown | undefined, as: Linear): void {
-    const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns);
+    const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns) && this.filled === shown?.history.inserted;
     if (same && this.as.scale === as.scale && this.as.shift === as.shift) return;
-    [this.shown, this.as] = [shown, as];
+    [this.shown, this.as, this.filled] = [shown, as, shown?.history.inserted];
     this.dirty = true;
     this.drawnEmpty = false;
     this.low = this.high = NaN;
+  }
+
+  /** Show the last `window_s` seconds. */
+  span(window_s: number): void {
+    if (window_s === this.window_s) return;
+    [this.window_s, this.dirty, this.drawnEmpty] = [window_s, true, false];
+  }
+
+  destroy(): void {
+    this.offTheme();
+    this.plot.destroy();
   }
 
   /** Whether the chart must be drawn: it would visibly change, or its data or size has changed. */
   due(now: number): boolean {
     if (!this.visible || now - this.drawnAt < FRAME_S) return false;
     if (this.dirty) return true;
-    return !this.drawnEmpty && ((edge(now) - this.right) / WINDOW_S) * this.plot.bbox.width >= STEP_PX;
+    return !this.drawnEmpty && ((edge(now) - this.right) / this.window_s) * this.plot.bbox.width >= STEP_PX;
   }
 
   draw(now: number): void {
     if (!this.visible) return;
     const right = edge(now);
-    const data = this.data(right - WINDOW_S);
+    const data = this.data(right - this.window_s);
     [this.right, this.drawnAt, this.dirty] = [right, now, false];
-    this.drawnEmpty = this.shown === undefined || !(this.shown.history.last(0) > right - WINDOW_S);
+    this.drawnEmpty = this.shown === undefined || !(this.shown.history.last(0) > right - this.window_s);
     this.plot.batch(() => {
       this.plot.setData(data, false);
-      this.plot.setScale("x", { min: right - WINDOW_S, max: right });
+      this.plot.setScale("x", { min: right - this.window_s, max: right });
     });
   }
 
@@ -161,7 +177,7 @@ export class LiveChart {
     const [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
     const [toLow, toHigh] = roundRange(least, most, this.options.span, this.options.zero ?? false);
     const ease = (from: number, to: number): number =>
-      calm.matches || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.3;
+      calm.matches || this.window_s > EASED_S || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.3;
     this.low = ease(this.low, toLow);
     this.high = ease(this.high, toHigh);
     return [this.low, this.high];
@@ -171,7 +187,7 @@ export class LiveChart {
   private drawHeads(plot: uPlot): void {
     const times = plot.data[0];
     const at = times[times.length - 1];
-    if (at === undefined || at < this.right - WINDOW_S) return;
+    if (at === undefined || at < this.right - this.window_s) return;
     const { ctx } = plot;
     const radius = 2.6 * uPlot.pxRatio;
     plot.series.slice(1).forEach((_, i) => {

@@ -27,6 +27,7 @@ const SHADES = 12;
 
 export class XYChart {
   private readonly plot: uPlot;
+  private readonly offTheme: () => void;
   private track: Track = { x: [], y: [] };
   private visible = true;
   private drawnAt = -Infinity;
@@ -72,14 +73,23 @@ export class XYChart {
       this.visible = visible;
       this.drawnAt = -Infinity;
     });
-    onTheme(() => {
+    this.offTheme = onTheme(() => {
       [this.ink, this.paint] = [colour("--accent"), paint()];
       this.drawnAt = -Infinity;
     });
   }
 
+  destroy(): void {
+    this.offTheme();
+    this.plot.destroy();
+  }
+
+  due(now: number): boolean {
+    return this.visible && now - this.drawnAt >= FRAME_S;
+  }
+
   draw(now: number, track: () => Track): void {
-    if (!this.visible || now - this.drawnAt < FRAME_S) return;
+    if (!this.due(now)) return;
     this.drawnAt = now;
     this.track = track();
     this.setBounds();

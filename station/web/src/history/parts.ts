@@ -44,14 +44,14 @@ export class Parts {
     const step = (range[1] - range[0]) / ROWS;
     const grid = Array.from({ length: ROWS + 1 }, (_, i) => range[0] + i * step);
     const samples = wholes.reduce((sum, { drive }) => sum + drive.samples, 0);
-    return { samples, extent, compared: { grid, unit: UNITS[axis], fields: this.fields(shown, grid, axis) } };
+    return { samples, extent, compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) } };
   }
 
   /** The format of a field: the speed of the cars, if it is known of all of them. */
-  spec(field: string, parts: readonly Part[], ros2 = false): Spec {
+  spec(field: string, stream: string, parts: readonly Part[]): Spec {
     const speeds = parts.map(({ robot }) => this.fleet.speed(robot));
     const all = speeds.every((speed) => speed !== undefined);
-    return asSpeed(field, spec(field, this.table, ros2), all ? speeds[0] : undefined);
+    return asSpeed(field, spec(field, this.table, false, stream), all ? speeds[0] : undefined);
   }
 
   private read(part: Part, stream: string): Promise<HistoryAnswer> {
@@ -87,15 +87,15 @@ export class Parts {
     return { ...there, x: there.x.map((at) => at + offset) };
   }
 
-  private fields(shown: readonly Loaded[], grid: readonly number[], axis: Axis): Compared["fields"] {
+  private fields(shown: readonly Loaded[], stream: string, grid: readonly number[], axis: Axis): Compared["fields"] {
     const parts = shown.map(({ part }) => part);
     const numeric = ({ drive }: Loaded): string[] => Object.keys(drive.fields).filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
     const names = new Set(shown.flatMap(numeric));
     // The speed of the cars is shown as the field speed.
-    if (names.has("speed") && this.spec("speed", parts).unit === "m/s") names.delete("speed_mps");
-    const all = this.spec("speed", parts).unit === "m/s";
+    const all = this.spec("speed", stream, parts).unit === "m/s";
+    if (names.has("speed") && all) names.delete("speed_mps");
     const column = (field: string, { part, drive, x }: Loaded): (number | null)[] => {
-      const as = asSpeed(field, spec(field, this.table, drive.ros2), all ? this.fleet.speed(part.robot) : undefined);
+      const as = asSpeed(field, spec(field, this.table, drive.ros2, stream), all ? this.fleet.speed(part.robot) : undefined);
       const y = drive.fields[field]?.mean.map((value) => (typeof value === "number" ? linear(value, as) : null)) ?? [];
       return y.length === 0 ? grid.map(() => null) : onGrid({ x, y }, grid, axis === "time" ? Math.max(LEAST_HOLE_S, drive.row_s * HOLES) : Infinity);
     };

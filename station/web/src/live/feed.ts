@@ -4,7 +4,7 @@ import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
 import { keep, kept } from "../base/kept";
 import type { Fleet } from "./fleet";
-import type { FromWorker, LinkState, ToWorker } from "./worker_messages";
+import type { FromWorker, LinkState, ToWorker } from "../link/worker_messages";
 
 export class Feed {
   state: LinkState = { kind: "connecting" };

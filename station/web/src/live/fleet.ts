@@ -6,7 +6,7 @@ import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
 import { BOUNDS } from "./bounds";
 import { Robot } from "./robot";
 import { Stream, type Used } from "./stream";
-import type { Arrival } from "./worker_messages";
+import type { Arrival } from "../link/worker_messages";
 
 export class Fleet {
   readonly robots = new Map<string, Robot>();

@@ -8,6 +8,8 @@ const FIRST_ROWS = 32;
  */
 export class Ring {
   private columns: Float64Array[];
+  /** Grows with every insertion into the past. */
+  inserted = 0;
   private size = FIRST_ROWS;
   private first = 0;
   private end = 0;
@@ -63,6 +65,7 @@ export class Ring {
     const [mine, known] = [this.column(0).slice(), new Set(this.column(0))];
     const fresh = [...times.keys()].filter((row) => !known.has(times[row]!));
     if (fresh.length === 0) return;
+    this.inserted += 1;
     const old = this.columns.map((column) => column.slice(this.first, this.end));
     const length = mine.length + fresh.length;
     this.size = length * 2;

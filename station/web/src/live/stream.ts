@@ -4,7 +4,7 @@ import type { FieldTable, Value } from "../base/contract";
 import { claim, claimed, type Claim } from "./attachments";
 import { BOUNDS, DEEP_S, deepRows, WINDOW_S } from "./bounds";
 import { Ring } from "./ring";
-import type { Hops, Update } from "./update";
+import type { Hops, Update } from "../link/update";
 
 /** The field that the fleet's cards draw; it is kept when the columns of all cars are used up. */
 export const CARD_FIELD = "speed";

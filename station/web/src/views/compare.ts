@@ -45,7 +45,7 @@ export class CompareView {
     this.add = new AddPart(fleet, (part) => this.choose([...this.parts, part].slice(-MOST_PARTS)));
     const hands = { zoom: (to: Range) => this.go(to), move: (to: Range, upright: boolean) => this.move(to, upright), back: () => this.back(), pick: () => undefined };
     this.charts = new CompareCharts(
-      (field) => this.loader.spec(field, this.parts),
+      (field) => this.loader.spec(field, this.stream.value, this.parts),
       hands,
       (index) => index !== null && this.read(index),
       () => {

@@ -305,7 +305,7 @@ export class HistoryView {
   }
 
   private spec(field: string): Spec {
-    return asSpeed(field, spec(field, this.table, this.drive?.ros2), this.fleet.speed(this.robot));
+    return asSpeed(field, spec(field, this.table, this.drive?.ros2, this.form.stream), this.fleet.speed(this.robot));
   }
 
   /** Scrub to a row: in every chart, in the table and on the slider. */

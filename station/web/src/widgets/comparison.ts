@@ -20,7 +20,7 @@ export class Comparison {
   private live: Stream | undefined;
 
   constructor() {
-    const head = el("tr", {}, ...["Field", "Then", "Now", "Change", ""].map((name) => el("th", { scope: "col" }, name)));
+    const head = el("tr", {}, ...["Field", "Then", "Now", "Change", "Unit"].map((name) => el("th", { scope: "col" }, name)));
     this.node = el("section", { class: "panel compare", "aria-label": "Then and now" }, el("table", {}, el("thead", {}, head), this.body));
   }
 

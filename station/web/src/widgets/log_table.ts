@@ -11,7 +11,7 @@ const AGAIN_S = 60;
 export class LogTable {
   readonly node: HTMLElement;
   private readonly note = new Text("note", "p", { role: "status" });
-  private readonly host = el("div", { class: "log", role: "region", tabindex: "0" });
+  private readonly host = el("div", { class: "log", role: "group", tabindex: "0" });
   private askedAt = -Infinity;
   // A query may take longer than the dashboard's refresh period.
   private asking: AbortController | undefined;
@@ -72,5 +72,7 @@ function cell(column: string, value: string): HTMLElement {
   }
   // "123456789012:/aws/lambda/name": the account is the viewer's own.
   if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));
-  return el("td", { class: "words" }, value);
+  const [head = "", ...details] = value.split("\n");
+  if (details.length === 0) return el("td", { class: "words" }, head);
+  return el("td", { class: "words" }, el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n"))));
 }

@@ -6,7 +6,7 @@ import type { Alarms } from "../live/alarms";
 import type { Fleet } from "../live/fleet";
 import { age, number } from "../base/format";
 import { now } from "../base/clock";
-import type { LinkState } from "../live/worker_messages";
+import type { LinkState } from "../link/worker_messages";
 
 const ANNOUNCE_S = 8;
 const WORDS = { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" } as const;

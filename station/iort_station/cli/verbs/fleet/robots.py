@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
@@ -125,7 +126,7 @@ def show(
         described = [
             {**one._asdict(), "created": _time(one.created), "expires": _time(one.expires)} for one in held
         ]
-        said = {OVER_SHARE: over and over._asdict(), "certificates": described}
+        said = {OVER_SHARE: over and asdict(over), "certificates": described}
         print_json({**row, **said}, default=float)
         return
     table = Table(show_header=False, box=None, pad_edge=False)

@@ -3,9 +3,9 @@
 import { power_w } from "../base/contract";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
 import { hottest, type Robot } from "../live/robot";
-import type { ChartPanelOptions } from "./chart_panel";
-import type { GaugeOptions } from "./gauge";
-import type { XYChartOptions } from "./xy_chart";
+import type { ChartPanelOptions } from "../charts/chart_panel";
+import type { GaugeOptions } from "../charts/gauge";
+import type { XYChartOptions } from "../charts/xy_chart";
 
 /** A number with a bar. */
 export interface GaugeSpec extends GaugeOptions {
@@ -21,9 +21,11 @@ export interface GaugeSpec extends GaugeOptions {
   ) => { readonly value: number; readonly as?: Linear; readonly unit?: string; readonly digits?: number };
 }
 
-/** Lines over the last 30 s. */
+/** Lines over time. */
 export interface LineSpec extends ChartPanelOptions {
   readonly kind: "line";
+  /** Its name in addresses. */
+  readonly key: string;
   /** A field for each line. */
   readonly fields: readonly string[];
   /** The scale, and the unit if it depends on the car. */
@@ -33,12 +35,20 @@ export interface LineSpec extends ChartPanelOptions {
 /** One field over another. */
 export interface XYChartSpec extends Omit<XYChartOptions, "x"> {
   readonly kind: "xy";
+  /** Its name in addresses. */
+  readonly key: string;
   readonly x: string;
   readonly title: string;
   /** The x axis is the motor's speed, shown as the car's speed if the car's parameters are known. */
   readonly speed?: boolean;
   /** The two fields to draw; undefined for a stream without them. */
   readonly axes: (fields: ReadonlyMap<string, number>) => readonly [string, string] | undefined;
+}
+
+/** The delay of every message. */
+export interface DelaySpec extends ChartPanelOptions {
+  readonly kind: "delay";
+  readonly key: string;
 }
 
 const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | "show"> => ({
@@ -81,6 +91,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "line",
+    key: "speed",
     title: "Speed",
     fields: ["speed"],
     readings: [{ name: "speed", unit: "m/s", digits: 2, from: first }],
@@ -89,6 +100,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "line",
+    key: "battery",
     title: "Battery voltage",
     fields: ["voltage_input"],
     readings: [{ name: "voltage_input", unit: "V", digits: 2, from: first }],
@@ -97,6 +109,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "line",
+    key: "currents",
     title: "Current",
     fields: ["current_motor", "current_input"],
     readings: [
@@ -108,6 +121,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "line",
+    key: "duty",
     title: "Duty cycle",
     fields: ["duty_cycle"],
     readings: [{ name: "duty_cycle", unit: "%", digits: 1, from: first }],
@@ -116,6 +130,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "xy",
+    key: "speed-current",
     title: "Speed and motor current",
     x: "speed",
     y: "motor current, A",
@@ -126,6 +141,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "xy",
+    key: "g-g",
     title: "Accelerations, G-G",
     x: "lateral, m/s²",
     y: "longitudinal, m/s²",
@@ -138,6 +154,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   {
     kind: "xy",
+    key: "trajectory",
     title: "Trajectory",
     x: "x, m",
     y: "y, m",
@@ -150,13 +167,17 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
 ];
 
-export const GAUGES = CHARTS.filter((chart) => chart.kind === "gauge");
-export const LINE_CHARTS = CHARTS.filter((chart) => chart.kind === "line");
-export const XY_CHARTS = CHARTS.filter((chart) => chart.kind === "xy");
-
-/** Beside the delay by hop. */
-export const DELAY_CHART: ChartPanelOptions = {
+/** The delay by message, beside its hops. */
+const DELAY: DelaySpec = {
+  kind: "delay",
+  key: "delay",
   title: "Delay",
   readings: [{ name: "delay", unit: "ms", digits: 0, from: first }],
   chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
 };
+
+export const GAUGES = CHARTS.filter((chart) => chart.kind === "gauge");
+/** The charts that are shown unless the viewer chooses, by their keys and in their order. */
+export const BOARD: ReadonlyMap<string, LineSpec | XYChartSpec | DelaySpec> = new Map(
+  [...CHARTS.filter((chart) => chart.kind !== "gauge"), DELAY].map((chart) => [chart.key, chart]),
+);

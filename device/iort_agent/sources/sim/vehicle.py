@@ -1,7 +1,8 @@
-"""The physics of a small electric car, such as F1TENTH's: motor, mass, battery, heat and a driver.
+"""The physics of a small electric car, such as F1TENTH's: motor, mass, battery, heat, steering and tyres.
 
 The model is plausible, not exact. Speed, duty cycle, currents, voltage sag, counters and temperature depend
-on each other as on a real VESC, so that a chart looks real.
+on each other as on a real VESC, so that a chart looks real. The car moves as a bicycle that slides where its
+tyres have no more grip.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import random
 from dataclasses import dataclass
 
 from iort_agent.common.schema import number, setting
+from iort_agent.sources.sim.circuit import HALL, Circuit, Grip, wrapped
+from iort_agent.sources.sim.driver import Driver, Pose, Wish
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.vesc import TACHOMETER_COUNTS
 from iort_contract.limits import Value
@@ -21,6 +24,10 @@ _AMBIENT_DEGC = 24.0
 _IDLE_W = 1.5
 # The board's heat capacity, and its cooling while the car stands.
 _BOARD_J_PER_K, _BOARD_W_PER_K = 60.0, 0.25
+# A servo turns the wheels this fast.
+_STEERING_RAD_PER_S = 3.2
+# The noise of a position from a laser scanner on a map.
+_NOISE_M, _NOISE_RAD = 0.01, 0.005
 
 
 @dataclass(frozen=True)
@@ -38,50 +45,30 @@ class VehicleConfig:
     max_current_a: float = setting(number(0.1, 1000, unit="A"), 40.0)
     max_brake_current_a: float = setting(number(0, 1000, unit="A"), 20.0)
     max_speed_mps: float = setting(number(0.1, 100, unit="m/s"), 6.5)
+    wheelbase_m: float = setting(number(0.01, 20, unit="m"), 0.33)
+    max_steering_rad: float = setting(number(0.01, 1.4, unit="rad"), 0.42)
+    friction: float = setting(number(0.01, 5), 0.7)
     cells: int = setting(number(1, 100, whole=True), 3)
     capacity_ah: float = setting(number(0.01, 1000, unit="Ah"), 5.0)
     battery_resistance_ohm: float = setting(number(0, 10, unit="ohm"), 0.03)
 
 
-class Driver:
-    """Drives laps: fast on straights, slower in corners, and a little different each time."""
-
-    # Length in metres, and speed as a share of the highest; the last corner is a hairpin.
-    _LAP: tuple[tuple[float, float], ...] = ((14, 1.0), (5, 0.5), (6, 0.75), (4, 0.42), (11, 0.92), (5, 0.3))
-    _LOOKAHEAD_S = 0.6
-
-    def __init__(self, config: VehicleConfig, chance: random.Random) -> None:
-        self._chance = chance
-        self._top_mps = config.max_speed_mps
-        self._section = 0
-        self._left_m = self._LAP[0][0]
-        self._mood = 1.0
-
-    def target_mps(self, speed_mps: float, dt: float) -> float:
-        """The target speed; the driver brakes before the corner, not in it."""
-        self._left_m -= speed_mps * dt
-        if self._left_m <= 0:
-            self._section = (self._section + 1) % len(self._LAP)
-            self._left_m += self._LAP[self._section][0]
-            self._mood = self._chance.uniform(0.93, 1.0)
-        here = self._LAP[self._section][1]
-        ahead = self._LAP[(self._section + 1) % len(self._LAP)][1]
-        share = min(here, ahead) if self._left_m < speed_mps * self._LOOKAHEAD_S else here
-        return share * self._mood * self._top_mps
-
-
 class Vehicle:
-    """A car's state: `step` advances it, and `sample` is the report of its VESC."""
+    """A car's state: `step` advances it, `sample` is the report of its VESC, and `pose` where it is."""
 
-    def __init__(self, config: VehicleConfig, seed: int) -> None:
+    def __init__(self, config: VehicleConfig, seed: int, circuit: Circuit | None = None) -> None:
         self._config = config
-        self._chance = random.Random(seed)  # noqa: S311 - noise, not secrets
-        self._driver = Driver(config, self._chance)
+        # Apart, so that the drive does not depend on how often it is measured.
+        driving, self._chance, self._pose_chance = (random.Random(seed + i) for i in range(3))  # noqa: S311 - noise, not secrets
         # The motor's speed constant ties volts, newtons and m/s.
         self._volts_per_mps = config.speed_to_erpm_gain / config.pole_pairs / config.motor_kv
         rad_s_per_mps = config.speed_to_erpm_gain / config.pole_pairs * 2 * math.pi / 60
         self._newtons_per_amp = 60 / (2 * math.pi * config.motor_kv) * rad_s_per_mps
+        self._lateral_mps2 = config.friction * _G
+        driver = Driver(circuit or Circuit(HALL), self._grip(), config.wheelbase_m, driving)
+        self._driver, self.pose = driver, driver.start()
         self._speed_mps = 0.0
+        self._steering_rad = 0.0
         self._current_a = 0.0
         self._battery_a = 0.0
         self._charge_left = 0.97
@@ -91,21 +78,30 @@ class Vehicle:
         self._counts = self._counts_abs = 0.0
         self._drawn_ah = self._regen_ah = self._drawn_wh = self._regen_wh = 0.0
 
-    def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds; steps of at most 20 ms keep the driver steady."""
+    def step(self, dt: float, wish: Wish | None = None) -> None:
+        """Advance by ``dt`` seconds as wished, or as the driver does; at most 20 ms keep it steady."""
         c = self._config
-        self._steer(dt)
-        force = self._current_a * self._newtons_per_amp
-        # The losses of the gears always work against the motion.
-        force *= c.drivetrain_efficiency if self._current_a > 0 else 1 / c.drivetrain_efficiency
-        drag = 0.5 * 1.2 * c.drag_area_m2 * self._speed_mps**2
-        rolling = c.rolling_resistance * c.mass_kg * _G if self._speed_mps > 0 else 0.0
-        speed = max(0.0, self._speed_mps + (force - drag - rolling) / c.mass_kg * dt)
-        mean_mps, self._speed_mps = (self._speed_mps + speed) / 2, speed
+        if wish is None:
+            wish = self._driver.wish(self.pose, self._speed_mps, dt)
+        else:
+            self._driver.leave()
+        self._throttle(max(-c.max_speed_mps, min(c.max_speed_mps, wish.speed_mps)), dt)
+        mean_mps = self._accelerate(dt)
+        self._move(mean_mps, wish.steering_rad, dt)
         self._electrics(dt)
         counts = mean_mps * c.speed_to_erpm_gain / 60 * TACHOMETER_COUNTS * dt
         self._counts += counts
-        self._counts_abs += counts
+        self._counts_abs += abs(counts)
+
+    def measured_pose(self) -> dict[str, Value]:
+        """The pose as a localisation on a map gives it: with noise, to the millimetre."""
+        x_m, y_m, heading_rad = self.pose
+        noise = self._pose_chance.gauss
+        return {
+            "x": round(x_m + noise(0, _NOISE_M), 3),
+            "y": round(y_m + noise(0, _NOISE_M), 3),
+            "heading": round(wrapped(heading_rad + noise(0, _NOISE_RAD)), 3),
+        }
 
     def sample(self) -> dict[str, Value]:
         """The 13 fields of the ROS 1 driver's VescState, in its units and resolution."""
@@ -127,16 +123,64 @@ class Vehicle:
             "fault_code": 0,
         }
 
-    def _steer(self, dt: float) -> None:
+    def _grip(self) -> Grip:
+        """The accelerations that motor and brakes reach at low speed, and the tyres in a corner."""
+        c = self._config
+        drive_n = c.max_current_a * self._newtons_per_amp * c.drivetrain_efficiency
+        brake_n = c.max_brake_current_a * self._newtons_per_amp / c.drivetrain_efficiency
+        rolling_n = c.rolling_resistance * c.mass_kg * _G
+        return Grip(
+            c.max_speed_mps,
+            self._lateral_mps2,
+            max(0.01, min(self._lateral_mps2, (drive_n - rolling_n) / c.mass_kg)),
+            max(0.01, min(self._lateral_mps2, (brake_n + rolling_n) / c.mass_kg)),
+        )
+
+    def _throttle(self, target_mps: float, dt: float) -> None:
         """Set the motor current in proportion to the missing speed, within the limits."""
         c = self._config
-        error = self._driver.target_mps(self._speed_mps, dt) - self._speed_mps
-        wanted = error * c.mass_kg * 4 / self._newtons_per_amp
-        wanted = max(-c.max_brake_current_a, min(c.max_current_a, wanted))
+        wanted = (target_mps - self._speed_mps) * c.mass_kg * 4 / self._newtons_per_amp
+        # Against the motion it brakes, as far as the car moves.
+        forwards = c.max_current_a if self._speed_mps >= 0 else c.max_brake_current_a
+        backwards = c.max_current_a if self._speed_mps <= 0 else c.max_brake_current_a
+        wanted = max(-backwards, min(forwards, wanted))
         # The driver's foot needs a tenth of a second, and no current brakes a standing car.
         self._current_a += (wanted - self._current_a) * min(1.0, dt / 0.1)
-        if self._speed_mps == 0:
-            self._current_a = max(0.0, self._current_a)
+        if self._speed_mps == 0 and self._current_a * target_mps <= 0:
+            self._current_a = 0.0
+
+    def _accelerate(self, dt: float) -> float:
+        """Change the speed; returns the mean of before and after."""
+        c, before = self._config, self._speed_mps
+        force = self._current_a * self._newtons_per_amp
+        # The losses of the gears always work against the motion.
+        force *= c.drivetrain_efficiency if force * before >= 0 else 1 / c.drivetrain_efficiency
+        way = math.copysign(1.0, before or force)
+        drag = way * 0.5 * 1.2 * c.drag_area_m2 * before**2
+        rolling = way * c.rolling_resistance * c.mass_kg * _G
+        if before == 0 and abs(force) <= abs(rolling):
+            return 0.0
+        after = before + (force - drag - rolling) / c.mass_kg * dt
+        # A car that brakes to a stand stands.
+        self._speed_mps = after if before * after >= 0 else 0.0
+        return (before + self._speed_mps) / 2
+
+    def _move(self, speed_mps: float, steering_rad: float, dt: float) -> None:
+        """Turn the wheels, and move along the arc of a bicycle, or of what the tyres hold."""
+        c = self._config
+        wanted = max(-c.max_steering_rad, min(c.max_steering_rad, steering_rad))
+        most = _STEERING_RAD_PER_S * dt
+        self._steering_rad += max(-most, min(most, wanted - self._steering_rad))
+        curvature = math.tan(self._steering_rad) / c.wheelbase_m
+        held = self._lateral_mps2 / max(speed_mps**2, 1e-9)
+        turned = max(-held, min(held, curvature)) * speed_mps * dt
+        x_m, y_m, heading = self.pose
+        middle = heading + turned / 2
+        self.pose = Pose(
+            x_m + speed_mps * math.cos(middle) * dt,
+            y_m + speed_mps * math.sin(middle) * dt,
+            wrapped(heading + turned),
+        )
 
     def _electrics(self, dt: float) -> None:
         c = self._config
@@ -158,7 +202,7 @@ class Vehicle:
         self._charge_left = max(0.0, self._charge_left - amp_hours / c.capacity_ah)
         # The MOSFETs' resistance, a third of the motor's, heats the board.
         heat_w = self._current_a**2 * c.motor_resistance_ohm / 3 + _IDLE_W
-        cooling_w = (self._board_degc - _AMBIENT_DEGC) * _BOARD_W_PER_K * (1 + self._speed_mps / 5)
+        cooling_w = (self._board_degc - _AMBIENT_DEGC) * _BOARD_W_PER_K * (1 + abs(self._speed_mps) / 5)
         self._board_degc += (heat_w - cooling_w) / _BOARD_J_PER_K * dt
 
     def _open_voltage(self) -> float:

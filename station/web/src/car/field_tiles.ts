@@ -6,11 +6,9 @@ import { el, setAttribute, Text } from "../base/dom";
 import { STALE_S, type FieldTable } from "../base/contract";
 import { numeric, type Stream } from "../live/stream";
 import { age, spec, write, type Spec } from "../base/format";
-import { Thumbnail } from "./thumbnail";
+import { Thumbnail } from "../widgets/thumbnail";
+import { fieldKey } from "./board_panels";
 import { Sparkline } from "../charts/sparkline";
-
-/** A field's key: two streams may have fields of the same name. */
-export const fieldKey = (stream: string, field: string): string => `${stream}/${field}`;
 
 class Tile {
   readonly node: HTMLElement;
@@ -72,7 +70,7 @@ export class StreamSection {
     private readonly table: FieldTable,
     /** Fields that are shown as gauges. */
     private readonly except: ReadonlySet<string>,
-    private readonly choose: (field: string) => void,
+    private readonly choose: (key: string) => void,
   ) {
     this.node = el(
       "section",
@@ -89,7 +87,7 @@ export class StreamSection {
     this.drawn = stream.version;
     if (stream.ros2 !== this.ros2) {
       this.ros2 = stream.ros2;
-      for (const [field, tile] of this.tiles) tile.write(spec(field, this.table, this.ros2));
+      for (const [field, tile] of this.tiles) tile.write(spec(field, this.table, this.ros2, stream.name));
     }
     this.arrange();
     for (const [field, tile] of this.tiles) tile.set(stream.sample.get(field));
@@ -124,7 +122,7 @@ export class StreamSection {
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));
-      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2), charts ? () => this.choose(field) : undefined));
+      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2, this.stream.name), charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined));
     }
     const known = Object.keys(this.table.fields);
     const place = (field: string): number => (known.includes(field) ? known.indexOf(field) : known.length);

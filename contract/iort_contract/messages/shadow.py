@@ -1,0 +1,127 @@
+"""The named shadow of a robot: the settings that the operator desires, and what the agent reports.
+
+The operator, the cloud and the robot write it, so a reader ignores what has another form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Iterator, Mapping, NamedTuple
+
+from iort_contract.messages.settings import FIELDS, SETTINGS
+from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
+from iort_contract.topics import COMMANDS
+
+REJECTED = "rejected"
+# Larger than any count, and than any time of a calendar.
+_MOST = 10**15
+_SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
+
+
+@dataclass(frozen=True)
+class OverShare:
+    """The batches over a robot's share of the cloud, and the cloud's time of the first and the last one."""
+
+    since_ms: int
+    last_ms: int
+    batches: int
+
+
+class Rejection(NamedTuple):
+    """A desired value that the agent rejects, and the reason for a human."""
+
+    value: Any
+    reason: str
+
+
+class Outcome(NamedTuple):
+    """What became of a command: accepted, or the reason of its rejection."""
+
+    session: str
+    seq: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Desired:
+    """The desired settings by name, and the cloud's notice. The settings are not checked."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    over_share: OverShare | None = None
+
+
+@dataclass(frozen=True)
+class Reported:
+    """The settings in force and the rejected ones, by name; the newest outcome of each command."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    rejected: Mapping[str, Rejection] = field(default_factory=dict)
+    commands: Mapping[str, Outcome] = field(default_factory=dict)
+    agent_version: str = ""
+
+
+def decode_desired(document: Any) -> Desired:
+    """The desired part of a shadow."""
+    found = dict(_mapping(document))
+    notice = _mapping(found.pop(OVER_SHARE, None))
+    counts = [notice.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
+    valid = [count for count in counts if type(count) is int and 0 <= count < _MOST]
+    return Desired(dict(_flat(found)), OverShare(*valid) if len(valid) == len(counts) else None)
+
+
+def decode_reported(document: Any) -> Reported:
+    """The reported part of a shadow."""
+    found = dict(_mapping(document))
+    rejected = _mapping(found.pop(REJECTED, None))
+    commands = _mapping(found.pop(COMMANDS, None))
+    version = found.pop(AGENT_VERSION, "")
+    return Reported(
+        dict(sorted(_flat(found))),
+        {
+            name: Rejection(one.get("value"), str(one.get("reason", "")))
+            for name, one in sorted(rejected.items())
+            if isinstance(one, dict)
+        },
+        {
+            name: Outcome(one["session"], one["seq"], str(one.get("outcome")))
+            for name, one in commands.items()
+            if isinstance(one, dict) and isinstance(one.get("session"), str) and type(one.get("seq")) is int
+        },
+        version if isinstance(version, str) else "",
+    )
+
+
+def encode_reported(reported: Reported) -> dict[str, Any]:
+    """The reported part as an object for JSON."""
+    return {
+        **{section: {} for section in _SECTIONS},
+        **nested(reported.settings),
+        REJECTED: {name: one._asdict() for name, one in reported.rejected.items()},
+        COMMANDS: {name: one._asdict() for name, one in reported.commands.items()},
+        AGENT_VERSION: reported.agent_version,
+    }
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name as the sections of a document."""
+    document: dict[str, Any] = {}
+    for name, value in settings.items():
+        section, _, rest = name.partition(".")
+        if rest:
+            document.setdefault(section, {})[rest] = value
+        else:
+            document[section] = value
+    return document
+
+
+def _flat(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in document.items():
+        if isinstance(value, dict):
+            for inner, item in value.items():
+                yield f"{name}.{inner}", item
+        else:
+            yield name, value
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}

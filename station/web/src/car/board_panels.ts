@@ -1,0 +1,167 @@
+// What a car's board is made of: each panel finds its values in the car, and is hidden while the car has none.
+
+import type { FieldTable } from "../base/contract";
+import { el } from "../base/dom";
+import { AS_SENT, linear, spec, type Linear } from "../base/format";
+import type { Robot } from "../live/robot";
+import { numeric, type Stream } from "../live/stream";
+import { BOARD, type DelaySpec, type LineSpec, type XYChartSpec } from "./car_charts";
+import { ChartPanel } from "../charts/chart_panel";
+import { windowLabel, WINDOWS } from "../charts/windows";
+import { XYChart, type Track } from "../charts/xy_chart";
+
+export interface BoardPanel {
+  readonly title: string;
+  readonly node: HTMLElement;
+  /** Take the newest values; whether the car has any. */
+  values(robot: Robot, speed: Linear | undefined): boolean;
+  due(now: number): boolean;
+  draw(now: number): void;
+  /** Show the last `window_s` seconds. */
+  span(window_s: number): void;
+  destroy(): void;
+}
+
+/** A field's key: two streams may have fields of the same name. */
+export const fieldKey = (stream: string, field: string): string => `${stream}/${field}`;
+
+/** The panel of a chart's or a field's key; undefined for a text that is neither. */
+export function panelOf(key: string, table: FieldTable): BoardPanel | undefined {
+  const known = BOARD.get(key);
+  if (known?.kind === "line") return new LinePanel(known, table);
+  if (known?.kind === "delay") return new DelayPanel(known);
+  if (known) return new XYPanel(known);
+  const [stream, field, ...rest] = key.split("/");
+  return stream && field && rest.length === 0 ? new FieldPanel(stream, field, table) : undefined;
+}
+
+abstract class TimePanel implements BoardPanel {
+  readonly title: string;
+  readonly node: HTMLElement;
+
+  constructor(protected readonly panel: ChartPanel, title: string) {
+    this.title = title;
+    this.node = panel.node;
+  }
+
+  abstract values(robot: Robot, speed: Linear | undefined): boolean;
+
+  due(now: number): boolean {
+    return this.panel.due(now);
+  }
+
+  draw(now: number): void {
+    this.panel.draw(now);
+  }
+
+  span(window_s: number): void {
+    this.panel.span(window_s);
+  }
+
+  destroy(): void {
+    this.panel.destroy();
+  }
+}
+
+class LinePanel extends TimePanel {
+  constructor(
+    private readonly spec: LineSpec,
+    private readonly table: FieldTable,
+  ) {
+    super(new ChartPanel(spec), spec.title);
+  }
+
+  values(robot: Robot, speed: Linear | undefined): boolean {
+    const { fields, as } = this.spec;
+    const vesc = robot.vesc(this.table);
+    this.panel.show(vesc && { history: vesc.history, columns: fields.map((field) => vesc.columns.get(field)) }, ...as(speed));
+    this.panel.update(fields.map((field) => numeric(vesc?.sample.get(field))));
+    return vesc !== undefined;
+  }
+}
+
+class DelayPanel extends TimePanel {
+  constructor(spec: DelaySpec) {
+    super(new ChartPanel(spec), spec.title);
+  }
+
+  values(robot: Robot): boolean {
+    this.panel.show({ history: robot.delays, columns: [1] }, AS_SENT);
+    this.panel.update([robot.newestDelay()?.total ?? NaN]);
+    return true;
+  }
+}
+
+class FieldPanel extends TimePanel {
+  constructor(
+    private readonly stream: string,
+    private readonly field: string,
+    private readonly table: FieldTable,
+  ) {
+    const { label, unit, digits } = spec(field, table, false, stream);
+    const reading = { name: fieldKey(stream, field), unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
+    super(new ChartPanel({ title: label, readings: [reading], chart: { lines: [{ colour: "--accent" }], span: 1e-3 } }), label);
+  }
+
+  values(robot: Robot): boolean {
+    const stream = robot.streams.get(this.stream);
+    const as = spec(this.field, this.table, stream?.ros2, this.stream);
+    this.panel.show(stream && { history: stream.history, columns: [stream.columns.get(this.field)] }, as, as.unit);
+    this.panel.update([numeric(stream?.sample.get(this.field))]);
+    return stream?.columns.has(this.field) ?? false;
+  }
+}
+
+class XYPanel implements BoardPanel {
+  readonly title: string;
+  readonly node: HTMLElement;
+  private readonly chart: XYChart;
+  private readonly note = el("p", { class: "note" });
+  private source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
+  private unit = "";
+  private window_s = 0;
+
+  constructor(private readonly spec: XYChartSpec) {
+    const host = el("div", { class: "plot", "aria-hidden": "true" });
+    this.title = spec.title;
+    this.node = el("section", { class: "panel xy", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), this.note), host);
+    this.chart = new XYChart(host, { ...spec, x: () => spec.x + this.unit });
+    this.span(WINDOWS[0]);
+  }
+
+  values(robot: Robot, speed: Linear | undefined): boolean {
+    this.source = undefined;
+    if (this.spec.speed) this.unit = speed ? ", m/s" : ", erpm";
+    for (const stream of robot.streams.values()) {
+      const axes = this.spec.axes(stream.columns);
+      if (!axes) continue;
+      this.source = { stream, x: axes[0], y: axes[1], as: (this.spec.speed && speed) || AS_SENT };
+      return true;
+    }
+    return false;
+  }
+
+  due(now: number): boolean {
+    return this.source !== undefined && this.chart.due(now);
+  }
+
+  draw(now: number): void {
+    const { source } = this;
+    if (source) this.chart.draw(now, () => track(source, now - this.window_s));
+  }
+
+  span(window_s: number): void {
+    this.window_s = window_s;
+    this.note.textContent = `last ${windowLabel(window_s)}`;
+  }
+
+  destroy(): void {
+    this.chart.destroy();
+  }
+}
+
+function track({ stream, x, y, as }: NonNullable<XYPanel["source"]>, from: number): Track {
+  const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field)!, from);
+  const across = column(x);
+  return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };
+}

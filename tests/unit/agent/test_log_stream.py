@@ -1,0 +1,139 @@
+"""The agent's own warnings and errors as a stream: which ones, how many, and without secrets."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from iort_agent.agent import Agent
+from iort_agent.common.logs import Troubles
+from iort_agent.config import Config
+from iort_agent.errors import SourceError
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.runtime import Runtime
+from iort_agent.sources import Emit
+from iort_agent.spool.config import REJECT_NEW
+from iort_agent.spool.memory import MemorySpool
+from iort_contract.catalog.streams import CATALOG, LOG_STREAM
+from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.live import decode_live
+from tests.agent_fakes import Loopback, ManualClock
+
+T0_S = 1_700_000_000.0
+
+
+def said(
+    troubles: Troubles, *lines: str, level: int = logging.WARNING, at_s: float = T0_S, **more: Any
+) -> None:
+    for line in lines:
+        record = logging.LogRecord("iort_agent.mqtt.aws", level, __file__, 1, line, None, None)
+        record.created = at_s
+        for name, value in more.items():
+            setattr(record, name, value)
+        troubles.handle(record)
+
+
+def test_a_line_is_a_sample_of_the_catalogue() -> None:
+    troubles = Troubles()
+    said(troubles, "connection lost")
+    ((t_us, line),) = troubles.lines.take()
+    assert (t_us, line) == (
+        round(T0_S * 1e6),
+        {"level": "warning", "logger": "iort_agent.mqtt.aws", "text": "connection lost", "left_out": 0},
+    )
+    assert list(line) == [field.name for field in CATALOG[LOG_STREAM].fields]
+    assert troubles.lines.take() == []
+
+
+def test_a_flood_is_counted_and_does_not_displace_an_error() -> None:
+    troubles = Troubles()
+    said(troubles, *(f"warning {i}" for i in range(1000)))
+    said(troubles, "the one that matters", level=logging.ERROR)
+    lines = [line for _, line in troubles.lines.take()]
+    assert [line["text"] for line in lines] == [*(f"warning {i}" for i in range(20)), "the one that matters"]
+    assert lines[-1]["left_out"] == 980
+    said(troubles, *("again",) * 1000, at_s=T0_S + 60)
+    assert len(troubles.lines.take()) == 20
+    # The wall clock was set back.
+    said(troubles, "before", at_s=0.0)
+    assert troubles.lines.take() == []
+
+
+@pytest.mark.parametrize(
+    ("text", "sent"),
+    [
+        ("ws://lab:hunter2@10.0.0.1:9090: closed", "ws://...@10.0.0.1:9090: closed"),
+        ("https://b.s3.aws.com/a.txt?X-Amz-Signature=0f&b=1 failed", "https://b.s3.aws.com/a.txt?... failed"),
+        ("why? no idea", "why? no idea"),
+        ("two\nlines", "two\\nlines"),
+        ("x" * 5000, "x" * 997 + "..."),
+    ],
+)
+def test_a_line_is_short_and_has_no_secrets(text: str, sent: str) -> None:
+    troubles = Troubles()
+    said(troubles, text)
+    assert troubles.lines.take()[0][1]["text"] == sent
+
+
+def test_an_exception_is_told_without_its_traceback() -> None:
+    troubles = Troubles()
+    error = ValueError("must be a number")
+    said(troubles, "source failed", level=logging.ERROR, exc_info=(ValueError, error, None))
+    assert troubles.lines.take()[0][1]["text"] == "source failed: ValueError: must be a number"
+
+
+def test_other_librarys_lines_stay_in_the_robots_own_log() -> None:
+    troubles = Troubles()
+    said(troubles, "their business", name="rospy")
+    assert troubles.lines.take() == []
+
+
+class Failing:
+    def streams(self) -> list[str]:
+        return ["vesc"]
+
+    def describe(self) -> str:
+        return "failing"
+
+    def build(self, _clock: object) -> Failing:
+        return self
+
+    def report(self) -> dict[str, Any]:
+        return {}
+
+    def run(self, _emit: Emit, _stop: object) -> None:
+        raise SourceError("the device is gone")
+
+
+@pytest.mark.parametrize("working", [True, False])
+def test_lines_are_recorded_and_live_and_a_failing_link_adds_few(working: bool) -> None:
+    clock = ManualClock()
+    uplink = Loopback(clock, Dispatcher())
+    if not working:
+        uplink.verdict = lambda message: "no" if "/record" in message.topic or message.qos else None
+    spool = MemorySpool(max_bytes=2000, policy=REJECT_NEW)
+    troubles = Troubles()
+    logging.getLogger().addHandler(troubles)
+    try:
+        config = Config("car1", "host", Path(), Path(), (Failing(),))  # type: ignore[arg-type]  # no check
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
+        assert Runtime(agent).run(drain_s=10 if working else 0.2) == 1
+    finally:
+        logging.getLogger().removeHandler(troubles)
+    topics = f"car1/{LOG_STREAM}"
+    live = [
+        decode_live(m.payload) for m in uplink.published if m.topic.endswith(topics) and "live" in m.topic
+    ]
+    stored = [
+        decode_batch(m.payload) for m in uplink.published if m.topic.endswith(topics) and "/dt/" in m.topic
+    ]
+    assert "source failed: failing: the device is gone" in [one.sample["text"] for one in live]
+    if working:
+        assert [text for batch in stored for text in batch.columns["text"]] == [
+            "source failed: failing: the device is gone"
+        ]
+    # Each refusal of a batch of lines is a warning, too.
+    assert agent.streams.counts()[LOG_STREAM].samples < 30

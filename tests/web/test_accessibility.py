@@ -1,0 +1,77 @@
+"""Every view is usable without sight, without a mouse, with little contrast vision, and with a thumb."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+
+from tests.browser import drawn, show, until
+from tests.web.cars import SAMPLE, Car
+from tests.web.lab import VIEWS, Lab
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from playwright.sync_api import Page
+
+    from local.pubnub.standin import PubNubStandIn
+
+AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
+DESKTOP = {"viewport": {"width": 1280, "height": 900}}
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+# What a finger can hit, in CSS pixels; links within a text are as high as the text.
+TARGET_PX = 44
+SMALL = """(least) => [...document.querySelectorAll("a, button, input, select, summary, [tabindex='0']")]
+  .filter((node) => node.checkVisibility() && getComputedStyle(node).display !== "inline")
+  .map((node) => [node.outerHTML.slice(0, 90), node.getBoundingClientRect()])
+  .filter(([_, { width, height }]) => width < least - 0.5 || height < least - 0.5)
+  .map(([html, { width, height }]) => `${Math.round(width)} x ${Math.round(height)}: ${html}`)"""
+
+
+def violations(page: Page) -> list[str]:
+    """What axe finds: the rule, the place and the reason."""
+    drawn(page)
+    found = page.evaluate(
+        "(tags) => axe.run(document, { runOnly: tags, resultTypes: ['violations'] })", RULES
+    )
+    return [
+        f"{rule['id']}: {node['target']} {node['failureSummary']}"
+        for rule in found["violations"]
+        for node in rule["nodes"]
+    ]
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+@pytest.mark.parametrize("device", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_every_view_is_accessible(
+    open_page: Callable[..., Page],
+    pubnub: PubNubStandIn,
+    theme: Literal["dark", "light"],
+    device: dict[str, Any],
+) -> None:
+    found = {}
+    with Lab().server(pubnub) as server:
+        page = open_page(server.url, color_scheme=theme, reduced_motion="reduce", **device)
+        page.evaluate(AXE.read_text())
+        car = Car(pubnub)
+        show(page, car.send({**SAMPLE, "fault_code": 2}))
+        for view, (address, filled) in VIEWS.items():
+            page.goto(server.url + address)
+            show(page, car.send({**SAMPLE, "fault_code": 2}))
+            page.locator(filled).first.wait_for()
+            found[view] = violations(page)
+            if device is PHONE:
+                found[f"{view}, by thumb"] = page.evaluate(SMALL, TARGET_PX)
+        # Old values are readable, too.
+        for view in ("car", "fleet"):
+            page.goto(server.url + VIEWS[view].address)
+            show(page, car.send({**SAMPLE, "fault_code": 2}))
+            for state in ("stale", "gone"):
+                until(
+                    lambda state=state: page.locator(f"[data-state={state}]").count(), f"{view} to be {state}"
+                )
+                found[f"{view}, {state}"] = violations(page)
+    assert {view: faults for view, faults in found.items() if faults} == {}
