@@ -105,6 +105,7 @@ export class HistoryView {
     this.clear();
     this.note.set("");
     this.runs.set(robot, undefined);
+    this.form.node.inert = true;
     if (this.config.answers) void this.enter(robot, query);
   }
 
@@ -124,6 +125,7 @@ export class HistoryView {
         this.note.set("Nothing of this car is stored.");
         return;
       }
+      this.form.node.inert = false;
       this.form.streams(streams);
       this.form.stream = stream;
       this.runs.show(stream);
