@@ -23,12 +23,15 @@ from rich.console import Console
 from iort_agent.clock import SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagConfig, BagSource
+from iort_agent.sources.sim.circuit import HALL
+from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import delivery
+from iort_station.page import control
 from iort_station.page.answers import actions, answers
 from iort_station.page.downloads import downloads
 from iort_station.page.listener import Listener
@@ -43,6 +46,15 @@ ROBOT = "car1"
 _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
+# `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`; nobody is hurt by a long lease.
+DRIVE_COMMANDS = {
+    "drive": {
+        "topic": "/drive",
+        "type": DRIVE_TYPE,
+        "partial": True,
+        "motion": {"lease_s": 10.0, "stop": {"drive": {"speed": 0.0}}},
+    }
+}
 _CATCH_UP_S = 30.0
 _STATUS_S = 1.0
 
@@ -140,7 +152,8 @@ class _Demo:
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
                     downloads=downloads(embedded.cloud),
-                    actions=actions(embedded.cloud),
+                    track=HALL if self._options.bag is None else None,
+                    actions=actions(embedded.cloud) | control.actions(embedded.cloud),
                     port=self._options.port,
                 )
             )
@@ -184,7 +197,10 @@ class _Demo:
             duration_s = 60.0
         if duration_s is not None:
             source["duration_s"] = duration_s
-        return {"sources": [source], "ping": _PING}
+        settings = {"sources": [source], "ping": _PING}
+        return (
+            settings if self._options.bag is not None else {**settings, "downlink": {"cmd": DRIVE_COMMANDS}}
+        )
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"

@@ -21,6 +21,7 @@ from iort_agent.lanes.streams import Streams
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.run import SourceRun
+from iort_agent.sources.sim.source import SimSource
 from iort_agent.spool.interface import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
@@ -71,12 +72,14 @@ class Agent:
             known_fields=self.streams.known_fields,
             version=agent_version(),
         )
+        self.sources = [SourceRun(source, clock) for source in config.sources]
         self.downlink = make_downlink(
             config.downlink,
             config.share,
             link=link,
             boot=self.boot,
             sources=config.sources,
+            graph=next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None),
             offset=self.offset.known,
             answer=self.shadow.answer,
         )
@@ -84,7 +87,6 @@ class Agent:
         self.attachments = make_attachments(
             config.files, robot=config.robot, clock=clock, uploads=self.uploads
         )
-        self.sources = [SourceRun(source, clock) for source in config.sources]
         self.accounts = Accounts(
             clock=clock,
             spool=spool,

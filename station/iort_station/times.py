@@ -77,6 +77,11 @@ def iso_s(t_us: int) -> str:
     return _iso(t_us, "seconds")
 
 
+def stamped(name: str, t_us: int | None) -> dict[str, Any]:
+    """A time for JSON: ``name`` as ISO 8601, and ``name_ms`` in milliseconds; both null for None."""
+    return {name: None, f"{name}_ms": None} if t_us is None else {name: iso(t_us), f"{name}_ms": t_us // 1000}
+
+
 def between(extent: Extent) -> dict[str, Any]:
     """An extent for JSON: its times as ISO 8601 and in milliseconds."""
     start_us, end_us = extent["from_us"], extent["to_us"]

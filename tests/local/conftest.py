@@ -17,9 +17,11 @@ import pytest
 from pubnub.pubnub import PubNub
 from typer.testing import CliRunner
 
+from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.pubnub.standin import PubNubStandIn
@@ -86,6 +88,12 @@ def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
         assert time.monotonic() < deadline, f"not true within {seconds} s"
         time.sleep(0.05)
     return value
+
+
+def recorded(embedded: EmbeddedCloud, robot: str, stream: str) -> data.Result:
+    """The stream's samples, as soon as there are some: a query of an unknown stream is an error."""
+    until(lambda: list(delivery.batches(embedded.cloud, robot, stream)))
+    return data.query(embedded.cloud, robot, stream, "-1h", "now")
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ def run(tmp_path, name, **context):
         "HOME": str(tmp_path),
         # The cache of `make deploy`; otherwise every run would unpack the CDK again.
         "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
+        "CDK_VALIDATION": os.environ["CDK_VALIDATION"],
         "CDK_OUTDIR": str(tmp_path / name),
         "CDK_CONTEXT_JSON": json.dumps({"layer": str(tmp_path / "layer"), **context}),
         # Every lookup goes to a port without a listener.

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, config
+from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import MOST_ANSWERS, PageServer
 
 TOLD: dict[str, Any] = {
@@ -166,6 +166,19 @@ def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> N
         assert ask(page, "/slow.json")[0].status == 200
 
 
+def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) -> None:
+    file = tmp_path / "track.csv"
+    file.write_text("# x_m, y_m, w_right_m, w_left_m\n0,0,1,2\n4,0,1,2\n4,3,1,2\n0,3,1,2\n")
+    with PageServer(**TOLD, built=built, track=load_track(file)) as page:
+        told = json.loads(ask(page, "/config.json")[1])
+    assert told["track"] == {
+        "x_m": [0, 4, 4, 0], "y_m": [0, 0, 3, 3], "w_right_m": [1, 1, 1, 1], "w_left_m": [2, 2, 2, 2],
+    }  # fmt: skip
+    file.write_text("0,0\n")
+    with pytest.raises(StationError, match=r"track.csv: line 1 must be the four numbers"):
+        load_track(file)
+
+
 def test_a_malformed_request_is_answered_without_a_traceback(
     built: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,8 +216,8 @@ def test_other_methods_are_rejected(built: Path) -> None:
         assert ask(page, "/", "POST")[0].status == 405
 
 
-def test_an_action_needs_a_post_of_json(built: Path) -> None:
-    """A page elsewhere can send neither this method by a link, nor this type by a form."""
+def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> None:
+    """A page elsewhere has neither this origin nor the key, and a form cannot send this type."""
     done: list[Mapping[str, str]] = []
 
     def act(asked: Mapping[str, str]) -> dict[str, Any]:
@@ -213,15 +226,25 @@ def test_an_action_needs_a_post_of_json(built: Path) -> None:
             raise StationError("nothing was asked")
         return {"done": True}
 
-    def post(page: PageServer, body: str, kind: str = "application/json", host: str = "localhost") -> Any:
-        headers = {"Content-Type": kind, "Host": host}
+    def post(page: PageServer, body: str, kind: str = "application/json", **more: str) -> Any:
+        key = json.loads(ask(page, "/config.json")[1])["key"]
+        own = {"Host": "localhost", "Origin": "http://localhost", "X-Iort-Key": key}
+        headers = {
+            "Content-Type": kind,
+            **own,
+            **{name.replace("_", "-"): value for name, value in more.items()},
+        }
         answer, body_ = ask(page, "/act.json", "POST", headers, body)
         return answer.status, json.loads(body_)
 
     with PageServer(**TOLD, actions={"act": act}, built=built) as page:
         assert ask(page, "/act.json")[0].status == 404
         assert post(page, '{"a": "b"}', "text/plain")[0] == 415
-        assert post(page, '{"a": "b"}', host="evil.example")[0] == 403
+        assert post(page, '{"a": "b"}', Host="evil.example")[0] == 403
+        for origin in ("", "null", "http://evil.example", "http://localhost:81"):
+            assert post(page, '{"a": "b"}', Origin=origin)[0] == 403
+        for key in ("", "x", "\u00e4"):
+            assert post(page, '{"a": "b"}', X_Iort_Key=key)[0] == 403
         for wrong in ("", "[]", '{"a": 1}', "\ud800"):
             assert post(page, wrong)[0] == 400
         assert not done
@@ -234,7 +257,8 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
-    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False}
+    assert len(told.pop("key")) > 30
+    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, "actions": [], "track": None}
 
 
 def test_an_answer_has_null_for_nan_and_infinity(built: Path) -> None:

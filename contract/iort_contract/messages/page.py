@@ -10,10 +10,21 @@ from typing import Literal, TypedDict, Union
 from iort_contract.limits import Value
 
 
+class TrackMap(TypedDict):
+    """A closed track's centre line and its widths to either side: `iort_contract.track.Track`."""
+
+    x_m: list[float]
+    y_m: list[float]
+    w_right_m: list[float]
+    w_left_m: list[float]
+
+
 class Config(TypedDict):
     """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
-    whether the server answers questions about the past; a static site does not. ``vehicles`` maps a
-    robot to its `Vehicle`'s parameters."""
+    whether the server answers questions about the past; a static site does not. ``actions`` names what the
+    server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a
+    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is
+    known."""
 
     namespace: str
     subscribe_key: str
@@ -21,7 +32,10 @@ class Config(TypedDict):
     tls: bool
     token: str
     answers: bool
+    actions: list[str]
+    key: str
     vehicles: dict[str, dict[str, float]]
+    track: TrackMap | None
 
 
 class RobotPresence(TypedDict):
@@ -98,6 +112,14 @@ class DashboardsAnswer(TypedDict):
     """Answers ``dashboards``: their names."""
 
     dashboards: list[str]
+
+
+class SendAnswer(TypedDict):
+    """Answers ``send``: null if the robot did not answer, or its reason if it rejected the command."""
+
+    accepted: bool | None
+    reason: str
+    after_ms: int
 
 
 class _Mean(TypedDict):
@@ -240,4 +262,5 @@ Answer = Union[
     AlarmsAnswer,
     RejectedAnswer,
     RunsAnswer,
+    SendAnswer,
 ]

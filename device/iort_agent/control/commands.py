@@ -74,6 +74,7 @@ class Commands:
 
     def tick(self) -> float | None:
         """Publish the stops that are due. Returns when to call again; None while nothing moves."""
+        ended: set[str] = set()
         with self._lock:
             for command in self._commands.values():
                 if command.leases.stop_due(self._clock.monotonic()):
@@ -82,10 +83,17 @@ class Commands:
                     command.stopping = True
                     data = command.stop(self._clock.now_us())
                     command.stops += self._graph.publish(command.config.topic, data)
-                elif command.leases.next_due() is None:
+                elif command.stopping and command.leases.next_due() is None:
                     command.stopping = False
-            due = [command.leases.next_due() for command in self._commands.values()]
-        return min((at for at in due if at is not None), default=None)
+                    ended.add(command.config.topic)
+            due = [
+                (at, command.config.topic)
+                for command in self._commands.values()
+                if (at := command.leases.next_due()) is not None
+            ]
+        for topic in ended.difference(topic for _, topic in due):
+            self._graph.release(topic)
+        return min((at for at, _ in due), default=None)
 
     def report(self) -> dict[str, Any]:
         """The passed commands and the published stops, by name."""

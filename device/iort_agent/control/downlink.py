@@ -106,15 +106,18 @@ def make_downlink(
     link: Link,
     boot: str,
     sources: Iterable[object],
+    graph: Graph | None,
     offset: Callable[[], ClockOffset | None],
     answer: Answer,
 ) -> Downlink | None:
-    """The downlink of a configuration that has one, in the ROS node of the sources.
+    """The downlink of a configuration that has one: in the ROS node of the sources, or in a ``graph`` that is
+    no ROS graph if they need no node.
 
     Raises as `Downlink`, and `SourceError` without rospy.
     """
     if not (config.cmd or config.fleet or share):
         return None
-    node = next((source.node for source in sources if isinstance(source, Ros1Config)), DEFAULT_NODE)
-    graph = shared(node, link.clock)
+    node = next((source.node for source in sources if isinstance(source, Ros1Config)), None)
+    if graph is None or node is not None:
+        graph = shared(node or DEFAULT_NODE, link.clock)
     return Downlink(config, share, link=link, boot=boot, graph=graph, offset=offset, answer=answer)

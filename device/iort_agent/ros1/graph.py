@@ -22,6 +22,9 @@ class Graph(Protocol):
     def publish(self, topic: str, data: bytes) -> bool:
         """Publish a message on an advertised topic; False if there is no graph to publish in."""
 
+    def release(self, topic: str) -> None:
+        """Nobody commands the topic any more, and its last stop is published."""
+
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in another thread."""
 

@@ -169,6 +169,9 @@ class Node:
             self._wanted.setdefault(self.resolve(topic), self._types[kind][0].message_class)
         self._wake.set()
 
+    def release(self, topic: str) -> None:
+        """Nothing to do: a joystick or a planner on board drives on by itself."""
+
     def publish(self, topic: str, data: bytes) -> bool:
         """Publish a message's bytes on an advertised topic; False if the node is not in the graph."""
         publisher = self._publishers.get(self.resolve(topic))

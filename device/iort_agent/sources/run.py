@@ -18,7 +18,7 @@ class SourceRun:
 
     def __init__(self, config: SourceConfig, clock: Clock) -> None:
         self.description, self.streams = config.describe(), config.streams()
-        self._source = config.build(clock)
+        self.source = config.build(clock)
         self.failed = False
         self._ended = False
 
@@ -26,7 +26,7 @@ class SourceRun:
         """Run until the source ends, fails or is stopped. Raises nothing, because the other sources go on."""
         _log.info("source started: %s", self.description)
         try:
-            self._source.run(emit, stop)
+            self.source.run(emit, stop)
         except SourceError as error:
             _log.error("source failed: %s: %s", self.description, error)
             self.failed = True
@@ -54,9 +54,9 @@ class SourceRun:
 
     def waits(self) -> str | None:
         """The reason why the source waits; None if it does not wait."""
-        why = self._source.report().get("waits")
+        why = self.source.report().get("waits")
         return str(why) if why else None
 
     def report(self) -> Mapping[str, Any]:
         """The source's own counts."""
-        return self._source.report()
+        return self.source.report()

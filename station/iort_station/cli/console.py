@@ -8,7 +8,8 @@ that change the direction of a line are shown so too, and no text is rich's mark
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
 from typing import Any
 
 from rich import console
@@ -39,6 +40,17 @@ class Console(console.Console):
 out, errors = Console(), Console(stderr=True)
 
 
-def print_json(value: Any, **options: Any) -> None:
-    """Print a value as indented JSON; ``options`` are those of `json.dumps`."""
-    out.print_json(json.dumps(value, **options))
+def print_json(value: Any) -> None:
+    """Print a value as indented JSON; whole numbers of a table are integers."""
+    out.print_json(json.dumps(value, default=_number))
+
+
+def tell(facts: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+    """Print what a verb has done: a line of JSON for a script, or a text."""
+    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
+
+
+def _number(value: Any) -> int | float:
+    if not isinstance(value, Decimal):
+        raise TypeError(f"{type(value).__name__} has no form in JSON")
+    return int(value) if value == value.to_integral_value() else float(value)

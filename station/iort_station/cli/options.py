@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -47,6 +48,10 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. A script must give it.")]
 Token = Annotated[
     str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
+]
+TrackFile = Annotated[
+    Path | None,
+    typer.Option("--track", metavar="FILE", help="A CSV file of the cars' track, which the page shows."),
 ]
 
 # The range of a verb that would otherwise read years.

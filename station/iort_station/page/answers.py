@@ -12,7 +12,7 @@ import numpy as np
 
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.messages.page import Acknowledged, Answer, HistoryAnswer, RunsAnswer
+from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
 from iort_station import data
@@ -58,12 +58,12 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     }
 
 
-def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Acknowledged]]:
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
     """Every action, by its name."""
     return {
         "acknowledge": lambda asked: alarms.acknowledge(
             cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
-        )
+        ),
     }
 
 
@@ -184,16 +184,16 @@ def _last_known(column: Column, starts: Any) -> Any:
 
 
 def text(asked: Mapping[str, str], name: str) -> str:
-    """A parameter of a request; raises `StationError` if it is missing."""
+    """A text that is not empty; raises `StationError`."""
     if not asked.get(name):
         raise StationError(f"the request must have the parameter {name}")
     return asked[name]
 
 
 def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
-    """A whole number of a request; raises `StationError` if it is missing or not in the range."""
-    digits = text(asked, name)
+    """A whole number in the range; raises `StationError`."""
+    found = text(asked, name)
     # Sixteen digits are enough for every allowed number.
-    if not (digits.isascii() and digits.isdecimal()) or len(digits) > 16 or not least <= int(digits) <= most:
-        raise StationError(f"{name} must be a whole number from {least} to {most}, got {digits[:40]!r}")
-    return int(digits)
+    if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
+        raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
+    return int(found)

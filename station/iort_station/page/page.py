@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.page import Config
+from iort_contract.messages.page import Config, TrackMap
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_contract.topics import check_namespace, check_robot
+from iort_contract.track import Track, parse_track
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
@@ -58,6 +59,9 @@ def config(
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
     token: str = "",
     answers: bool = False,
+    actions: Iterable[str] = (),
+    key: str = "",
+    track: Track | None = None,
 ) -> Config:
     """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
 
@@ -92,4 +96,24 @@ def config(
         "vehicles": known,
         "token": token,
         "answers": answers,
+        "actions": sorted(actions),
+        "key": key,
+        "track": None if track is None else _track_map(track),
+    }
+
+
+def load_track(file: Path) -> Track:
+    """The track of a CSV file; raises `StationError` for another file."""
+    try:
+        return parse_track(file.read_text())
+    except (OSError, UnicodeDecodeError, ContractError) as error:
+        raise StationError(f"{file}: {error}") from error
+
+
+def _track_map(track: Track) -> TrackMap:
+    return {
+        "x_m": list(track.x_m),
+        "y_m": list(track.y_m),
+        "w_right_m": list(track.w_right_m),
+        "w_left_m": list(track.w_left_m),
     }

@@ -25,9 +25,15 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     assert added.exit_code == 0, added.output
     key = tmp_path / "cli-car" / "private.key"
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
-    assert {"robot": "cli-car", "speed_to_erpm_gain": 3000.0, "speed_to_erpm_offset": 0.0} in json.loads(
-        iort("robots", "list", "--json").output
+    listed = json.loads(iort("robots", "list", "--json").output)
+    (told,) = (row for row in listed if row["robot"] == "cli-car")
+    assert (told["speed_to_erpm_gain"], told["online"], told["connected"], told["streams"]) == (
+        3000.0,
+        False,
+        None,
+        [],
     )
+    assert all(row.keys() == told.keys() for row in listed)
     shown = iort("robots", "list").stdout
     assert f"{'cli-car':<8}" in shown
     assert "speed_to_erpm_gain 3000" in shown
@@ -43,7 +49,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "robot nobody is not registered; the nearest: "),
+        (("files", "list", "nobody"), "robot nobody is not registered; "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
         (("files", "get", "nobody"), "robot nobody is not registered"),
         (("trace", "nobody"), "robot nobody is not registered"),

@@ -64,10 +64,12 @@ def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedde
     assert 1.9 < run["seconds"] < 2.1
     assert run["streams"]["wheels"]["samples"] == 200
     assert run["streams"]["wheels"]["missing"] == 1
-    listed, *own = json.loads(_run(embedded, car.robot, verb="streams").stdout)["streams"]
-    assert (listed["stream"], listed["runs"], listed["from"]) == ("wheels", 1, run["from"])
-    assert {"name": "speed", "unit": "erpm"} in listed["fields"]
-    assert ACCOUNT_STREAM in [one["stream"] for one in own]
+    listed = {
+        one["stream"]: one for one in json.loads(_run(embedded, car.robot, verb="streams").stdout)["streams"]
+    }
+    assert (listed["wheels"]["runs"], listed["wheels"]["from"]) == (1, run["from"])
+    assert {"name": "speed", "unit": "erpm"} in listed["wheels"]["fields"]
+    assert ACCOUNT_STREAM in listed
     (short,) = wheels["shortfalls"]
     assert short["samples"] == samples
     # No later number reveals the loss of the last batch; the agent's own count does.
@@ -98,7 +100,7 @@ def test_each_run_names_the_run_before_it(embedded, bundle):
     _delete(embedded, car.robot, "wheels", {BATCH: str(last)})
     (wheels,) = json.loads(_run(embedded, car.robot, "--stream", "wheels", "--last", "1h").stdout)["streams"]
     (gap,) = wheels["runs"][0]["missing"]
-    assert (gap["first"], gap["last"], gap["before_us"]) == (last.seq, last.seq, None)
+    assert (gap["first"], gap["last"], gap["before_ms"]) == (last.seq, last.seq, None)
     assert not wheels["runs"][1]["missing"]
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 
-from iort_station import data
 from iort_station.cloud import EMBEDDED
 from local.deployment import ROOT
-from tests.local.conftest import run_agent, until
+from tests.local.conftest import recorded, run_agent
 
 PAGE = ROOT / "docs" / "tutorials" / "first-question.md"
 
@@ -15,7 +14,7 @@ PAGE = ROOT / "docs" / "tutorials" / "first-question.md"
 def test_the_notebook_answers_its_questions(embedded, bundle, tmp_path, monkeypatch, capsys):
     car = bundle(sources=[{"type": "sim", "rate_hz": 50, "duration_s": 8}])
     run_agent(car)
-    until(lambda: data.query(embedded.cloud, car.robot, "vesc", "-1h", "now"))
+    recorded(embedded, car.robot, "vesc")
     # The demo's folder, with its car.
     (tmp_path / EMBEDDED.parent.parent).mkdir(parents=True)
     (tmp_path / EMBEDDED.parent).symlink_to(embedded.folder)

@@ -6,7 +6,11 @@ import json
 
 import pytest
 
+from iort_agent.sources.sim.graph import DRIVE_TYPE
+from iort_contract.catalog.streams import LOG_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.errors import UsageError
+from iort_station.operations import delivery
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import driving
 
@@ -85,3 +89,28 @@ def test_an_invalid_value_is_rejected_with_the_reason(iort, bundle, arguments, s
     car = bundle()
     named = [car.robot if part == "CAR" else part for part in arguments]
     assert said in str(iort(*named).exception)
+
+
+def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bundle, embedded):
+    source = {"type": "sim", "rate_hz": 50, "vehicle": {"max_speed_mps": 5}}
+    motion = {"lease_s": 10, "stop": {}}
+    drive = {"topic": "/drive", "type": DRIVE_TYPE, "partial": True, "motion": motion}
+    car = bundle(sources=[source], downlink={"cmd": {"drive": drive}}, ping={"rate_hz": 2})
+    asked = ("send", car.robot, "drive", '{"drive": {"speed": -1.0}}', "--lease-ms", "3000")
+
+    def recorded(stream, field):
+        batches = delivery.batches(embedded.cloud, car.robot, stream)
+        return [value for batch in batches for value in batch.columns[field]]
+
+    with driving(car):
+        # It accepts no motion before it knows the cloud's clock.
+        until(lambda: iort(*asked).exit_code == 0)
+        ended = "command drive: nobody renews it, stopping"
+        until(lambda: ended in recorded(LOG_STREAM, "text"))
+        # Then its own driver drives on.
+        until(lambda: recorded(VESC_STREAM, "speed")[-1] > 4614)
+    speeds = recorded(VESC_STREAM, "speed")
+    assert -1.2 < min(speeds) / 4614 < -0.8
+    shown = iort("query", car.robot, LOG_STREAM, "--last", "5m", "--json")
+    rows = [json.loads(line) for line in shown.output.splitlines() if line.startswith("{")]
+    assert ended in [row.get("text") for row in rows], shown.output

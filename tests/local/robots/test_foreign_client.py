@@ -11,12 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from iort_station import data
 from iort_station.fleet import claims, registry, robots
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from local.deployment import ROOT
-from tests.local.conftest import until
+from tests.local.conftest import recorded, until
 
 EXAMPLES = ROOT / "docs" / "examples"
 SMALL = EXAMPLES / "batch_and_live.py"
@@ -70,7 +69,7 @@ def test_a_foreign_client_works_like_any_robot(embedded, car, iort):
     ping, stored = said
     assert ping["round_trip_ms"] > 0
 
-    found = until(lambda: data.query(embedded.cloud, car.robot, "arm", "-1h", "now"))
+    found = recorded(embedded, car.robot, "arm")
     assert found.columns["angle"].tolist()[:2] == [0.5, 1.5]
     assert found.columns["grip"].tolist() == [True, False, "x"]
     first_us, run, number = stored["batch"].split("-")
@@ -114,7 +113,7 @@ def test_a_small_client_stores_a_batch_and_shows_a_live_sample(language, embedde
             [*client, *endpoint, car.robot, car.folder, car.folder / "root-ca.pem"], check=True, timeout=60
         )
         (live,) = until(lambda: listener.heard)
-    found = until(lambda: data.query(embedded.cloud, car.robot, "arm", "-1h", "now"))
+    found = recorded(embedded, car.robot, "arm")
     assert found.columns["angle"].tolist() == [0.5, 1.5]
     assert (live.robot, live.stream, live.seq) == (car.robot, "arm", 0)
     assert not list(quarantine.entries(embedded.cloud, robot=car.robot))

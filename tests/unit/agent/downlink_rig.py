@@ -57,6 +57,7 @@ class FakeGraph:
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes]] = []
         self.kinds: dict[str, str] = {}
+        self.released: list[str] = []
         self.up = True
         self.closed = False
         self.stopped = threading.Event()
@@ -77,6 +78,9 @@ class FakeGraph:
         if data == doubles(0):
             self.stopped.set()
         return self.up
+
+    def release(self, topic: str) -> None:
+        self.released.append(topic)
 
     def subscribe(self, topic: str, handler: Callable[[Mapping[str, str], bytes], None]) -> None:
         self._handlers[topic] = handler
@@ -110,7 +114,7 @@ CONFIG: dict[str, Any] = {
 class Rig:
     def __init__(
         self, robot: str = "car1", *, share: Any = None, uplink: Loopback | None = None, clock: Any = None,
-        **config: Any,
+        graph: Any = None, **config: Any,
     ) -> None:  # fmt: skip
         self.clock = clock or ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
@@ -120,11 +124,11 @@ class Rig:
         self.offset: ClockOffset | None = ClockOffset(0.0, 0.0)
         where = Place(Path("car.yaml"))
         self.downlink = Downlink(
-            load(DownlinkConfig, {**CONFIG, **config}, where),
+            load(DownlinkConfig, {**(CONFIG if graph is None else {}), **config}, where),
             share_rule()(share, where) if share else (),
             link=link_of(self.uplink, self.clock, robot=robot),
             boot="0badcafe",
-            graph=self.graph,
+            graph=graph or self.graph,
             offset=lambda: self.offset,
             answer=lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
         )

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 import operator
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from iort_agent.common.schema import Place, load
+from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.sim.circuit import HALL, Circuit, wrapped
+from iort_agent.sources.sim.driver import Pose
+from iort_agent.sources.sim.graph import DRIVE_TYPE, SimGraph
 from iort_agent.sources.sim.source import PoseConfig, SimConfig
-from iort_agent.sources.sim.vehicle import VehicleConfig
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import CATALOG, POSE_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from tests.agent_fakes import ManualClock
+from tests.unit.agent.downlink_rig import Rig
 
 NO_POSE = PoseConfig(rate_hz=0)
 T0 = 1_700_000_000_000_000
@@ -70,6 +76,20 @@ def test_the_same_seed_drives_the_same_lap() -> None:
     for stream in (VESC_STREAM, POSE_STREAM):
         assert drive(stream, duration_s=20, seed=5) == drive(stream, duration_s=20, seed=5)
         assert drive(stream, duration_s=20, seed=5) != drive(stream, duration_s=20, seed=6)
+
+
+def test_the_example_of_a_track_is_the_hall_and_a_car_may_drive_another(tmp_path: Path) -> None:
+    example = Path(__file__).parents[3] / "docs" / "examples" / "hall.csv"
+    assert example.read_text() == HALL.csv()
+    big = tmp_path / "big.csv"
+    big.write_text("0,0,2,2\n60,0,2,2\n60,40,2,2\n0,40,2,2\n")
+    config = load(SimConfig, {"track": "big.csv", "duration_s": 60}, Place(tmp_path / "car.yaml"))
+    xs: list[Any] = []
+    config.build(ManualClock()).run(lambda *sample: xs.append(sample[2].get("x", 0)), threading.Event())
+    assert 58 < max(xs) < 62
+    big.write_text("0,0,2,2\n60,0\n")
+    with pytest.raises(ConfigError, match=r"track: .*big.csv: line 2 must be the four numbers"):
+        load(SimConfig, {"track": "big.csv"}, Place(tmp_path / "car.yaml"))
 
 
 def test_poses_come_at_their_own_rate_with_the_times_of_samples() -> None:
@@ -157,3 +177,63 @@ def test_a_heavier_car_is_slower_and_thirstier() -> None:
 def test_an_impossible_car_still_gives_numbers(vehicle: VehicleConfig) -> None:
     for _, _, values in drive(duration_s=10, vehicle=vehicle):
         assert all(math.isfinite(value) for value in values.values())
+
+
+class Commanded:
+    """A simulated car and its downlink, in steps of 20 ms."""
+
+    def __init__(self) -> None:
+        drive = {"topic": "/drive", "type": DRIVE_TYPE, "partial": True}
+        motion = {"lease_s": 10, "stop": {}}
+        clock = ManualClock(now_us=T0)
+        self.graph = SimGraph(clock)
+        self.rig = Rig(cmd={"drive": {**drive, "motion": motion}}, graph=self.graph, clock=clock)
+        self.vehicle = Vehicle(VehicleConfig(), 1)
+
+    def drive(self, seconds: float) -> list[tuple[float, Pose]]:
+        """The speed and pose of each step."""
+        found = []
+        for i in range(round(seconds * 50)):
+            self.rig.clock.advance(0.02)
+            if i % 5 == 0:
+                self.rig.downlink.tick()
+            self.vehicle.step(0.02, self.graph.wish())
+            found.append((self.vehicle.sample()["speed"] / 4614, self.vehicle.pose))
+        return found
+
+
+def test_a_command_drives_the_car_until_its_lease_ends_and_then_it_finds_its_lap_again() -> None:
+    car = Commanded()
+    car.drive(3)
+    car.rig.send({"drive": {"speed": 1.0, "steering_angle": 0.3}}, name="drive", lease_ms=4000)
+    driven = car.drive(4)
+    assert driven[-1][0] == pytest.approx(1.0, abs=0.15)
+    turned = sum(wrapped(b[1].heading_rad - a[1].heading_rad) for a, b in zip(driven, driven[1:]))
+    assert turned > 3, "it turns to the left"
+    stopped = car.drive(1)
+    assert stopped[-1][0] == 0.0
+    car.drive(30)
+    place = Circuit(HALL).nearest(car.vehicle.pose.x_m, car.vehicle.pose.y_m)
+    away_m = math.dist(car.vehicle.pose[:2], Circuit(HALL).beside(place, 0.0))
+    assert away_m < 0.5
+    assert car.drive(15)[-1][0] > 2
+
+
+def test_a_command_reverses_stops_and_holds() -> None:
+    car = Commanded()
+    car.drive(1)
+    car.rig.send({"drive": {"speed": -1.0}}, name="drive", lease_ms=5000)
+    speeds = [speed for speed, _ in car.drive(3)]
+    assert speeds[-1] == pytest.approx(-1.0, abs=0.15)
+    sample = car.vehicle.sample()
+    assert sample["duty_cycle"] < 0
+    assert sample["displacement"] < sample["distance_traveled"]
+    car.rig.send({}, name="drive", lease_ms=5000)
+    assert {speed for speed, _ in car.drive(5)[100:]} == {0.0}, "it stands for the whole lease"
+
+
+def test_a_simulated_car_takes_drive_commands_only() -> None:
+    with pytest.raises(SourceError, match="of the type ackermann_msgs/AckermannDriveStamped only"):
+        SimGraph(ManualClock()).advertise("/cmd_vel", "geometry_msgs/Twist")
+    with pytest.raises(SourceError, match="cannot share /pose"):
+        SimGraph(ManualClock()).subscribe("/pose", print)

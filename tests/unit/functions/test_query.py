@@ -212,7 +212,7 @@ def test_exported_messages_have_the_recorded_values():
 def test_a_mistake_gives_the_same_error_here_and_on_lambda():
     cloud = Cloud(table(*ride()))
     for question, reason in (
-        ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has name, speed"),
+        ({"fields": ["volts"]}, "car has no volts in vesc in this range; the nearest: speed"),
         ({"where": "speed > '3'"}, "cannot compare a number with a text: speed is a number"),
         ({"where": "speed > None"}, "None is only allowed as"),
         ({"summary": True}, "query the summary without --on lambda"),

@@ -11,6 +11,7 @@ from iort_agent.clock import Clock, Pace
 from iort_agent.common.schema import Place, existing_path, number, section, setting, text
 from iort_agent.sources import Emit, Source, SourceConfig
 from iort_agent.sources.sim.circuit import HALL, Circuit
+from iort_agent.sources.sim.graph import SimGraph
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -68,11 +69,13 @@ class SimConfig(SourceConfig):
 
 
 class SimSource(Source):
-    """Emits exactly ``rate_hz * duration_s`` samples, each at its absolute deadline."""
+    """Emits exactly ``rate_hz * duration_s`` samples, each at its absolute deadline. The car obeys the
+    commands that ``graph`` takes."""
 
     def __init__(self, config: SimConfig, clock: Clock) -> None:
         self._config = config
         self._clock = clock
+        self.graph = SimGraph(clock)
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Drive until the duration is over or ``stop`` is set."""
@@ -84,7 +87,7 @@ class SimSource(Source):
         done = poses = 0
         while (total is None or done < total) and pace.until(done / config.rate_hz):
             for _ in range(steps):
-                vehicle.step(1 / config.rate_hz / steps)
+                vehicle.step(1 / config.rate_hz / steps, self.graph.wish())
             now_us = self._clock.now_us()
             emit(config.stream, now_us, vehicle.sample())
             # With the first sample at or after its time, so that both have the same time.

@@ -6,9 +6,8 @@ import fnmatch
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import DownloadColumn, TransferSpeedColumn
@@ -16,11 +15,12 @@ from rich.progress import DownloadColumn, TransferSpeedColumn
 from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
 from iort_station.cli.progress import bar
+from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
-from iort_station.times import iso_s
+from iort_station.times import iso_s, stamped
 
 commands = typer.Typer(
     name="files", no_args_is_help=True, help="Bags, images and other files that robots have uploaded."
@@ -29,7 +29,7 @@ commands = typer.Typer(
 _Name = Annotated[str, typer.Option(help="Only names that match, for example '*.bag'.")]
 
 
-@commands.command("list")
+@commands.command("list", epilog=examples("files list car7 --name '*.bag' --last 7d"))
 def list_(
     context: typer.Context,
     robot: Robot,
@@ -46,12 +46,12 @@ def list_(
     when, one = Range.of(start, end, last), None
     for one in _chosen(context.obj.cloud(), robot, name, when):
         text = f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}"
-        console.out.print(json.dumps(asdict(one)) if as_json else text, soft_wrap=True)
+        console.out.print(json.dumps(_as_json(one)) if as_json else text, soft_wrap=True)
     if one is None:
         console.errors.print("no matching files", soft_wrap=True)
 
 
-@commands.command("get")
+@commands.command("get", epilog=examples("files get car7 --name '*.bag' --out bags"))
 def get(
     context: typer.Context,
     robot: Robot,
@@ -86,18 +86,18 @@ def get(
         folder = out / time.strftime("%Y%m%d-%H%M%S", time.gmtime(one.second)) if apart else out
         with bar(one.name, one.size, DownloadColumn(), TransferSpeedColumn()) as progress:
             path = files.download(cloud, one, folder, progress, force=force)
-        text = json.dumps({**asdict(one), "path": str(path)}) if as_json else str(path)
+        text = json.dumps({**_as_json(one), "path": str(path)}) if as_json else str(path)
         console.out.print(text, soft_wrap=True)
 
 
-@commands.command("empty")
-def empty(context: typer.Context, yes: Yes = False) -> None:
+@commands.command("empty", epilog=examples("files empty --yes"))
+def empty(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Delete every file of every robot, and the results of queries. Do so before you destroy the stacks."""
     cloud = context.obj.cloud()
     agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
     counts: list[int] = []
     files.empty(cloud, counts.append)
-    console.out.print(f"{sum(counts)} deleted")
+    console.tell({"deleted": sum(counts)}, f"{sum(counts)} deleted", as_json=as_json)
 
 
 def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[StoredFile]:
@@ -107,6 +107,17 @@ def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[Stored
             yield one
     if one is None and next(files.listed(cloud, robot), None) is None:
         registry.get(cloud, robot)
+
+
+def _as_json(one: StoredFile) -> dict[str, Any]:
+    return {
+        "key": one.key,
+        "robot": one.robot,
+        "name": one.name,
+        "size": one.size,
+        **stamped("written", one.second * 1_000_000),
+        **stamped("stored", round(one.stored_s * 1e6)),
+    }
 
 
 def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
@@ -14,6 +13,7 @@ from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
     AGENT_VERSION,
     ALERT_PREFIX,
     CONNECTED_MS,
@@ -21,6 +21,7 @@ from iort_contract.tables import (
     DISCONNECTED_MS,
     FILES_BYTES,
     FILES_DAY,
+    LAST_SEEN_MS,
     ONLINE,
     OVER_SHARE,
     PRESENCE,
@@ -28,14 +29,14 @@ from iort_contract.tables import (
     STREAMS,
 )
 from iort_station.cli import completion
-from iort_station.cli.console import Console, errors, out, print_json
+from iort_station.cli.console import Console, errors, out, print_json, tell
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
-from iort_station.times import iso_s, time_us
+from iort_station.times import iso_s, stamped, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
 commands.add_typer(provisioning.commands)
@@ -44,7 +45,7 @@ commands.add_typer(tags.commands)
 _PIPE_WIDTH = 10_000
 
 
-@commands.command("set")
+@commands.command("set", epilog=examples("robots set car7 speed_to_erpm_gain=4614 --last 7d"))
 def set_(
     context: typer.Context,
     name: Robot,
@@ -62,6 +63,7 @@ def set_(
     wait: Annotated[
         bool, typer.Option(help="Wait a minute first. --no-wait is for a robot that was silent for a minute.")
     ] = True,
+    as_json: AsJson = False,
 ) -> None:
     """Correct a robot's vehicle parameters, and recompute the speed in its summaries.
 
@@ -74,7 +76,8 @@ def set_(
     before = registry.set_vehicle(cloud, name, vehicle)
     for key, value in vehicle.items():
         was = f"{before[key]:.12g}" if key in before else "not set"
-        out.print(f"{name}: {key} {value:.12g}, was {was}", soft_wrap=True)
+        facts = {"robot": name, "parameter": key, "value": value, "was": before.get(key)}
+        tell(facts, f"{name}: {key} {value:.12g}, was {was}", as_json=as_json)
     # numpy takes longer to load than most commands to run.
     from iort_station.operations import recompute  # noqa: PLC0415 - see above
 
@@ -85,19 +88,20 @@ def set_(
     for stream in streams:
         with reading(f"{name} {stream}", from_us, time.time_ns() // 1000) as progress:
             done = recompute.recompute(cloud, name, stream, from_us, progress=progress)
-        out.print(f"{name} {stream}: {done.seconds:,} seconds recomputed", soft_wrap=True)
+        facts = {"robot": name, "stream": stream, "seconds": done.seconds, "left_out": done.left_out}
+        tell(facts, f"{name} {stream}: {done.seconds:,} seconds recomputed", as_json=as_json)
         if done.left_out:
             say(f"{done.left_out} stored items are in no summary: not a batch, or too many samples")
     if not streams:
-        out.print(f"{name}: 0 seconds recomputed: no summary has a speed", soft_wrap=True)
+        say(f"{name}: 0 seconds recomputed: no summary has a speed")
 
 
-@commands.command("list")
+@commands.command("list", epilog=examples("robots list"))
 def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
     rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
     if as_json:
-        print_json(rows, default=float)
+        print_json([_as_json(row) for row in rows])
         return
     if not rows:
         errors.print("no robot is registered; `iort robots add NAME` registers one")
@@ -112,7 +116,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
 
 
-@commands.command("show")
+@commands.command("show", epilog=examples("robots show car7"))
 def show(
     context: typer.Context,
     name: Robot,
@@ -123,11 +127,27 @@ def show(
     row, held = registry.get(cloud, name), certificates.attached(cloud, name)
     over = shadow.over_share(cloud, name)
     if as_json:
-        described = [
-            {**one._asdict(), "created": _time(one.created), "expires": _time(one.expires)} for one in held
-        ]
-        said = {OVER_SHARE: over and asdict(over), "certificates": described}
-        print_json({**row, **said}, default=float)
+        print_json(
+            {
+                **_as_json(row),
+                OVER_SHARE: over
+                and {
+                    "batches": over.batches,
+                    **stamped("since", over.since_ms * 1000),
+                    **stamped("last", over.last_ms * 1000),
+                },
+                "certificates": [
+                    {
+                        "id": one.id,
+                        "arn": one.arn,
+                        "status": one.status,
+                        **stamped("created", time_us(one.created, 0)),
+                        **stamped("expires", None if one.expires is None else time_us(one.expires, 0)),
+                    }
+                    for one in held
+                ],
+            }
+        )
         return
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(no_wrap=True)
@@ -147,7 +167,7 @@ def show(
     out.print(table)
 
 
-@commands.command("remove")
+@commands.command("remove", epilog=examples("robots remove car8 --yes"))
 def remove(
     context: typer.Context,
     name: Annotated[
@@ -157,6 +177,7 @@ def remove(
         bool, typer.Option("--all", help="Remove every robot and lasting claim, before `make destroy`.")
     ] = False,
     yes: Yes = False,
+    as_json: AsJson = False,
 ) -> None:
     """Revoke a robot's certificates, end its session and forget it. Its data stays."""
     if everything == (name is not None):
@@ -166,14 +187,15 @@ def remove(
         registry.get(cloud, name)
         agreed(f"Remove {name} and revoke its certificates?", yes=yes)
         robots.remove(cloud, name)
-        out.print(f"{name} is removed")
+        tell({"removed": name}, f"{name} is removed", as_json=as_json)
         return
     names = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
     agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
     for one in names:
         robots.remove(cloud, one)
-        out.print(f"{one} is removed")
-    out.print(f"lasting claims revoked: {claims.revoke_all(cloud)}")
+        tell({"removed": one}, f"{one} is removed", as_json=as_json)
+    count = claims.revoke_all(cloud)
+    tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 
 def _parameter(text: str) -> tuple[str, float]:
@@ -182,6 +204,21 @@ def _parameter(text: str) -> tuple[str, float]:
         return name, float(value)
     except ValueError as error:
         raise UsageError(f"must be PARAMETER=NUMBER, got {text!r}") from error
+
+
+def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A robot's row with every attribute that a row may have; null is not known."""
+    known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, FILES_DAY, FILES_BYTES))
+    told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
+    told |= {name: float(row[name]) for name in robots.F1TENTH if name in row}
+    for name in (CONNECTED_MS, DISCONNECTED_MS, LAST_SEEN_MS, ADMITTED_MS):
+        at_ms = told.pop(name)
+        told |= stamped(name.removesuffix("_ms"), None if at_ms is None else int(at_ms) * 1000)
+    until_s = told.pop(ADMIT_UNTIL_S)
+    told |= stamped("admit_until", None if until_s is None else int(until_s) * 1_000_000)
+    for name in [name for name in told if name.startswith(ALERT_PREFIX)]:
+        told |= stamped(name, int(told[name]) * 1_000_000)
+    return told
 
 
 def _connection(row: Mapping[str, Any]) -> str:

@@ -15,18 +15,19 @@ from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.words import examples
 from iort_station.data import inventory
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.operations import accounts, audit
 from iort_station.operations.audit import Audit
-from iort_station.times import duration_us, iso, iso_s
+from iort_station.times import duration_us, iso, iso_s, stamped
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
 _LISTED = 20
 
 
-@commands.command("audit")
+@commands.command("audit", epilog=examples("audit car7 --last 1h"))
 def audit_(
     context: typer.Context,
     robot: Robot,
@@ -41,9 +42,11 @@ def audit_(
     start: From = None,
     end: To = None,
     last: Last = None,
-    late: Annotated[str, typer.Option(help="A batch that is slower than this is late.")] = "5s",
+    late: Annotated[
+        str, typer.Option(help="Count a batch as late if it took so much longer than the fastest.")
+    ] = "5s",
     from_start: Annotated[
-        bool, typer.Option("--from-start", help="Count numbers before the first stored one as missing.")
+        bool, typer.Option("--from-start", help="Count batches before the first stored one as missing.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -59,7 +62,7 @@ def audit_(
         check_robot(robot)
         names = [check_stream(name) for name in streams or ()] or inventory.known(cloud, robot)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
     found, now_us = [], time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)
@@ -173,12 +176,23 @@ def _table(one: Audit) -> Table:
 
 
 def _as_json(one: Audit) -> dict[str, Any]:
+    left_out = {"samples_of", "first_us", "last_us"}
     runs = [
         {
-            **{name: value for name, value in asdict(run).items() if name != "samples_of"},
+            **{name: value for name, value in asdict(run).items() if name not in left_out},
+            **stamped("first", run.first_us),
+            **stamped("last", run.last_us),
             "expected": run.expected,
             "missing_batches": sum(gap.batches for gap in run.missing),
-            "missing": [gap._asdict() for gap in run.missing],
+            "missing": [
+                {
+                    "first": gap.first,
+                    "last": gap.last,
+                    **stamped("after", gap.after_us),
+                    **stamped("before", gap.before_us),
+                }
+                for gap in run.missing
+            ],
         }
         for run in one.runs
     ]

@@ -11,16 +11,17 @@ from rich.text import Text
 
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, OneRobot, Range, To
+from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
-from iort_station.times import iso_s
+from iort_station.times import iso_s, stamped
 
 commands = typer.Typer()
 _HEX_WIDTH = 16
 
 
-@commands.command("errors")
+@commands.command("errors", epilog=examples("errors --robot car7 --last 1h"))
 def errors_(
     context: typer.Context,
     entry_id: Annotated[
@@ -113,7 +114,8 @@ def as_text(payload: bytes) -> str:
 
 def as_fields(entry: DeadLetter) -> dict[str, Any]:
     """What is printed of a message as JSON."""
-    return {name: value for name, value in asdict(entry).items() if name != "payload"}
+    told = {name: value for name, value in asdict(entry).items() if name != "payload"}
+    return {**told, **stamped("first", entry.first_ms * 1000), **stamped("last", entry.last_ms * 1000)}
 
 
 def _utc(ms: int) -> str:

@@ -6,17 +6,18 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import Yes, agreed
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
+from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
-from iort_station.page.page import config
+from iort_station.page.page import config, load_track
 from iort_station.page.site import publish, upload
 
 commands = typer.Typer()
 
 
-@commands.command("site")
+@commands.command("site", epilog=examples("site"))
 def site(
     context: typer.Context,
     token: Annotated[
@@ -29,14 +30,24 @@ def site(
     remove: Annotated[
         bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
     ] = False,
+    track: TrackFile = None,
     yes: Yes = False,
+    as_json: AsJson = False,
 ) -> None:
     """Upload the page to the stack iort-site, which serves it. Deploy with -c site=true first."""
     cloud = context.obj.cloud()
     if remove:
         agreed(f"Take the page of the deployment {cloud.namespace} down?", yes=yes)
         gone = upload(cloud.client("s3"), cloud.output("site", "PageBucket"), {})
-        out.print(f"{len(gone)} files deleted")
+        tell({"deleted": len(gone)}, f"{len(gone)} files deleted", as_json=as_json)
         return
     vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
-    out.print(publish(cloud, config(namespace=cloud.namespace, vehicles=vehicles, token=token, **pubnub)))
+    told = config(
+        namespace=cloud.namespace,
+        vehicles=vehicles,
+        token=token,
+        track=None if track is None else load_track(track),
+        **pubnub,
+    )
+    url = publish(cloud, told)
+    tell({"url": url}, url, as_json=as_json)

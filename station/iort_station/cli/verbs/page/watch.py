@@ -20,17 +20,18 @@ from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import out
 from iort_station.cli.options import Token
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.listener import Listener
 from iort_station.page.watch import FleetWatch
+from iort_station.times import iso
 
 commands = typer.Typer()
 _REFRESH_S = 0.25
 
 
-@commands.command("watch")
+@commands.command("watch", epilog=examples("watch", "watch --json --seconds 5"))
 def watch(
     context: typer.Context,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for every update.")] = False,
@@ -70,7 +71,13 @@ def _print_line(update: Any, now_us: int, done: threading.Event) -> None:
         return
     live = heard.live
     delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
-    line = {ROBOT: heard.robot, "stream": heard.stream, T_US: live.t_us, "delay_ms": delay_ms}
+    line = {
+        ROBOT: heard.robot,
+        "stream": heard.stream,
+        "time": iso(live.t_us),
+        T_US: live.t_us,
+        "delay_ms": delay_ms,
+    }
     try:
         print(json.dumps({**line, "sample": live.sample}), flush=True)
     except BrokenPipeError:
