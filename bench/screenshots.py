@@ -24,6 +24,7 @@ from bench.load.agent_process import AgentProcess
 from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.meters import chromium
 from iort_station.fleet import robots
+from iort_station.page import control
 from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
@@ -71,7 +72,7 @@ def _take(views: Sequence[str], out: Path) -> None:
             **cloud.keys.reading(),
             vehicles=vehicles,
             answers=answers(cloud.cloud),
-            actions=actions(cloud.cloud),
+            actions=actions(cloud.cloud) | control.actions(cloud.cloud),
         )
         url = stack.enter_context(server).url
         pages = {

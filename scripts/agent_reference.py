@@ -1,7 +1,8 @@
-"""The sections of car.yaml, from the agent's schema: a table each for docs/reference/car-yaml.md."""
+"""The sections of car.yaml and the commands of `iort-agent`, for docs/reference/."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import inspect
 import re
@@ -9,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from iort_agent.cli import command_line
 from iort_agent.common.schema import Place, Rule, rules_of
 from iort_agent.config import Config
 from iort_agent.errors import ConfigError
@@ -22,6 +24,33 @@ class Section(NamedTuple):
     path: str
     meaning: str
     rows: list[tuple[str, str, str]]
+
+
+class Command(NamedTuple):
+    """A command of `iort-agent`: its name, what it does, and a row for each option."""
+
+    name: str
+    meaning: str
+    rows: list[tuple[str, str]]
+
+
+def commands() -> list[Command]:
+    """Every command."""
+    (choices,) = (
+        action.choices
+        for action in command_line()._actions  # noqa: SLF001 - argparse has no other way to list them
+        if isinstance(action, argparse._SubParsersAction)  # noqa: SLF001 - as above
+    )
+    return [
+        Command(name, parser.description or "", [_option(action) for action in parser._actions[1:]])  # noqa: SLF001 - as above
+        for name, parser in choices.items()
+    ]
+
+
+def _option(action: argparse.Action) -> tuple[str, str]:
+    values = action.metavar or ",".join(map(str, action.choices or ()))
+    required = ", required" if action.required and action.option_strings else ""
+    return f"`{' '.join((*action.option_strings, str(values))).strip()}`", f"{action.help}{required}"
 
 
 def sections() -> list[Section]:

@@ -6,7 +6,7 @@ cfn-lint and our own checks also read every variation of the parameters (stacks/
 
 It needs no credentials and no network. stacks/checks/acknowledged.py lists the findings that the stacks do
 not follow; an entry that no checker reports any more is a finding too. --write generates
-docs/reference/acknowledged.md from it. Our own checks, stacks/checks/invariants.py, cannot be acknowledged.
+docs/explanation/acknowledged.md from it. Our own checks, stacks/checks/invariants.py, cannot be acknowledged.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from stacks.checks.invariants import broken
 from stacks.checks.variations import VARIATIONS
 from stacks.settings import Settings
 
-DOCUMENT = ROOT / "docs" / "reference" / "acknowledged.md"
+DOCUMENT = ROOT / "docs" / "explanation" / "acknowledged.md"
 STAGES: dict[str, dict[str, Any]] = {
     "dev": {},
     "prod": {
@@ -68,7 +68,7 @@ def main() -> None:
     """Print the open findings; exit with 1 if any is open."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--checkov", type=Path, help="checkov's command, in its own environment")
-    parser.add_argument("--write", action="store_true", help="write docs/reference/acknowledged.md")
+    parser.add_argument("--write", action="store_true", help="write docs/explanation/acknowledged.md")
     asked = parser.parse_args()
     found: list[Finding] = []
     known: dict[str, list[Acknowledged]] = {}
@@ -233,7 +233,7 @@ def output(command: list[str], *, good: Iterable[int]) -> str:
 
 
 def document(known: dict[str, list[Acknowledged]]) -> str:
-    """docs/reference/acknowledged.md: rule, reason, and the acknowledged resources."""
+    """docs/explanation/acknowledged.md: rule, reason, and the acknowledged resources."""
     where: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for stage, acknowledged in known.items():
         for one in acknowledged:

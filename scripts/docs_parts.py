@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -32,6 +33,7 @@ from scripts import agent_reference, cloud_tables
 from scripts.page_contract import formula, page_contract
 
 __all__ = [
+    "agent_manual",
     "alarms",
     "car_yaml",
     "cost",
@@ -66,6 +68,7 @@ FILES = tuple(
         "docs/reference/fields.md",
         "docs/reference/metrics.md",
         "docs/explanation/cost.md",
+        "docs/reference/iort-agent.md",
         "docs/reference/iort.md",
         "docs/reference/messages.md",
         "docs/explanation/processing.md",
@@ -186,6 +189,13 @@ def car_yaml() -> None:
         _table(("key", "default", "allowed"), section.rows, right=False)
 
 
+def agent_manual() -> None:
+    """The command `iort-agent`."""
+    for command in agent_reference.commands():
+        print(f"\n## `iort-agent {command.name}`\n\n{command.meaning}\n")
+        _table(("option", "meaning"), command.rows, right=False)
+
+
 def errors() -> None:
     """The errors of the agent and of the station."""
     rows = []
@@ -219,8 +229,15 @@ def manual() -> None:
     root.commands = {name: verb.load() for name, verb in root.commands.items()}
     _whole_sentences(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root), name="iort")
+    text = re.sub(r"\x08\nExamples:\n((?:  .*\n)+)", _console, text)
     # The page has a title of its own. The text is escaped for HTML; Markdown shows an apostrophe as it is.
     print(html.unescape(text.partition("\n\n")[2]).strip())
+
+
+def _console(found: re.Match[str]) -> str:
+    """A verb's examples as a console's text."""
+    commands = (f"$ {line.strip()}" for line in found[1].splitlines())
+    return "\n".join(["**Examples**:", "", "```console", *commands, "```", ""])
 
 
 def _whole_sentences(group: Any) -> None:

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from iort_contract import checks, limits, topics
+from iort_contract import page as served
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import page
+from iort_contract.messages import commands, page
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -67,6 +68,8 @@ def _constants() -> Iterator[str]:
         limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
         topics: ("NAME",),
         checks: ("BOOT", "FIELD_NAME"),
+        commands: ("MAX_LEASE_MS",),
+        served: ("KEY_HEADER",),
     }.items():
         for name in names:
             value = getattr(module, name)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 PUBNUB_ORIGIN = "ps.pndsn.com"
+# An action's request has the server's key in it.
+KEY_HEADER = "X-Iort-Key"
 # Sent with every file, beside the policy.
 HEADERS = {
     "X-Content-Type-Options": "nosniff",

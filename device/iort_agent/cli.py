@@ -67,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.umask(before)
 
 
-def _parse(arguments: list[str]) -> argparse.Namespace:
+def command_line() -> argparse.ArgumentParser:
+    """The commands and their options."""
     parser = argparse.ArgumentParser(
         prog="iort-agent",
         description="Sends a robot's data to AWS IoT: every sample recorded, the newest one live. "
@@ -106,6 +107,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
     renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
+    return parser
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = command_line()
     if not arguments:
         parser.print_help(sys.stderr)
         raise SystemExit(2)

@@ -1,7 +1,7 @@
 """The findings of cfn-lint, cdk-nag and checkov that these stacks do not follow, with reasons.
 
 Each finding is acknowledged for one rule on one resource, in the checker's own way, so that the tools report
-no open finding. docs/reference/acknowledged.md is generated from this file.
+no open finding. docs/explanation/acknowledged.md is generated from this file.
 """
 
 from __future__ import annotations

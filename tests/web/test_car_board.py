@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from iort_agent.sources.sim.circuit import HALL
+from iort_contract.catalog.streams import LOG_STREAM, POSE_STREAM
 from iort_station.page.server import PageServer
 from tests.browser import drawn, plain, show, until
 from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
@@ -28,6 +30,10 @@ class Recorded:
 
     def history(self, asked: Any) -> dict[str, Any]:
         first, last = (int(asked[name]) / 1e6 for name in ("from_us", "to_us"))
+        if asked["stream"] == LOG_STREAM:
+            line = {"level": "warning", "logger": "iort_agent.mqtt", "text": "connection lost", "left_out": 0}
+            fields = {name: {"mean": [value]} for name, value in line.items()}
+            return {"times_s": [last - 60], "fields": fields, "samples": 1, "ros2": False, "row_s": 0}
         self.asked_s.append(last - first)
         times = [first + i / 10 for i in range(int((last - first) * 10))]
         fields = {"voltage_input": {"mean": [10.0] * len(times)}, "frame": {"mean": ["map"] * len(times)}}
@@ -47,7 +53,7 @@ def served(pubnub: PubNubStandIn, recorded: Recorded) -> Iterator[str]:
         "robots": lambda _: {"robots": {}},
     }
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=answers, **told) as server:
+    with PageServer(namespace="iort", answers=answers, track=HALL, **told) as server:
         yield server.url
 
 
@@ -107,6 +113,39 @@ def test_the_viewers_charts_are_kept_and_shared(
     drawn(page)
     assert page.evaluate(TITLES) == first
     assert page.url == f"{url}#/car/car-1"
+
+
+def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(
+    open_page: Callable[..., Page], served: str, car: Car
+) -> None:
+    page = open_page(f"{served}#/car/car-1")
+    line = {"level": "error", "logger": "iort_agent.sources", "text": "source vesc failed\nOSError: gone"}
+    show(page, car.send({**line, "left_out": 2}, stream=LOG_STREAM))
+    lines = page.get_by_label("Log of the agent").locator("li")
+    until(lambda: lines.count() == 2, "both lines")
+    assert lines.nth(0).inner_text().splitlines()[1:] == [
+        "source vesc failed",
+        "2 lines before were left out",
+    ]
+    assert "connection lost" in lines.nth(1).inner_text()
+    # Their texts are no tiles.
+    assert page.locator(f"[data-stream={LOG_STREAM}]").count() == 0
+
+
+def test_the_trajectory_is_drawn_on_the_track(open_page: Callable[..., Page], served: str, car: Car) -> None:
+    page = open_page(f"{served}#/car/car-1?charts=trajectory")
+    painted = """() => {
+      const canvas = document.querySelector(".panel.xy canvas");
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      return data.filter((value, i) => i % 4 === 3 && value > 0).length;
+    }"""
+    # Far from the track, the pose is of another map, and the track is left out.
+    show(page, car.send({"x": 1e4, "y": 1e4, "heading": 0.0}, stream=POSE_STREAM))
+    until(lambda: page.evaluate(painted) > 0, "the pose")
+    alone = page.evaluate(painted)
+    page = open_page(page.url)
+    show(page, car.send({"x": HALL.x_m[0], "y": HALL.y_m[0], "heading": 0.0}, stream=POSE_STREAM))
+    until(lambda: page.evaluate(painted) > 2 * alone, "the track")
 
 
 def test_a_chart_is_dragged_to_another_place(page: Page, car: Car) -> None:

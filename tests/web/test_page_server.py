@@ -216,8 +216,8 @@ def test_other_methods_are_rejected(built: Path) -> None:
         assert ask(page, "/", "POST")[0].status == 405
 
 
-def test_an_action_needs_a_post_of_json(built: Path) -> None:
-    """A page elsewhere can send neither this method by a link, nor this type by a form."""
+def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> None:
+    """A page elsewhere has neither this origin nor the key, and a form cannot send this type."""
     done: list[Mapping[str, str]] = []
 
     def act(asked: Mapping[str, str]) -> dict[str, Any]:
@@ -226,15 +226,25 @@ def test_an_action_needs_a_post_of_json(built: Path) -> None:
             raise StationError("nothing was asked")
         return {"done": True}
 
-    def post(page: PageServer, body: str, kind: str = "application/json", host: str = "localhost") -> Any:
-        headers = {"Content-Type": kind, "Host": host}
+    def post(page: PageServer, body: str, kind: str = "application/json", **more: str) -> Any:
+        key = json.loads(ask(page, "/config.json")[1])["key"]
+        own = {"Host": "localhost", "Origin": "http://localhost", "X-Iort-Key": key}
+        headers = {
+            "Content-Type": kind,
+            **own,
+            **{name.replace("_", "-"): value for name, value in more.items()},
+        }
         answer, body_ = ask(page, "/act.json", "POST", headers, body)
         return answer.status, json.loads(body_)
 
     with PageServer(**TOLD, actions={"act": act}, built=built) as page:
         assert ask(page, "/act.json")[0].status == 404
         assert post(page, '{"a": "b"}', "text/plain")[0] == 415
-        assert post(page, '{"a": "b"}', host="evil.example")[0] == 403
+        assert post(page, '{"a": "b"}', Host="evil.example")[0] == 403
+        for origin in ("", "null", "http://evil.example", "http://localhost:81"):
+            assert post(page, '{"a": "b"}', Origin=origin)[0] == 403
+        for key in ("", "x", "\u00e4"):
+            assert post(page, '{"a": "b"}', X_Iort_Key=key)[0] == 403
         for wrong in ("", "[]", '{"a": 1}', "\ud800"):
             assert post(page, wrong)[0] == 400
         assert not done
@@ -247,7 +257,8 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
-    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False}
+    assert len(told.pop("key")) > 30
+    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, "actions": [], "track": None}
 
 
 def test_an_answer_has_null_for_nan_and_infinity(built: Path) -> None:

@@ -21,8 +21,10 @@ class TrackMap(TypedDict):
 
 class Config(TypedDict):
     """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
-    whether the server answers questions about the past; a static site does not. ``vehicles`` maps a
-    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known."""
+    whether the server answers questions about the past; a static site does not. ``actions`` names what the
+    server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a
+    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is
+    known."""
 
     namespace: str
     subscribe_key: str
@@ -30,6 +32,8 @@ class Config(TypedDict):
     tls: bool
     token: str
     answers: bool
+    actions: list[str]
+    key: str
     vehicles: dict[str, dict[str, float]]
     track: TrackMap | None
 
@@ -108,6 +112,14 @@ class DashboardsAnswer(TypedDict):
     """Answers ``dashboards``: their names."""
 
     dashboards: list[str]
+
+
+class SendAnswer(TypedDict):
+    """Answers ``send``: null if the robot did not answer, or its reason if it rejected the command."""
+
+    accepted: bool | None
+    reason: str
+    after_ms: int
 
 
 class _Mean(TypedDict):
@@ -250,4 +262,5 @@ Answer = Union[
     AlarmsAnswer,
     RejectedAnswer,
     RunsAnswer,
+    SendAnswer,
 ]

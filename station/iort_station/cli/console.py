@@ -8,7 +8,7 @@ that change the direction of a line are shown so too, and no text is rich's mark
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from typing import Any
 
@@ -43,6 +43,11 @@ out, errors = Console(), Console(stderr=True)
 def print_json(value: Any) -> None:
     """Print a value as indented JSON; whole numbers of a table are integers."""
     out.print_json(json.dumps(value, default=_number))
+
+
+def tell(facts: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+    """Print what a verb has done: a line of JSON for a script, or a text."""
+    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
 
 
 def _number(value: Any) -> int | float:

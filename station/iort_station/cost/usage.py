@@ -9,7 +9,7 @@ from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cost.prices import MONTH_DAYS
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 
 # A car without round-trip pings still pings for its clock offset; a test compares this with the agent.
 CLOCK_PING_S = 30.0
@@ -62,10 +62,10 @@ class Usage:
     device_defender: bool = False
 
     def check(self) -> Usage:
-        """Return itself; raises `StationError` for an impossible value."""
+        """Return itself; raises `UsageError` for an impossible value."""
         for name, value in vars(self).items():
             if isinstance(value, (int, float)) and value < 0:
-                raise StationError(f"{name} must be at least 0, got {value}")
+                raise UsageError(f"{name} must be at least 0, got {value}")
         for name, holds, allowed in (
             ("robots", self.robots >= 1, "at least 1"),
             ("streams", self.streams >= 1, "at least 1"),
@@ -74,7 +74,7 @@ class Usage:
             ("hours_per_day", 0 < self.hours_per_day <= 24, "more than 0 and at most 24"),
         ):
             if not holds:
-                raise StationError(f"{name} must be {allowed}, got {getattr(self, name)}")
+                raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
         return self
 
     @property

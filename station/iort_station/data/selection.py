@@ -11,7 +11,7 @@ from iort_contract.catalog.derived import SOURCES
 from iort_contract.expression import ExpressionError, Node
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.times import Time, time_us
 
 
@@ -58,18 +58,18 @@ def select(
     fields: Sequence[str] | None = None,
     where: str | None = None,
 ) -> Selection:
-    """Make a selection from times and a condition as people write them; raises `StationError`."""
+    """Make a selection from times and a condition as people write them; raises `UsageError`."""
     now_us = time.time_ns() // 1000
     try:
         check_robot(robot)
         check_stream(stream)
         condition = expression.parse(where) if where is not None else None
     except (ContractError, ExpressionError) as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     start_us = None if start is None else time_us(start, now_us)
     end_us = None if end is None else time_us(end, now_us)
     if start_us is not None and end_us is not None and start_us > end_us:
-        raise StationError("the range ends before it starts")
+        raise UsageError("the range ends before it starts")
     return Selection(
         robot=robot,
         stream=stream,

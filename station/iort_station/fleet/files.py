@@ -15,9 +15,9 @@ from urllib3.exceptions import HTTPError
 
 from iort_contract.limits import ContractError
 from iort_contract.messages.files import FILES_PREFIX, parse_file_key
-from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 
 _CHUNK_BYTES = 1024 * 1024
 # DeleteObjects takes at most so many keys.
@@ -43,14 +43,11 @@ class StoredFile:
 def listed(
     cloud: Cloud, robot: str, *, start_us: int | None = None, end_us: int | None = None
 ) -> Iterator[StoredFile]:
-    """A robot's files that it last wrote in the range, both ends inclusive, in order of time.
+    """A robot's files that it last wrote in the range, in order of time. The end is exclusive.
 
-    Raises `StationError` for an invalid name.
+    Raises `UsageError` for an invalid name.
     """
-    try:
-        prefix = f"{FILES_PREFIX}{check_robot(robot)}/"
-    except ContractError as error:
-        raise StationError(str(error)) from error
+    prefix = f"{FILES_PREFIX}{registry.checked(robot)}/"
     # The key begins with the time, so only the range is listed.
     after = prefix if start_us is None else prefix + _day(start_us)
     pages = cloud.client("s3").get_paginator("list_objects_v2")
@@ -60,7 +57,7 @@ def listed(
                 key = parse_file_key(one["Key"])
             except ContractError:
                 continue  # not a file of a robot
-            if end_us is not None and key.second * 1_000_000 > end_us:
+            if end_us is not None and key.second * 1_000_000 >= end_us:
                 return
             if start_us is None or (key.second + 1) * 1_000_000 > start_us:
                 stored_s = one["LastModified"].timestamp()

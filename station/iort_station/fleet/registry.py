@@ -25,17 +25,17 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError, unknown
+from iort_station.errors import StationError, UsageError, unknown
 
 _serialize = TypeSerializer().serialize
 
 
 def checked(robot: str) -> str:
-    """Return a valid robot name; raises `StationError`."""
+    """Return a valid robot name; raises `UsageError`."""
     try:
         return check_robot(robot)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
 
 
 def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:

@@ -14,7 +14,7 @@ from iort_contract.catalog import derived
 from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
 from iort_station.fleet import certificates, registry
 from iort_station.fleet.bundle import Bundle, configure, write_bundle
 from iort_station.fleet.registry import listed
@@ -30,16 +30,14 @@ _MOST, _LEAST = 1e9, 1e-9
 
 
 def checked_vehicle(vehicle: Mapping[str, float]) -> dict[str, float]:
-    """Return valid vehicle parameters; raises `StationError`."""
+    """Return valid vehicle parameters; raises `UsageError`."""
     for name, value in vehicle.items():
         if name not in F1TENTH:
-            raise StationError(f"vehicle parameter must be one of {', '.join(F1TENTH)}, got {name}")
+            raise UsageError(f"vehicle parameter must be one of {', '.join(F1TENTH)}, got {name}")
         # NaN fails every comparison.
         if not abs(value) <= _MOST or (name == GAIN and abs(value) < _LEAST):
             no_zero = " and not 0" if name == GAIN else ""
-            raise StationError(
-                f"{name} must be a number from {-_MOST:g} to {_MOST:g}{no_zero}, got {value:g}"
-            )
+            raise UsageError(f"{name} must be a number from {-_MOST:g} to {_MOST:g}{no_zero}, got {value:g}")
     return dict(vehicle)
 
 

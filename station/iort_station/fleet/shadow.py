@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from email.utils import parsedate_to_datetime
 from typing import Any, NamedTuple, TypeVar
 
-from iort_contract.limits import ContractError
 from iort_contract.messages.shadow import (
     Desired,
     OverShare,
@@ -20,7 +19,7 @@ from iort_contract.messages.shadow import (
     decode_reported,
     nested,
 )
-from iort_contract.topics import SHADOW, check_robot
+from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -53,10 +52,7 @@ class Shadow:
     wrong, since robots judge commands by their time."""
 
     def __init__(self, cloud: Cloud, robot: str) -> None:
-        try:
-            self.robot = check_robot(robot)
-        except ContractError as error:
-            raise StationError(str(error)) from error
+        self.robot = registry.checked(robot)
         iot = cloud.client("iot")
         began_s = time.time()
         try:

@@ -12,7 +12,7 @@ import numpy as np
 
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.messages.page import Acknowledged, Answer, HistoryAnswer, RunsAnswer
+from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
 from iort_station import data
@@ -40,38 +40,38 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
         "tags": lambda _asked: {"tags": tags.listed(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
-        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
+        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(text(asked, "robot")))},
         "runs": lambda asked: _runs(cloud, asked),
         "history": lambda asked: history(cloud, asked),
         "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
         "dashboard": lambda asked: cloudwatch.dashboard(
-            cloud, _text(asked, "name"), minutes=_whole(asked, "minutes", 1, 14 * 24 * 60)
+            cloud, text(asked, "name"), minutes=whole(asked, "minutes", 1, 14 * 24 * 60)
         ),
         "log": lambda asked: cloudwatch_logs.rows(
             cloud,
-            _text(asked, "name"),
-            _whole(asked, "widget", 0, 500),
-            minutes=_whole(asked, "minutes", 1, 14 * 24 * 60),
+            text(asked, "name"),
+            whole(asked, "widget", 0, 500),
+            minutes=whole(asked, "minutes", 1, 14 * 24 * 60),
         ),
         "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
         "rejected": lambda _asked: alarms.rejected(cloud),
     }
 
 
-def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Acknowledged]]:
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
     """Every action, by its name."""
     return {
         "acknowledge": lambda asked: alarms.acknowledge(
-            cloud, _text(asked, "alarm"), _whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
-        )
+            cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
+        ),
     }
 
 
 def _runs(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
     """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
-    before_us = _whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
-    count = _whole(asked, "count", 1, _MOST_RUNS)
-    return runs(cloud, check_robot(_text(asked, "robot")), end_us=before_us, count=count)
+    before_us = whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
+    count = whole(asked, "count", 1, _MOST_RUNS)
+    return runs(cloud, check_robot(text(asked, "robot")), end_us=before_us, count=count)
 
 
 def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
@@ -81,12 +81,12 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     attachment, and the last value that is not null of everything else. Raises `StationError` for a request
     that cannot be answered.
     """
-    start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
-    rows = _whole(asked, "rows", 2, MAX_ROWS)
+    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    rows = whole(asked, "rows", 2, MAX_ROWS)
     if start_us >= end_us:
         raise StationError("the range must end after its start")
     summary = end_us - start_us > _SAMPLES_US
-    robot, stream = _text(asked, "robot"), _text(asked, "stream")
+    robot, stream = text(asked, "robot"), text(asked, "stream")
     found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
     columns = (
         _by_statistic(found.columns)
@@ -183,15 +183,17 @@ def _last_known(column: Column, starts: Any) -> Any:
     return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
 
 
-def _text(asked: Mapping[str, str], name: str) -> str:
+def text(asked: Mapping[str, str], name: str) -> str:
+    """A text that is not empty; raises `StationError`."""
     if not asked.get(name):
         raise StationError(f"the request must have the parameter {name}")
     return asked[name]
 
 
-def _whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
-    text = _text(asked, name)
+def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
+    """A whole number in the range; raises `StationError`."""
+    found = text(asked, name)
     # Sixteen digits are enough for every allowed number.
-    if not (text.isascii() and text.isdecimal()) or len(text) > 16 or not least <= int(text) <= most:
-        raise StationError(f"{name} must be a whole number from {least} to {most}, got {text[:40]!r}")
-    return int(text)
+    if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
+        raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
+    return int(found)

@@ -20,7 +20,7 @@ from iort_contract.track import Track, parse_track
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
@@ -59,6 +59,8 @@ def config(
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
     token: str = "",
     answers: bool = False,
+    actions: Iterable[str] = (),
+    key: str = "",
     track: Track | None = None,
 ) -> Config:
     """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
@@ -94,6 +96,8 @@ def config(
         "vehicles": known,
         "token": token,
         "answers": answers,
+        "actions": sorted(actions),
+        "key": key,
         "track": None if track is None else _track_map(track),
     }
 

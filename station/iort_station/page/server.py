@@ -16,19 +16,21 @@ import ipaddress
 import json
 import math
 import re
+import secrets
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
 from iort_contract.limits import ContractError
-from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.page import HEADERS, KEY_HEADER, PUBNUB_ORIGIN, security_policy
 from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
@@ -56,7 +58,8 @@ class PageServer(BackgroundServer):
     """The page's web server, in threads of its own.
 
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
-    from the parameters of the request. ``actions`` are those that change something: they need a POST. The
+    from the parameters of the request. ``actions`` are those that change something: they need a POST with
+    the page's own origin and the key of ``/config.json``. The
     server accepts a Host that is localhost, an address or one of ``names``, and no other. Raises
     `StationError` if the page is not built, if the port is in use, and for a configuration that it must not
     serve.
@@ -82,6 +85,8 @@ class PageServer(BackgroundServer):
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
         self._actions = {f"/{name}.json": action for name, action in (actions or {}).items()}
+        # A page elsewhere cannot read it.
+        self._key = secrets.token_urlsafe(32)
         self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
@@ -92,6 +97,8 @@ class PageServer(BackgroundServer):
             vehicles=vehicles,
             token=token,
             answers=bool(answers),
+            actions=actions or (),
+            key=self._key,
             track=track,
         )
         # Only these can be requested: no path reaches the file system.
@@ -174,6 +181,14 @@ class PageServer(BackgroundServer):
 
     async def _act(self, request: web.BaseRequest, action: Answer) -> web.StreamResponse:
         """Answer with the result of an action; its parameters are texts in a JSON object."""
+        # Every browser sends the origin with a POST, and no script can change it.
+        origin = urlsplit(request.headers.get("Origin", "")).netloc
+        known = secrets.compare_digest(
+            request.headers.get(KEY_HEADER, "").encode(errors="surrogateescape"), self._key.encode()
+        )
+        if not known or origin.lower() != request.headers["Host"].lower():
+            refused = "an action needs this page's own origin and key: reload the page"
+            return self._response(request, _json({"error": refused}), 403)
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:
             return self._response(
@@ -210,6 +225,14 @@ class PageServer(BackgroundServer):
                 body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
             )
         return web.Response(body=body.plain, status=status, headers=headers)
+
+
+def on_loopback(host: str) -> bool:
+    """Whether a server on this address answers to this machine only."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _takes_gzip(accepted: str) -> bool:

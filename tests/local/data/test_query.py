@@ -121,7 +121,7 @@ def test_the_command_draws_a_plot(embedded, noise, tmp_path):
     asked = ["plot", ROBOT, STREAM, "--last", "all", "--fields", "f0,f1", "--out", str(picture)]
     done = iort(*asked, "--kind", "distribution", embedded=embedded)
     assert done.returncode == 0, done.stderr
-    assert f"{N:,} samples" in done.stderr
+    assert f"{N:,} samples" in done.stdout
     assert picture.read_text().startswith("<?xml")
     done = iort(*asked[:-1], str(tmp_path / "where.svg"), "--kind", "trajectory", embedded=embedded)
     assert done.returncode == 1

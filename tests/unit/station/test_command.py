@@ -62,6 +62,14 @@ def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
     assert summary.endswith(".")
 
 
+@pytest.fixture
+def _files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("ride.csv", "ride.mcap", "ride.png"):
+        (tmp_path / name).touch()
+
+
+@pytest.mark.usefixtures("_files")
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
@@ -70,6 +78,9 @@ def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
         (["plot", "car", "vesc", "--out", "speed.gif"], 2, "must end in .pdf, .png, .svg"),
         (["--local", "--embedded", "nowhere.json", "robots", "list"], 1, "no embedded cloud is running"),
         (["querry"], 2, "Did you mean 'query'?"),
+        (["query", "car", "vesc", "--out", "ride.csv"], 1, "ride.csv exists: give another --out"),
+        (["export", "car", "vesc", "--out", "ride.mcap"], 1, "ride.mcap exists: give another --out"),
+        (["plot", "car", "vesc", "--out", "ride.png"], 1, "ride.png exists: give another --out"),
     ],
 )
 def test_wrong_use_ends_with_status_2(arguments, status, said, monkeypatch, capsys):
@@ -80,11 +91,17 @@ def test_wrong_use_ends_with_status_2(arguments, status, said, monkeypatch, caps
     assert said in capsys.readouterr().err
 
 
-def test_no_verb_shows_a_flag_as_a_boolean():
-    root = typer.main.get_command(app)
-    for verb in root.commands.values():
-        with typer.Context(verb.load(), info_name=verb.name) as context:
-            assert "bool" not in context.get_help()
+def every_command(commands):
+    for command in commands:
+        yield from every_command(command.commands.values()) if hasattr(command, "commands") else [command]
+
+
+def test_every_command_has_json_and_shows_no_flag_as_a_boolean():
+    verbs = typer.main.get_command(app).commands.values()
+    for command in every_command([verb.load() for verb in verbs]):
+        with typer.Context(command, info_name=command.name) as context:
+            assert "<bool>" not in context.get_help()
+            assert "--json" in context.get_help(), command.name
 
 
 class Terminal(io.StringIO):

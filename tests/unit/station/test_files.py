@@ -100,9 +100,9 @@ def test_a_robots_files_are_listed_by_time_across_pages(cloud, store, s3):
     [
         (None, None, "01234"),
         (NOON + 1, None, "1234"),
-        (NOON, NOON, "0"),
-        (None, NOON + 86_400, "01"),
-        (NOON + 86_400, NOON + 3 * 86_400, "123"),
+        (NOON, NOON + 1, "0"),
+        (None, NOON + 86_400, "0"),
+        (NOON + 86_400, NOON + 3 * 86_400, "12"),
         (NOON + 9 * 86_400, None, ""),
         (0, 5, ""),
     ],

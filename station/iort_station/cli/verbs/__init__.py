@@ -22,7 +22,7 @@ VERBS = {
     "page.site": "Upload the page to the stack iort-site, which serves it.",
     "operations.alarms": "List the alarms with what to do, or acknowledge them.",
     "operations.errors": "List rejected messages, or show one.",
-    "operations.replay_errors": "Put rejected messages back.",
+    "operations.replay_errors": "Process rejected recordings again.",
     "operations.adopt": "Copy batches of an old telemetry table.",
     "fleet.send": "Send a command and print the robot's answer.",
     "fleet.config": "Show or change a robot's settings.",

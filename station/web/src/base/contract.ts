@@ -8,6 +8,8 @@ export const GONE_S = 4.5;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
+export const MAX_LEASE_MS = 10000;
+export const KEY_HEADER = "X-Iort-Key";
 export const POSE_STREAM = "pose";
 export const LOG_STREAM = "log";
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
@@ -319,7 +321,7 @@ export interface TrackMap {
   readonly w_left_m: readonly number[];
 }
 
-/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
+/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
   readonly subscribe_key: string;
@@ -327,6 +329,8 @@ export interface Config {
   readonly tls: boolean;
   readonly token: string;
   readonly answers: boolean;
+  readonly actions: readonly string[];
+  readonly key: string;
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
   readonly track: TrackMap | null;
 }
@@ -391,6 +395,13 @@ export interface RunsAnswer {
 /** Answers ``dashboards``: their names. */
 export interface DashboardsAnswer {
   readonly dashboards: readonly string[];
+}
+
+/** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */
+export interface SendAnswer {
+  readonly accepted: boolean | null;
+  readonly reason: string;
+  readonly after_ms: number;
 }
 
 /** A field's values; with minimum and maximum if a row stands for many samples. */

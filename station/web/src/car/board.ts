@@ -1,6 +1,6 @@
 // A car's charts, which the viewer chooses and arranges: drag a chart by its grip, or move it with the arrow keys.
 
-import type { FieldTable } from "../base/contract";
+import type { FieldTable, TrackMap } from "../base/contract";
 import { el } from "../base/dom";
 import type { Linear } from "../base/format";
 import type { Robot } from "../live/robot";
@@ -19,6 +19,7 @@ export class Board {
 
   constructor(
     private readonly table: FieldTable,
+    private readonly track: TrackMap | null,
     private readonly changed: () => void,
   ) {
     this.set([...BOARD.keys()]);
@@ -66,7 +67,7 @@ export class Board {
   }
 
   private add(key: string): boolean {
-    const panel = panelOf(key, this.table);
+    const panel = panelOf(key, this.table, this.track);
     if (!panel) return false;
     panel.span(this.window_s);
     const grip = el("button", { type: "button", class: "grip", "aria-label": `Move ${panel.title}`, title: "Drag, or press the arrow keys" }, "\u283f");

@@ -1,14 +1,17 @@
 // What a car's board is made of: each panel finds its values in the car, and is hidden while the car has none.
 
-import type { FieldTable } from "../base/contract";
+import type { FieldTable, TrackMap } from "../base/contract";
 import { el } from "../base/dom";
 import { AS_SENT, linear, spec, type Linear } from "../base/format";
 import type { Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { BOARD, type DelaySpec, type LineSpec, type XYChartSpec } from "./car_charts";
 import { ChartPanel } from "../charts/chart_panel";
+import { edges } from "./track_map";
 import { windowLabel, WINDOWS } from "../charts/windows";
 import { XYChart, type Track } from "../charts/xy_chart";
+
+const MOST_POINTS = 4000;
 
 export interface BoardPanel {
   readonly title: string;
@@ -26,11 +29,11 @@ export interface BoardPanel {
 export const fieldKey = (stream: string, field: string): string => `${stream}/${field}`;
 
 /** The panel of a chart's or a field's key; undefined for a text that is neither. */
-export function panelOf(key: string, table: FieldTable): BoardPanel | undefined {
+export function panelOf(key: string, table: FieldTable, track: TrackMap | null): BoardPanel | undefined {
   const known = BOARD.get(key);
   if (known?.kind === "line") return new LinePanel(known, table);
   if (known?.kind === "delay") return new DelayPanel(known);
-  if (known) return new XYPanel(known);
+  if (known) return new XYPanel(known, track);
   const [stream, field, ...rest] = key.split("/");
   return stream && field && rest.length === 0 ? new FieldPanel(stream, field, table) : undefined;
 }
@@ -121,11 +124,14 @@ class XYPanel implements BoardPanel {
   private unit = "";
   private window_s = 0;
 
-  constructor(private readonly spec: XYChartSpec) {
-    const host = el("div", { class: "plot", "aria-hidden": "true" });
+  constructor(
+    private readonly spec: XYChartSpec,
+    track: TrackMap | null,
+  ) {
+    const host = el("div", { class: "plot" });
     this.title = spec.title;
     this.node = el("section", { class: "panel xy", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), this.note), host);
-    this.chart = new XYChart(host, { ...spec, x: () => spec.x + this.unit });
+    this.chart = new XYChart(host, { ...spec, x: () => spec.x + this.unit, ...(spec.map && track ? { ground: edges(track) } : {}) });
     this.span(WINDOWS[0]);
   }
 
@@ -162,6 +168,9 @@ class XYPanel implements BoardPanel {
 
 function track({ stream, x, y, as }: NonNullable<XYPanel["source"]>, from: number): Track {
   const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field)!, from);
-  const across = column(x);
-  return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };
+  const [across, up] = [column(x), column(y)];
+  // A long window has more points than the chart has pixels.
+  const step = Math.ceil(across.length / MOST_POINTS);
+  const thin = (values: Float64Array): Float64Array => (step > 1 ? values.filter((_, i) => (values.length - 1 - i) % step === 0) : values);
+  return { x: as === AS_SENT ? thin(across) : thin(across).map((value) => linear(value, as)), y: thin(up) };
 }

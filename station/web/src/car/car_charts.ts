@@ -41,6 +41,8 @@ export interface XYChartSpec extends Omit<XYChartOptions, "x"> {
   readonly title: string;
   /** The x axis is the motor's speed, shown as the car's speed if the car's parameters are known. */
   readonly speed?: boolean;
+  /** The x and y of a map: the track is drawn below. */
+  readonly map?: boolean;
   /** The two fields to draw; undefined for a stream without them. */
   readonly axes: (fields: ReadonlyMap<string, number>) => readonly [string, string] | undefined;
 }
@@ -156,6 +158,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
     kind: "xy",
     key: "trajectory",
     title: "Trajectory",
+    map: true,
     x: "x, m",
     y: "y, m",
     span: [2, 2],

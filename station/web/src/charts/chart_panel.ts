@@ -18,7 +18,7 @@ export interface Reading {
 export interface ChartPanelOptions {
   readonly title: string;
   readonly readings: readonly Reading[];
-  readonly chart: LiveChartOptions;
+  readonly chart: Omit<LiveChartOptions, "about">;
 }
 
 export class ChartPanel {
@@ -56,10 +56,15 @@ export class ChartPanel {
         ),
       ),
     );
-    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    const plot = el("div", { class: "plot" });
     this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
     this.chart = new LiveChart(plot, {
       ...chart,
+      about: {
+        title,
+        lines: chart.lines.map((_, i) => readings.find(({ line }) => line === i)?.label ?? ""),
+        write: (value) => `${number(value, readings[0]?.digits)} ${this.units[0]?.node.textContent ?? ""}`,
+      },
       onPoint: (point) => {
         this.hovered = point !== undefined;
         setAttribute(this.node, "data-hover", String(this.hovered));

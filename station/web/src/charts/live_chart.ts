@@ -2,10 +2,11 @@
 
 import uPlot from "uplot";
 import { markLabels, marks, WINDOWS } from "./windows";
-import { AS_SENT, linear, type Linear } from "../base/format";
+import { age, AS_SENT, linear, type Linear } from "../base/format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
+import { Spoken, type About } from "./spoken";
 
 export interface Line {
   /** The custom property of its colour. */
@@ -21,6 +22,8 @@ export interface LiveChartOptions {
   readonly span: number;
   /** The axis always holds zero. */
   readonly zero?: boolean;
+  /** Its title, its lines' names, and a value with its unit. */
+  readonly about: Pick<About, "title" | "lines" | "write">;
   /** Called with the values under the pointer and their age in seconds; undefined when it leaves. */
   readonly onPoint?: (point: { readonly ago: number; readonly values: readonly number[] } | undefined) => void;
 }
@@ -43,6 +46,7 @@ const shared = uPlot.sync("charts");
 
 export class LiveChart {
   private readonly plot: uPlot;
+  private readonly spoken: Spoken;
   private readonly offTheme: () => void;
   private shown: Shown | undefined;
   private as: Linear = AS_SENT;
@@ -105,6 +109,11 @@ export class LiveChart {
       this.data(0),
       host,
     );
+    this.spoken = new Spoken(host, this.plot, {
+      ...options.about,
+      range: () => `last ${age(this.window_s)}`,
+      at: (seconds) => `${age(this.right - seconds)} ago`,
+    });
     fit(host, this.plot, (visible) => {
       this.visible = visible;
       this.dirty = true;
@@ -153,6 +162,7 @@ export class LiveChart {
       this.plot.setData(data, false);
       this.plot.setScale("x", { min: right - this.window_s, max: right });
     });
+    this.spoken.refresh();
   }
 
   /** Draw again after a time without data. */

@@ -2,9 +2,13 @@
 
 import uPlot from "uplot";
 import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { setAttribute } from "../base/dom";
+import { number } from "../base/format";
 import { colour, onTheme } from "../base/theme";
+import { AGAIN_MS, extremes } from "./spoken";
 
 export interface XYChartOptions {
+  readonly title: string;
   /** A text, or a function that gives one when the chart is drawn. */
   readonly x: string | (() => string);
   readonly y: string;
@@ -14,6 +18,8 @@ export interface XYChartOptions {
   readonly zero?: boolean;
   /** Both axes have the same scale, as on a map. */
   readonly equal?: boolean;
+  /** The edges of the ground below the track; it is left out while the newest point is far from it. */
+  readonly ground?: readonly [Track, Track];
 }
 
 /** Points in the order of time, the newest last. */
@@ -29,16 +35,20 @@ export class XYChart {
   private readonly plot: uPlot;
   private readonly offTheme: () => void;
   private track: Track = { x: [], y: [] };
+  private grounded = false;
   private visible = true;
   private drawnAt = -Infinity;
   private ink = "";
   private paint = paint();
+  private writtenAt = -Infinity;
   private bounds: { x: [number, number]; y: [number, number] };
 
   constructor(
-    host: HTMLElement,
+    private readonly host: HTMLElement,
     private readonly options: XYChartOptions,
   ) {
+    host.setAttribute("role", "img");
+    this.write();
     this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
     this.ink = colour("--accent");
     const colours = () => this.paint;
@@ -98,11 +108,29 @@ export class XYChart {
       this.plot.setScale("y", { min: this.bounds.y[0], max: this.bounds.y[1] });
       this.plot.redraw(false, true);
     });
+    if (performance.now() - this.writtenAt >= AGAIN_MS) this.write();
+  }
+
+  /** Say in words what the chart shows. */
+  private write(): void {
+    this.writtenAt = performance.now();
+    const { title, x, y } = this.options;
+    const axes = [[typeof x === "string" ? x : x(), this.track.x], [y, this.track.y]] as const;
+    const figures = axes.map(([name, values]) => {
+      const { newest, least, most } = extremes(values);
+      return Number.isNaN(newest) ? `${name}: no values` : `${name}: newest ${number(newest, 2)}, minimum ${number(least, 2)}, maximum ${number(most, 2)}`;
+    });
+    setAttribute(this.host, "aria-label", `Chart ${title}. ${figures.join("; ")}.`);
   }
 
   private setBounds(): void {
-    const { span, zero = false, equal } = this.options;
+    const { span, zero = false, equal, ground } = this.options;
     let [x, y] = [extent(this.track.x), extent(this.track.y)];
+    this.grounded = ground !== undefined && this.near(ground);
+    if (ground && this.grounded) {
+      x = extent([...x, ...ground.flatMap((edge) => extent(edge.x))]);
+      y = extent([...y, ...ground.flatMap((edge) => extent(edge.y))]);
+    }
     if (equal) {
       const { width, height } = this.plot.bbox;
       const scale = Math.max((x[1] - x[0]) / width, (y[1] - y[0]) / height, span[0] / width, span[1] / height) * 1.08;
@@ -118,6 +146,32 @@ export class XYChart {
     this.bounds = { x, y };
   }
 
+  /** Whether the newest point is on the ground, or less than half its size away: another frame is elsewhere. */
+  private near(ground: readonly [Track, Track]): boolean {
+    return (["x", "y"] as const).every((axis) => {
+      const values = this.track[axis];
+      const [low, high] = extent(ground.flatMap((edge) => extent(edge[axis])));
+      return Math.abs((values[values.length - 1] ?? NaN) - (low + high) / 2) <= high - low;
+    });
+  }
+
+  private drawGround(plot: uPlot, [left, right]: readonly [Track, Track]): void {
+    const { ctx } = plot;
+    ctx.beginPath();
+    for (const { x, y } of [left, right]) {
+      for (let i = 0; i < x.length; i += 1) {
+        const [px, py] = [plot.valToPos(x[i]!, "x", true), plot.valToPos(y[i]!, "y", true)];
+        if (i === 0) ctx.moveTo(px, py);
+        else ctx.lineTo(px, py);
+      }
+    }
+    ctx.fillStyle = this.paint.grid;
+    ctx.fill("evenodd");
+    ctx.strokeStyle = this.paint.text;
+    ctx.lineWidth = uPlot.pxRatio;
+    ctx.stroke();
+  }
+
   private drawTrack(plot: uPlot): void {
     const { x, y } = this.track;
     const { ctx } = plot;
@@ -126,6 +180,7 @@ export class XYChart {
     ctx.beginPath();
     ctx.rect(left, top, width, height);
     ctx.clip();
+    if (this.grounded) this.drawGround(plot, this.options.ground!);
     ctx.lineWidth = 1.75 * uPlot.pxRatio;
     ctx.lineJoin = "round";
     // A few shades from old to new: a stroke for each point would be slow.

@@ -58,6 +58,7 @@ export class Fleet {
     robot.takenAt = Math.max(...[...robot.streams.values()].map((each) => each.takenAt));
     robot.version += 1;
     robot.logFault(stream, this.table, at);
+    robot.logLine(stream);
     const { received_ms, lambda_us, offset_us } = update.hops;
     const sent_us = update.hops.sent_us + offset_us;
     const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, pubnub_us - lambda_us, wall_us - pubnub_us];

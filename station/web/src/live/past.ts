@@ -1,6 +1,6 @@
 // Fills the charts of a watched car with what was recorded before this page heard it, from the page's server.
 
-import type { Config, HistoryAnswer } from "../base/contract";
+import { LOG_STREAM, type Config, type HistoryAnswer } from "../base/contract";
 import { now } from "../base/clock";
 import { ask, AnswerError } from "../server/answers";
 import type { Robot } from "./robot";
@@ -30,6 +30,8 @@ export class Past {
     if (!robot || !this.config.answers) return;
     const from = now() - Math.max(LEAST_S, back_s);
     for (const stream of robot.streams.values()) {
+      // Its lines are texts: car/agent_log.ts.
+      if (stream.name === LOG_STREAM) continue;
       const heard = stream.history.start;
       const to = this.asked.get(stream) ?? heard;
       if (!(from < to - 1)) continue;

@@ -1,7 +1,8 @@
 // One car: its streams, the delays and the faults. Nothing here touches the page; times are those of base/clock.ts.
 
-import { GONE_S, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
+import { GONE_S, LOG_STREAM, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
 import { BOUNDS, DEEP_S, deepRows, MEDIAN_S, WINDOW_S } from "./bounds";
+import { lineOf, type Line } from "./lines";
 import { Ring } from "./ring";
 import type { Stream } from "./stream";
 
@@ -28,6 +29,8 @@ export class Robot {
   readonly delays = new Ring(2 + LEGS.length, BOUNDS.delays, WINDOW_S);
   /** The newest last. */
   readonly faults: Fault[] = [];
+  /** The agent's warnings and errors, the newest last. */
+  readonly lines: Line[] = [];
   heardAt = -Infinity;
   takenAt = -Infinity;
   version = 0;
@@ -75,6 +78,14 @@ export class Robot {
     const skip = times.length > 0 && times[0]! < from ? 1 : 0;
     if (times.length - skip === 0) return undefined;
     return asDelay((column) => median(this.delays.column(column, from).subarray(skip)));
+  }
+
+  /** Keep the newest line of the agent's log. */
+  logLine(stream: Stream): void {
+    const line = stream.name === LOG_STREAM ? lineOf(stream.t_us, (name) => stream.sample.get(name)) : undefined;
+    if (!line) return;
+    this.lines.push(line);
+    if (this.lines.length > BOUNDS.lines) this.lines.shift();
   }
 
   /** Update the fault log: an entry is from the first to the last sample that reports it. */

@@ -1,5 +1,7 @@
 // Questions and requests to the server that serves the page; the answers' types are in contract.ts.
 
+import { KEY_HEADER, type Config } from "../base/contract";
+
 export class AnswerError extends Error {}
 
 type Parameters = Readonly<Record<string, string>>;
@@ -11,7 +13,10 @@ export async function ask<T>(name: string, parameters: Parameters, signal?: Abor
 
 /** Have the server change something; throws `AnswerError` if it does not, or if the change is refused. */
 export async function act<T>(name: string, parameters: Parameters): Promise<T> {
-  return answered(`${name}.json`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(parameters) });
+  // Asked each time, because a server that was started again has another key.
+  const { key } = await answered<Config>("config.json", { cache: "no-store" });
+  const headers = { "Content-Type": "application/json", [KEY_HEADER]: key };
+  return answered(`${name}.json`, { method: "POST", headers, body: JSON.stringify(parameters) });
 }
 
 async function answered<T>(address: string, request: RequestInit): Promise<T> {

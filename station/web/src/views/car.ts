@@ -1,9 +1,10 @@
 // One car in full: gauges, the viewer's charts, the delay by hop, faults, and every field of every stream.
 
-import type { Config, FieldTable } from "../base/contract";
+import { LOG_STREAM, type Config, type FieldTable } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { age, AS_SENT, linear, type Linear } from "../base/format";
 import { setAddress, type Query } from "../base/route";
+import { AgentLog } from "../car/agent_log";
 import { Board } from "../car/board";
 import { GAUGES } from "../car/car_charts";
 import { Gauge } from "../charts/gauge";
@@ -14,6 +15,7 @@ import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
+import { Commands } from "../car/commands";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
 import { StreamSection } from "../car/field_tiles";
@@ -31,6 +33,8 @@ export class CarView {
   private readonly board: Board;
   private readonly tools: BoardTools;
   private readonly past: Past;
+  private readonly commands = new Commands();
+  private readonly log: AgentLog;
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
@@ -50,9 +54,10 @@ export class CarView {
     changed: () => void,
   ) {
     this.past = new Past(config);
+    this.log = new AgentLog(config);
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
-    this.board = new Board(table, () => this.tools.arranged());
+    this.board = new Board(table, config.track, () => this.tools.arranged());
     this.tools = new BoardTools(this.board, table, () => {
       this.drawn = -1;
       setAddress({ view: "car", robot: this.name, query: this.query });
@@ -64,7 +69,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node)),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(config.actions.includes("send") ? [this.commands.node] : []))),
       this.streams,
     );
   }
@@ -83,6 +88,8 @@ export class CarView {
       return;
     }
     this.name = name;
+    this.commands.of(name);
+    this.log.of(name);
     this.tools.read(query);
     this.drawn = -1;
   }
@@ -112,6 +119,7 @@ export class CarView {
     this.gaugeRow.hidden = vesc === undefined;
     const ordered = [...robot.streams.values()].sort((a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name));
     for (const stream of ordered) {
+      if (stream.name === LOG_STREAM) continue;
       let section = this.sections.get(stream);
       if (!section) {
         const except: ReadonlySet<string> = stream === vesc ? gauged : new Set();
@@ -154,6 +162,7 @@ export class CarView {
     const screens = this.screens.column(1, now - MEDIAN_S);
     this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);
     this.faults.refresh(robot);
+    this.log.refresh(robot);
     const fresh = robot.freshness(now);
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
     const texts = {

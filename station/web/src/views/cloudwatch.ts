@@ -4,6 +4,7 @@ import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract"
 import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { clockTime, dayTime, NOTHING, number, zone } from "../base/format";
+import { route } from "../base/route";
 import { LogTable } from "../widgets/log_table";
 import { RangeChart, type Curve } from "../charts/range_chart";
 
@@ -157,8 +158,7 @@ function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
   return el(
     "li",
     { "data-alarm": name, "data-state": state, title: [about, since, reason].filter(Boolean).join("\n") },
-    name,
-    ...(state === "OK" ? [] : [" ", el("b", {}, STATES[state])]),
+    ...(state === "ALARM" ? [el("a", { href: route({ view: "alarms" }) }, name, " ", el("b", {}, STATES[state]))] : state === "OK" ? [name] : [name, " ", el("b", {}, STATES[state])]),
   );
 }
 

@@ -54,10 +54,10 @@ export class StatusBar {
     const raised = this.alarms.raised(at);
     const fresh = raised.filter((alarm) => alarm.fresh).length;
     const badge = byId("alarms");
-    badge.hidden = raised.length === 0;
     setAttribute(badge, "data-fresh", String(fresh > 0));
     setAttribute(badge, "aria-label", `${raised.length} raised, ${fresh} of them not acknowledged`);
-    write("alarms", String(raised.length));
+    // It keeps its room, so that nothing moves when it comes and goes.
+    write("alarms", raised.length > 0 ? String(raised.length) : "");
   }
 
   private announce(link: LinkState, at: number): void {

@@ -7,16 +7,17 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.options import SHORT, Force, From, Last, Range, Robot, To, to_file
+from iort_station.cli.console import tell
+from iort_station.cli.options import SHORT, AsJson, Force, From, Last, Range, Robot, To, to_file
 from iort_station.cli.progress import reading
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
 
 commands = typer.Typer()
 
 
-@commands.command("export")
+@commands.command("export", epilog=examples("export car7 vesc --last 10m --out car7.mcap"))
 def export(
     context: typer.Context,
     robot: Robot,
@@ -26,6 +27,7 @@ def export(
     end: To = None,
     last: Last = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
 
@@ -55,3 +57,4 @@ def export(
             for stream in streams:
                 check_there(cloud, robot, stream)
             raise StationError(f"there are no samples to export; {out} is not written")
+    tell({"file": str(out), "messages": written}, f"{out}: {written:,} messages", as_json=as_json)

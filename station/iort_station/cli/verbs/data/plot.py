@@ -9,8 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
+from iort_station.cli.console import tell
 from iort_station.cli.options import (
     SHORT,
+    AsJson,
     Every,
     Fields,
     Force,
@@ -25,7 +27,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
@@ -48,7 +50,13 @@ class Align(str, Enum):
     start = "start"
 
 
-@commands.command("plot")
+@commands.command(
+    "plot",
+    epilog=examples(
+        "plot car7 vesc --last 10m --fields speed_mps --out speed.png",
+        "plot car7 pose --kind trajectory --last 10m --out track.png",
+    ),
+)
 def plot(
     context: typer.Context,
     robot: Robot,
@@ -72,6 +80,7 @@ def plot(
     where: Where = None,
     every: Every = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
@@ -107,7 +116,8 @@ def plot(
     else:
         figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
     plots.save(figure, out, force=force)
-    say(f"{out}: {sum(len(run.result) for run in drawn):,} samples")
+    count = sum(len(run.result) for run in drawn)
+    tell({"file": str(out), "samples": count}, f"{out}: {count:,} samples", as_json=as_json)
 
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:

@@ -28,7 +28,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import UsageError
 from iort_station.output import check_free, whole
 
@@ -54,7 +54,14 @@ class On(str, Enum):
     lambda_ = "lambda"
 
 
-@commands.command("query")
+@commands.command(
+    "query",
+    epilog=examples(
+        "query car7 vesc --last 10m --fields speed_mps,voltage_input",
+        "query car7 vesc --last 1h --where 'speed_mps > 1.2' --every 1s",
+        "query car7 vesc --last 7d --format parquet --out car7.parquet",
+    ),
+)
 def query(
     context: typer.Context,
     robot: Robot,

@@ -11,7 +11,7 @@ from rich.table import Table
 from iort_contract.messages.page import Run
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.data.runs import runs as find
 from iort_station.operations import audit
@@ -23,9 +23,7 @@ commands = typer.Typer()
 Gaps = dict[tuple[str, str], list[Missing]]
 
 
-@commands.command(
-    "runs", epilog="Example: iort runs car7 --last 7d --gaps lists the runs of a week, with what is missing"
-)
+@commands.command("runs", epilog=examples("runs car7", "runs car7 --last 7d --gaps"))
 def runs(
     context: typer.Context,
     robot: Robot,

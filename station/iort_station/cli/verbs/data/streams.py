@@ -10,16 +10,14 @@ from rich.table import Table
 
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.words import examples
 from iort_station.data.overview import StreamOverview, overview
 from iort_station.times import between, iso_s
 
 commands = typer.Typer()
 
 
-@commands.command(
-    "streams",
-    epilog="Example: iort streams car7 shows what to ask for in iort query car7 vesc --fields speed",
-)
+@commands.command("streams", epilog=examples("streams car7"))
 def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> None:
     """List a robot's streams: their fields with units, their runs, their first and last sample.
 

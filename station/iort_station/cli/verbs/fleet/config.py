@@ -15,6 +15,7 @@ from iort_contract.messages.shadow import Rejection
 from iort_contract.tables import ONLINE
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.fleet.shadow import Shadow, State, answered
@@ -26,7 +27,9 @@ _WITHDRAWN_S = 3.0
 _OFFLINE_S = 2.0
 
 
-@commands.command("config", epilog="Example: iort config car7 live.rate_hz=5 fields.vesc=speed,fault_code")
+@commands.command(
+    "config", epilog=examples("config car7", "config car7 live.rate_hz=5 fields.vesc=speed,fault_code")
+)
 def config(
     context: typer.Context,
     robot: Robot,

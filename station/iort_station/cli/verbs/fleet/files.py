@@ -15,6 +15,7 @@ from rich.progress import DownloadColumn, TransferSpeedColumn
 from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
 from iort_station.cli.progress import bar
+from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import files, registry
@@ -28,7 +29,7 @@ commands = typer.Typer(
 _Name = Annotated[str, typer.Option(help="Only names that match, for example '*.bag'.")]
 
 
-@commands.command("list")
+@commands.command("list", epilog=examples("files list car7 --name '*.bag' --last 7d"))
 def list_(
     context: typer.Context,
     robot: Robot,
@@ -50,7 +51,7 @@ def list_(
         console.errors.print("no matching files", soft_wrap=True)
 
 
-@commands.command("get")
+@commands.command("get", epilog=examples("files get car7 --name '*.bag' --out bags"))
 def get(
     context: typer.Context,
     robot: Robot,
@@ -89,14 +90,14 @@ def get(
         console.out.print(text, soft_wrap=True)
 
 
-@commands.command("empty")
-def empty(context: typer.Context, yes: Yes = False) -> None:
+@commands.command("empty", epilog=examples("files empty --yes"))
+def empty(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Delete every file of every robot, and the results of queries. Do so before you destroy the stacks."""
     cloud = context.obj.cloud()
     agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
     counts: list[int] = []
     files.empty(cloud, counts.append)
-    console.out.print(f"{sum(counts)} deleted")
+    console.tell({"deleted": sum(counts)}, f"{sum(counts)} deleted", as_json=as_json)
 
 
 def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[StoredFile]:

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from iort_contract.catalog.derived import F1TENTH
-from iort_station.cli.console import errors, out
-from iort_station.cli.options import Robot, Yes, agreed, to_file
+from iort_station.cli.console import errors, tell
+from iort_station.cli.options import AsJson, Robot, Yes, agreed, to_file
+from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
 
@@ -19,20 +20,24 @@ _Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
 _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
 
-@commands.command("add")
+@commands.command("add", epilog=examples("robots add car8 --out robots"))
 def add(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The robot's name.")],
     folder: Annotated[Path, to_file("Where to write the robot's folder of configuration and keys.")] = Path(),
     speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+    as_json: AsJson = False,
 ) -> None:
     """Register a robot and write its folder: car.yaml, certificate and key."""
     bundle = robots.add(context.obj.cloud(), name, out=folder, vehicle=_vehicle(speed_to_erpm_gain))
-    out.print(f"{name} is registered. Copy {bundle.folder} to it, then run there:\n")
-    out.print(f"  iort-agent run --config {bundle.folder.name}/car.yaml")
+    text = (
+        f"{name} is registered. Copy {bundle.folder} to it, then run there:\n\n"
+        f"  iort-agent run --config {bundle.folder.name}/car.yaml"
+    )
+    tell({"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)}, text, as_json=as_json)
 
 
-@commands.command("register")
+@commands.command("register", epilog=examples("robots register car20 car21 --days 7"))
 def register(
     context: typer.Context,
     names: Annotated[list[str], typer.Argument(help="The robots' names.")],
@@ -41,6 +46,7 @@ def register(
     ] = None,
     days: Annotated[float, typer.Option(help="How many days the name can be claimed.", min=0)] = claims.DAYS,
     speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+    as_json: AsJson = False,
 ) -> None:
     """Pre-register names. Any robot with one of the fleet's lasting claims can claim each name once."""
     if serial is not None and len(names) != 1:
@@ -48,15 +54,16 @@ def register(
     cloud, vehicle = context.obj.cloud(), _vehicle(speed_to_erpm_gain)
     for name in names:
         claims.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
-        out.print(f"{name} is expected for {days:g} days")
+        tell({"robot": name, "days": days}, f"{name} is expected for {days:g} days", as_json=as_json)
 
 
-@commands.command("claim")
+@commands.command("claim", epilog=examples("robots claim car9 --out claim-car9"))
 def claim(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
     folder: _ClaimFolder = Path("claim"),
     lasting: Annotated[bool, typer.Option(help="Valid until revoked, instead of five minutes.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a provisioning claim, which the robot exchanges for a certificate of its own key.
 
@@ -66,11 +73,14 @@ def claim(
     if name is None and not lasting:
         raise UsageError("give the robot's name, or --lasting for a claim of many robots")
     path = claims.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
-    out.print(f"Copy {folder} to the robot, then run there:\n")
-    out.print(f"  iort-agent provision --config {folder.name}/{path.name}")
+    text = (
+        f"Copy {folder} to the robot, then run there:\n\n"
+        f"  iort-agent provision --config {folder.name}/{path.name}"
+    )
+    tell({"robot": name, "folder": str(folder), "claim": str(path)}, text, as_json=as_json)
 
 
-@commands.command("rotate")
+@commands.command("rotate", epilog=examples("robots rotate car7 --out claim-car7 --no-wait"))
 def rotate(
     context: typer.Context,
     name: Robot,
@@ -82,6 +92,7 @@ def rotate(
     settled_s: Annotated[
         float, typer.Option(help="Seconds that the robot must be connected with the new one.", min=0)
     ] = rotation.SETTLED_S,
+    as_json: AsJson = False,
 ) -> None:
     """Give a robot a new key and certificate; revoke the old one after the new one is in use.
 
@@ -91,19 +102,24 @@ def rotate(
     if not finish:
         registry.get(cloud, name)
         path = claims.claim(cloud, name, out=folder)
-        out.print(f"Copy {folder} to {name} within five minutes, then run there:\n")
-        out.print(f"  iort-agent renew --config car.yaml --claim {folder.name}/{path.name}\n")
+        text = (
+            f"Copy {folder} to {name} within five minutes, then run there:\n\n"
+            f"  iort-agent renew --config car.yaml --claim {folder.name}/{path.name}\n"
+        )
+        tell({"robot": name, "folder": str(folder), "claim": str(path)}, text, as_json=as_json)
     if finish or wait:
         with errors.status("waiting") as status:
             old = rotation.finish(cloud, name, settled_s=settled_s, progress=status.update)
-        out.print(f"{name} has settled with its new certificate; revoked: {len(old)}")
+        text = f"{name} has settled with its new certificate; revoked: {len(old)}"
+        tell({"robot": name, "revoked": len(old)}, text, as_json=as_json)
 
 
-@commands.command("revoke-claims")
-def revoke_claims(context: typer.Context, yes: Yes = False) -> None:
+@commands.command("revoke-claims", epilog=examples("robots revoke-claims --yes"))
+def revoke_claims(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
     agreed("Revoke every lasting claim?", yes=yes)
-    out.print(f"lasting claims revoked: {claims.revoke_all(context.obj.cloud())}")
+    count = claims.revoke_all(context.obj.cloud())
+    tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 
 def _vehicle(speed_to_erpm_gain: float) -> dict[str, float]:

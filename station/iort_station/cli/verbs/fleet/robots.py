@@ -29,11 +29,11 @@ from iort_contract.tables import (
     STREAMS,
 )
 from iort_station.cli import completion
-from iort_station.cli.console import Console, errors, out, print_json
+from iort_station.cli.console import Console, errors, out, print_json, tell
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import UsageError
 from iort_station.fleet import certificates, claims, registry, robots, shadow
 from iort_station.times import iso_s, stamped, time_us
@@ -45,7 +45,7 @@ commands.add_typer(tags.commands)
 _PIPE_WIDTH = 10_000
 
 
-@commands.command("set")
+@commands.command("set", epilog=examples("robots set car7 speed_to_erpm_gain=4614 --last 7d"))
 def set_(
     context: typer.Context,
     name: Robot,
@@ -63,6 +63,7 @@ def set_(
     wait: Annotated[
         bool, typer.Option(help="Wait a minute first. --no-wait is for a robot that was silent for a minute.")
     ] = True,
+    as_json: AsJson = False,
 ) -> None:
     """Correct a robot's vehicle parameters, and recompute the speed in its summaries.
 
@@ -75,7 +76,8 @@ def set_(
     before = registry.set_vehicle(cloud, name, vehicle)
     for key, value in vehicle.items():
         was = f"{before[key]:.12g}" if key in before else "not set"
-        out.print(f"{name}: {key} {value:.12g}, was {was}", soft_wrap=True)
+        facts = {"robot": name, "parameter": key, "value": value, "was": before.get(key)}
+        tell(facts, f"{name}: {key} {value:.12g}, was {was}", as_json=as_json)
     # numpy takes longer to load than most commands to run.
     from iort_station.operations import recompute  # noqa: PLC0415 - see above
 
@@ -86,14 +88,15 @@ def set_(
     for stream in streams:
         with reading(f"{name} {stream}", from_us, time.time_ns() // 1000) as progress:
             done = recompute.recompute(cloud, name, stream, from_us, progress=progress)
-        out.print(f"{name} {stream}: {done.seconds:,} seconds recomputed", soft_wrap=True)
+        facts = {"robot": name, "stream": stream, "seconds": done.seconds, "left_out": done.left_out}
+        tell(facts, f"{name} {stream}: {done.seconds:,} seconds recomputed", as_json=as_json)
         if done.left_out:
             say(f"{done.left_out} stored items are in no summary: not a batch, or too many samples")
     if not streams:
-        out.print(f"{name}: 0 seconds recomputed: no summary has a speed", soft_wrap=True)
+        say(f"{name}: 0 seconds recomputed: no summary has a speed")
 
 
-@commands.command("list")
+@commands.command("list", epilog=examples("robots list"))
 def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
     rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
@@ -113,7 +116,7 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
 
 
-@commands.command("show")
+@commands.command("show", epilog=examples("robots show car7"))
 def show(
     context: typer.Context,
     name: Robot,
@@ -164,7 +167,7 @@ def show(
     out.print(table)
 
 
-@commands.command("remove")
+@commands.command("remove", epilog=examples("robots remove car8 --yes"))
 def remove(
     context: typer.Context,
     name: Annotated[
@@ -174,6 +177,7 @@ def remove(
         bool, typer.Option("--all", help="Remove every robot and lasting claim, before `make destroy`.")
     ] = False,
     yes: Yes = False,
+    as_json: AsJson = False,
 ) -> None:
     """Revoke a robot's certificates, end its session and forget it. Its data stays."""
     if everything == (name is not None):
@@ -183,14 +187,15 @@ def remove(
         registry.get(cloud, name)
         agreed(f"Remove {name} and revoke its certificates?", yes=yes)
         robots.remove(cloud, name)
-        out.print(f"{name} is removed")
+        tell({"removed": name}, f"{name} is removed", as_json=as_json)
         return
     names = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
     agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
     for one in names:
         robots.remove(cloud, one)
-        out.print(f"{one} is removed")
-    out.print(f"lasting claims revoked: {claims.revoke_all(cloud)}")
+        tell({"removed": one}, f"{one} is removed", as_json=as_json)
+    count = claims.revoke_all(cloud)
+    tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 
 def _parameter(text: str) -> tuple[str, float]:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import json
-import secrets
-import time
 from typing import Annotated, Any
 
 import typer
 
-from iort_contract.limits import ContractError
-from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS, Command, encode_command
-from iort_contract.topics import ACCEPTED, CMD, build_topic
+from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS
+from iort_contract.topics import ACCEPTED
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet.shadow import Shadow, outcome
+from iort_station.fleet import commands as fleet_commands
 
 commands = typer.Typer()
 
 
-@commands.command("send")
+@commands.command("send", epilog=examples("""send car7 drive '{"drive": {"speed": 1.0}}' --lease-ms 500"""))
 def send(
     context: typer.Context,
     robot: Robot,
@@ -34,8 +32,10 @@ def send(
     ] = None,
     valid_ms: Annotated[
         int, typer.Option(min=1, max=MAX_VALID_MS, help="The robot rejects it if it arrives later than this.")
-    ] = 2_000,
-    seconds: Annotated[float, typer.Option(min=0, help="How long to wait for the robot's answer.")] = 10.0,
+    ] = fleet_commands.VALID_MS,
+    seconds: Annotated[
+        float, typer.Option(min=0, help="How long to wait for the robot's answer.")
+    ] = fleet_commands.ANSWER_S,
     as_json: AsJson = False,
 ) -> None:
     """Send a command and print the robot's answer.
@@ -43,27 +43,12 @@ def send(
     Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own,
     which takes over from earlier ones.
     """
+    asked = _message(message)
     cloud = context.obj.cloud()
-    shadow = Shadow(cloud, robot)
-    now_us = time.time_ns() // 1000
-    try:
-        topic = build_topic(CMD, robot, name, cloud.namespace)
-        command = Command(
-            session=secrets.token_hex(8),
-            started_us=now_us,
-            seq=0,
-            sent_us=now_us,
-            valid_ms=valid_ms,
-            message=_message(message),
-            lease_ms=lease_ms,
-            answer=True,
-        )
-        payload = encode_command(command)
-    except ContractError as error:
-        raise StationError(str(error)) from error
-    shadow.data.publish(topic=topic, qos=1, payload=payload)
     with errors.status(f"waiting for {robot}"):
-        said = shadow.wait(lambda state: outcome(state, name, command.session, command.seq), seconds)
+        command, said = fleet_commands.send(
+            cloud, robot, name, asked, lease_ms=lease_ms, valid_ms=valid_ms, seconds=seconds
+        )
     if as_json:
         sent = {"robot": robot, "command": name, "session": command.session, "seq": command.seq}
         print_json({**sent, "outcome": said})

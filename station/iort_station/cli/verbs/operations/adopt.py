@@ -6,13 +6,11 @@ from typing import Annotated
 
 import typer
 
-from iort_contract.limits import ContractError
-from iort_contract.topics import check_robot
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot
 from iort_station.cli.progress import bar
-from iort_station.cli.words import say
-from iort_station.errors import StationError
+from iort_station.cli.words import examples, say
+from iort_station.fleet import registry
 from iort_station.recordings import adopt
 from iort_station.recordings.adopt import Adoption
 
@@ -21,7 +19,7 @@ commands = typer.Typer()
 _LISTED = 20
 
 
-@commands.command("adopt")
+@commands.command("adopt", epilog=examples("adopt telemetry-restored --dry-run"))
 def adopt_(
     context: typer.Context,
     table: Annotated[
@@ -34,7 +32,7 @@ def adopt_(
     robot: OneRobot = None,
     units: Annotated[
         int,
-        typer.Option(min=1, help="Write units (1 KB) a second. A stream takes 1,000, its robot's included."),
+        typer.Option(min=1, help="Speed in write units of DynamoDB (1 KB) a second. A stream takes 1,000."),
     ] = adopt.UNITS_PER_S,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -45,10 +43,7 @@ def adopt_(
     status 1 if some items cannot be adopted; each is printed with its reason. See docs/how-to/upgrading.md.
     """
     cloud = context.obj.cloud()
-    try:
-        name = None if robot is None else check_robot(robot)
-    except ContractError as error:
-        raise StationError(str(error)) from error
+    name = None if robot is None else registry.checked(robot)
     source, count = adopt.source_table(cloud, table)
     with bar(f"reading {source}", count or None) as progress:
         done = adopt.adopt(cloud, source, robot=name, units_per_s=units, dry_run=dry_run, progress=progress)

@@ -11,7 +11,7 @@ from rich.text import Text
 from iort_contract.messages.page import AlarmEntry
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.errors import StationError
 from iort_station.operations import alarms
 from iort_station.times import iso_s
@@ -25,7 +25,7 @@ _MORE = {
 }
 
 
-@commands.command("alarms")
+@commands.command("alarms", epilog=examples("alarms", "alarms --all"))
 def alarms_(
     context: typer.Context,
     every: Annotated[bool, typer.Option("--all", help="Also the alarms that are not raised.")] = False,

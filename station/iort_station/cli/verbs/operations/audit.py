@@ -15,8 +15,9 @@ from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.words import examples
 from iort_station.data import inventory
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
 from iort_station.operations import accounts, audit
 from iort_station.operations.audit import Audit
 from iort_station.times import duration_us, iso, iso_s, stamped
@@ -26,7 +27,7 @@ commands = typer.Typer()
 _LISTED = 20
 
 
-@commands.command("audit")
+@commands.command("audit", epilog=examples("audit car7 --last 1h"))
 def audit_(
     context: typer.Context,
     robot: Robot,
@@ -41,9 +42,11 @@ def audit_(
     start: From = None,
     end: To = None,
     last: Last = None,
-    late: Annotated[str, typer.Option(help="A batch that is slower than this is late.")] = "5s",
+    late: Annotated[
+        str, typer.Option(help="Count a batch as late if it took so much longer than the fastest.")
+    ] = "5s",
     from_start: Annotated[
-        bool, typer.Option("--from-start", help="Count numbers before the first stored one as missing.")
+        bool, typer.Option("--from-start", help="Count batches before the first stored one as missing.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -59,7 +62,7 @@ def audit_(
         check_robot(robot)
         names = [check_stream(name) for name in streams or ()] or inventory.known(cloud, robot)
     except ContractError as error:
-        raise StationError(str(error)) from error
+        raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
     found, now_us = [], time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)

@@ -14,6 +14,7 @@ from rich.table import Table
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
+from iort_station.cli.words import examples
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.car import as_configured
 from iort_station.cost.deployed import as_deployed
@@ -26,17 +27,28 @@ commands = typer.Typer()
 _DEFAULT = Usage()
 
 
-@commands.command("cost")
+@commands.command("cost", epilog=examples("cost --robots 20 --hours-per-day 2"))
 def cost_(
     context: typer.Context,
     robots: Annotated[int, typer.Option(help="How many robots.")] = 1,
-    rate_hz: Annotated[float | None, typer.Option(help="Samples a second, of each stream.")] = None,
-    streams: Annotated[int | None, typer.Option(help="Streams from a robot's sources.")] = None,
-    live_hz: Annotated[float | None, typer.Option(help="Live messages a second.")] = None,
-    batch_s: Annotated[
-        float | None, typer.Option(help="Seconds that a batch spans; 0 sends each sample alone.")
+    rate_hz: Annotated[
+        float | None, typer.Option(help=f"Samples a second, of each stream. Default: {_DEFAULT.rate_hz:g}.")
     ] = None,
-    ping_hz: Annotated[float | None, typer.Option(help="Pings a second over each path.")] = None,
+    streams: Annotated[
+        int | None, typer.Option(help=f"Streams from a robot's sources. Default: {_DEFAULT.streams}.")
+    ] = None,
+    live_hz: Annotated[
+        float | None, typer.Option(help=f"Live messages a second. Default: {_DEFAULT.live_hz:g}.")
+    ] = None,
+    batch_s: Annotated[
+        float | None,
+        typer.Option(
+            help=f"Seconds that a batch spans; 0 sends each sample alone. Default: {_DEFAULT.batch_s:g}."
+        ),
+    ] = None,
+    ping_hz: Annotated[
+        float | None, typer.Option(help=f"Pings a second over each path. Default: {_DEFAULT.ping_hz:g}.")
+    ] = None,
     hours_per_day: Annotated[
         float, typer.Option(help="Hours a robot drives a day.")
     ] = _DEFAULT.hours_per_day,

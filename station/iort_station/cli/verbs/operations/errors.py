@@ -11,6 +11,7 @@ from rich.text import Text
 
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, From, Last, OneRobot, Range, To
+from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
@@ -20,7 +21,7 @@ commands = typer.Typer()
 _HEX_WIDTH = 16
 
 
-@commands.command("errors")
+@commands.command("errors", epilog=examples("errors --robot car7 --last 1h"))
 def errors_(
     context: typer.Context,
     entry_id: Annotated[

@@ -11,13 +11,14 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, DryRun, From, Last, OneRobot, Range, To
 from iort_station.cli.progress import bar
 from iort_station.cli.verbs.operations.errors import as_fields, entries, one_line
+from iort_station.cli.words import examples
 from iort_station.operations import quarantine, replay
 from iort_station.operations.replay import Fate
 
 commands = typer.Typer()
 
 
-@commands.command("replay-errors")
+@commands.command("replay-errors", epilog=examples("replay-errors --robot car7 --dry-run"))
 def replay_errors(
     context: typer.Context,
     robot: OneRobot = None,
@@ -30,7 +31,9 @@ def replay_errors(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Put the record lane's messages back, and delete those that arrive. Exit status 1 if any fails again."""
+    """Process rejected recordings again, and delete those that arrive.
+
+    Exit status 1 if any fails again."""
     when = Range.of(start, end, last)
     cloud = context.obj.cloud()
     if not dry_run and (moved := quarantine.recover(cloud)):

@@ -16,6 +16,7 @@ from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.words import examples
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import audit, trace
@@ -27,7 +28,7 @@ commands = typer.Typer()
 _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 
 
-@commands.command("trace")
+@commands.command("trace", epilog=examples("trace car7 --updates 20"))
 def trace_(
     context: typer.Context,
     robot: Robot,

@@ -7,20 +7,25 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import Token, TrackFile
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, Token, TrackFile
+from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
 
 commands = typer.Typer()
 
 
-@commands.command("dashboard")
+@commands.command("dashboard", epilog=examples("dashboard --port 8080"))
 def dashboard(
     context: typer.Context,
     port: Annotated[int, typer.Option(help="The page's port; 0 takes a free one.")] = 8080,
     host: Annotated[
-        str, typer.Option(help="The address to listen on. Whoever reaches it can read the cars' past.")
+        str,
+        typer.Option(
+            help="The address to listen on. Whoever reaches it can read the cars' past; "
+            "only a page on 127.0.0.1 sends commands."
+        ),
     ] = "127.0.0.1",
     name: Annotated[
         list[str] | None,
@@ -28,12 +33,14 @@ def dashboard(
     ] = None,
     token: Token = "",
     track: TrackFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
+    from iort_station.page import control  # noqa: PLC0415 - as above
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
-    from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
+    from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
     with PageServer(
@@ -41,12 +48,13 @@ def dashboard(
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
-        actions=actions(cloud),
+        # Whoever reaches the page can use it, and only people at this machine may move a robot.
+        actions=actions(cloud) | (control.actions(cloud) if on_loopback(host) else {}),
         track=None if track is None else load_track(track),
         host=host,
         port=port,
         names=name or (),
         **keys.load(cloud).reading(),
     ) as page:
-        out.print(f"{page.url}  (Ctrl-C stops)")
+        tell({"url": page.url}, f"{page.url}  (Ctrl-C stops)", as_json=as_json)
         threading.Event().wait()

@@ -6,22 +6,26 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson
+from iort_station.cli.words import examples
 from iort_station.errors import StationError
 from iort_station.page import keys
 
 commands = typer.Typer()
 
 
-@commands.command("pubnub")
+@commands.command("pubnub", epilog=examples("pubnub"))
 def pubnub(
     context: typer.Context,
     publish_key: Annotated[
-        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="Default: asks for it.")
+        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="The publish key. Default: asks for it.")
     ] = None,
     subscribe_key: Annotated[
-        str | None, typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="Default: asks for it.")
+        str | None,
+        typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="The subscribe key. Default: asks for it."),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Store PubNub's keys, encrypted, where Lambda 1 reads them."""
     # Fails for a missing cloud before anybody types a key.
@@ -31,4 +35,4 @@ def pubnub(
     publish_key = publish_key or typer.prompt("Publish key", hide_input=True)
     subscribe_key = subscribe_key or typer.prompt("Subscribe key", hide_input=True)
     keys.store(cloud, keys.typed(publish_key, subscribe_key))
-    out.print("stored; Lambda 1 uses them after its next cold start")
+    tell({"stored": True}, "stored; Lambda 1 uses them after its next cold start", as_json=as_json)

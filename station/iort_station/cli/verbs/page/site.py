@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import out
-from iort_station.cli.options import TrackFile, Yes, agreed
+from iort_station.cli.console import tell
+from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
+from iort_station.cli.words import examples
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.page import config, load_track
@@ -16,7 +17,7 @@ from iort_station.page.site import publish, upload
 commands = typer.Typer()
 
 
-@commands.command("site")
+@commands.command("site", epilog=examples("site"))
 def site(
     context: typer.Context,
     token: Annotated[
@@ -31,13 +32,14 @@ def site(
     ] = False,
     track: TrackFile = None,
     yes: Yes = False,
+    as_json: AsJson = False,
 ) -> None:
     """Upload the page to the stack iort-site, which serves it. Deploy with -c site=true first."""
     cloud = context.obj.cloud()
     if remove:
         agreed(f"Take the page of the deployment {cloud.namespace} down?", yes=yes)
         gone = upload(cloud.client("s3"), cloud.output("site", "PageBucket"), {})
-        out.print(f"{len(gone)} files deleted")
+        tell({"deleted": len(gone)}, f"{len(gone)} files deleted", as_json=as_json)
         return
     vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
     told = config(
@@ -47,4 +49,5 @@ def site(
         track=None if track is None else load_track(track),
         **pubnub,
     )
-    out.print(publish(cloud, told))
+    url = publish(cloud, told)
+    tell({"url": url}, url, as_json=as_json)

@@ -20,7 +20,7 @@ from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import out
 from iort_station.cli.options import Token
-from iort_station.cli.words import say
+from iort_station.cli.words import examples, say
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.listener import Listener
@@ -31,7 +31,7 @@ commands = typer.Typer()
 _REFRESH_S = 0.25
 
 
-@commands.command("watch")
+@commands.command("watch", epilog=examples("watch", "watch --json --seconds 5"))
 def watch(
     context: typer.Context,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for every update.")] = False,

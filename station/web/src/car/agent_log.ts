@@ -1,0 +1,62 @@
+// The warnings and errors of a car's agent: those that come live, and those of the last hour from the page's server.
+
+import { LOG_STREAM, type Config, type HistoryAnswer } from "../base/contract";
+import { el, Text } from "../base/dom";
+import { dayTime } from "../base/format";
+import { lineOf, type Line } from "../live/lines";
+import type { Robot } from "../live/robot";
+import { ask, AnswerError } from "../server/answers";
+
+const BACK_S = 3600;
+const ROWS = 500;
+const SHOWN = 100;
+
+export class AgentLog {
+  readonly node: HTMLElement;
+  private readonly note = new Text("note", "p");
+  private readonly list = el("ol", { class: "lines" });
+  private past: readonly Line[] = [];
+  private robot: string | undefined;
+  private drawn = "";
+
+  constructor(private readonly config: Config) {
+    this.node = el("section", { class: "panel agent-log", "aria-label": "Log of the agent" }, el("header", {}, el("h3", {}, "Log of the agent"), this.note.node), this.list);
+  }
+
+  /** Show this car's lines from now on. */
+  of(robot: string): void {
+    if (robot === this.robot) return;
+    [this.robot, this.past, this.drawn] = [robot, [], ""];
+    if (this.config.answers) void this.find(robot);
+  }
+
+  refresh(robot: Robot): void {
+    const key = `${this.past.length} ${robot.lines.length} ${robot.lines.at(-1)?.t_us ?? 0}`;
+    if (key === this.drawn) return;
+    this.drawn = key;
+    const first = robot.lines[0]?.t_us ?? Infinity;
+    const lines = [...this.past.filter(({ t_us }) => t_us < first), ...robot.lines].slice(-SHOWN).reverse();
+    this.note.set(lines.length > 0 ? "warnings and errors" : this.config.answers ? "no warnings in the last hour" : "no warnings since this page was opened");
+    this.list.replaceChildren(...lines.map(row));
+  }
+
+  private async find(robot: string): Promise<void> {
+    const us = (at_ms: number): string => String(Math.round(at_ms * 1000));
+    const asked = { robot, stream: LOG_STREAM, from_us: us(Date.now() - BACK_S * 1000), to_us: us(Date.now()), rows: String(ROWS) };
+    try {
+      const { times_s, fields } = await ask<HistoryAnswer>("history", asked);
+      if (robot !== this.robot) return;
+      this.past = times_s.flatMap((at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? []);
+    } catch (error) {
+      // A car that never warned has no such stream.
+      if (!(error instanceof AnswerError)) throw error;
+    }
+  }
+}
+
+function row({ t_us, level, logger, text, leftOut }: Line): HTMLElement {
+  const [head = "", ...details] = text.split("\n");
+  const words = details.length === 0 ? [head] : [el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n")))];
+  const left = leftOut > 0 ? [el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
+  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", dayTime(t_us / 1e6)), ...words, ...left);
+}

@@ -1,0 +1,84 @@
+"""What the page has its server do with a car: one command, and its answer. A static site offers neither."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from iort_station.errors import StationError
+from iort_station.page.server import PageServer
+from tests.browser import show, until
+from tests.web.cars import SUBSCRIBE_KEY, Car
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+    from local.pubnub.standin import PubNubStandIn
+
+
+class Robot:
+    """Answers commands as told, and keeps them."""
+
+    def __init__(self) -> None:
+        self.sent: list[dict[str, Any]] = []
+        self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
+
+    def send(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.sent.append({**asked, "message": json.loads(asked["message"])})
+        if asked["command"] == "nothing":
+            raise StationError("there is no such command")
+        return self.answer
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+@pytest.fixture
+def served(pubnub: PubNubStandIn, robot: Robot) -> Iterator[str]:
+    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    with PageServer(namespace="iort", actions={"send": robot.send}, **told) as server:
+        yield server.url
+
+
+def test_a_command_is_sent_and_its_answer_shown(
+    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+) -> None:
+    page = open_page(f"{served}#/car/car-1")
+    show(page, car.send())
+    page.get_by_role("heading", name="Commands").click()
+    said = page.locator(".said")
+    page.fill("[name=speed]", "1.2")
+    page.fill("[name=turn]", "-0.1")
+    page.fill("[name=lease]", "800")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: said.inner_text() == "drive accepted after 0.4 s", "the answer")
+    drive = {"robot": "car-1", "command": "drive", "lease_ms": "800"}
+    assert robot.sent == [{**drive, "message": {"drive": {"speed": 1.2, "steering_angle": -0.1}}}]
+    robot.answer = {"accepted": False, "reason": "clock_offset_unknown", "after_ms": 300}
+    page.get_by_role("button", name="Stop").click()
+    until(lambda: said.inner_text() == "drive rejected: clock offset unknown", "the rejection")
+    assert robot.sent[1]["message"] == {"drive": {"speed": 0, "steering_angle": 0}}
+    robot.answer = {"accepted": None, "reason": "", "after_ms": 10_000}
+    page.select_option("[name=type]", "JSON")
+    page.fill("[name=message]", '{"data": true')
+    page.get_by_role("button", name="Send").click()
+    until(lambda: "must be JSON" in said.inner_text(), "the refusal")
+    page.fill("[name=message]", '{"data": true}')
+    page.fill("[name=command]", "horn")
+    page.fill("[name=lease]", "")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: "No answer within 10 s" in said.inner_text(), "the end of the wait")
+    assert robot.sent[2] == {"robot": "car-1", "command": "horn", "lease_ms": "", "message": {"data": True}}
+    page.fill("[name=command]", "nothing")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: said.inner_text() == "there is no such command", "the server's refusal")
+
+
+def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
+    show(page, car.send())
+    assert page.get_by_role("heading", name="Commands").count() == 0
