@@ -26,11 +26,13 @@ class View(NamedTuple):
     filled: str
 
 
+LAP = "car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:00:20.000Z"
 # Every view of the page. A new view belongs here: tests then look at it.
 VIEWS = {
     "fleet": View("#/", "[data-robot=car-1]"),
     "car": View("#/car/car-1", ".gauge"),
     "history": View("#/history/car-1", ".history .charts canvas"),
+    "compare": View(f"#/compare?runs={LAP},{LAP}&stream={VESC_STREAM}", ".compare-view .charts canvas"),
     "alarms": View("#/alarms", "[data-alarm=Quarantined] .cases li"),
     "cloudwatch": View("#/cloudwatch", ".log summary"),
 }
@@ -105,7 +107,7 @@ class Lab:
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": [VESC_STREAM]},
-            "runs": lambda _: {"runs": []},
+            "runs": runs,
             "history": history,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
@@ -158,6 +160,13 @@ class Lab:
                 for i, widget in enumerate(widgets)
             ],
         }
+
+
+def runs(_asked: Mapping[str, str]) -> dict[str, Any]:
+    extent = {"from_us": round((NOW_S - 3600) * 1e6), "to_us": round(NOW_S * 1e6)}
+    part = {**extent, "batches": 10, "samples": 500}
+    run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 0, "streams": {VESC_STREAM: part}}
+    return {"runs": [run], "older": False, "streams": {VESC_STREAM: extent}}
 
 
 def history(asked: Mapping[str, str]) -> HistoryAnswer:

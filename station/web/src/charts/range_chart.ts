@@ -4,7 +4,9 @@ import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { gestures } from "./gestures";
 import type { Range } from "../base/range";
+import { clockTime, dayTime, number, zone } from "../base/format";
 import { colour, onTheme } from "../base/theme";
+import { Spoken, type About } from "./spoken";
 
 export interface Curve {
   readonly label: string;
@@ -30,6 +32,8 @@ export interface Hands {
 
 export interface RangeChartOptions {
   readonly curves: readonly Curve[];
+  /** Its title, and a value with its unit. */
+  readonly about: Pick<About, "title" | "write">;
   readonly zero?: boolean;
   /** Charts with the same name share their cursor. */
   readonly sync?: string;
@@ -51,6 +55,7 @@ let dragged: RangeChart | undefined;
 
 export class RangeChart {
   private readonly plot: uPlot;
+  private readonly spoken: Spoken;
   private readonly themed: () => void;
   private palette: string[] = [];
   private paint = paint();
@@ -108,6 +113,15 @@ export class RangeChart {
       data,
       host,
     );
+    const { unit } = options;
+    this.spoken = new Spoken(host, this.plot, {
+      ...options.about,
+      lines: options.curves.map(({ label }) => label),
+      range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${dayTime(this.range[1])} ${zone(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
+      at: (x) => (unit === undefined ? clockTime(x) : `${number(x, 2)} ${unit}`),
+      timeless: unit !== undefined,
+      band: options.band ?? false,
+    });
     if (hands) this.listen(hands);
     fit(host, this.plot, () => {});
     this.themed = onTheme(() => {
@@ -121,12 +135,14 @@ export class RangeChart {
     this.hole_s = hole_s;
     this.range = range;
     this.plot.setData(data);
+    this.spoken.changed();
   }
 
   /** Show another range of the same data. */
   move(range: Range): void {
     this.range = range;
     this.plot.setScale("x", { min: range[0], max: range[1] });
+    this.spoken.changed();
   }
 
   /** Put the cursor on a row. */

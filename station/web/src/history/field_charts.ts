@@ -106,9 +106,9 @@ export class FieldCharts {
     shown.extent.set(extent(band ? [scaled(least), scaled(most)] : [scaled(mean)], as));
   }
 
-  private make(field: string, { label, unit }: Spec, data: [number[], ...(number | null)[][]], band: boolean, hole_s: number): Shown {
+  private make(field: string, { label, unit, digits }: Spec, data: [number[], ...(number | null)[][]], band: boolean, hole_s: number): Shown {
     const [reading, extent] = [new Text("num", "span", { "data-reading": field }), new Text("note")];
-    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    const plot = el("div", { class: "plot" });
     const value = el("p", { class: "reading" }, reading.node, el("span", { class: "unit" }, unit));
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), extent.node, value), plot);
     const old = this.shown.get(field);
@@ -116,7 +116,8 @@ export class FieldCharts {
     if (old) old.node.replaceWith(node);
     else this.node.append(node);
     const { onCursor, hands } = this.options;
-    const options = { curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
+    const about = { title: label, write: (value: number) => `${number(value, digits)} ${unit}` };
+    const options = { about, curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
     const shown = { node, chart: new RangeChart(plot, options, data, this.range), band, reading, extent };
     this.shown.set(field, shown);
     return shown;
