@@ -33,6 +33,7 @@ from iort_station.fleet import robots
 from iort_station.operations import delivery
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
+from iort_station.page.downloads import downloads
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
 from local.cloud import FOLDER, EmbeddedCloud
@@ -46,7 +47,7 @@ _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
 # `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`; nobody is hurt by a long lease.
-_COMMANDS = {
+DRIVE_COMMANDS = {
     "drive": {
         "topic": "/drive",
         "type": DRIVE_TYPE,
@@ -150,6 +151,7 @@ class _Demo:
                     **embedded.keys.reading(),
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
+                    downloads=downloads(embedded.cloud),
                     track=HALL if self._options.bag is None else None,
                     actions=actions(embedded.cloud) | control.actions(embedded.cloud),
                     port=self._options.port,
@@ -196,7 +198,9 @@ class _Demo:
         if duration_s is not None:
             source["duration_s"] = duration_s
         settings = {"sources": [source], "ping": _PING}
-        return settings if self._options.bag is not None else {**settings, "downlink": {"cmd": _COMMANDS}}
+        return (
+            settings if self._options.bag is not None else {**settings, "downlink": {"cmd": DRIVE_COMMANDS}}
+        )
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"

@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from types import ModuleType
 
 import pytest
@@ -25,7 +25,7 @@ def no_network():
     enable_socket()
 
 
-@cache
+@lru_cache
 def kept_by(module: ModuleType) -> list[Callable[[], None]]:
     """What clears the caches of a function's module."""
     return [value.cache_clear for value in vars(module).values() if hasattr(value, "cache_clear")]

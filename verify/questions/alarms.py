@@ -11,7 +11,9 @@ from typing import Any
 from bench.target import Target
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.messages.page import AlarmEntry
 from iort_contract.topics import LIVE, build_topic
+from iort_station.operations import alarms
 from verify.errors import VerifyError
 from verify.question import WITH_KEY, Seen, question
 from verify.tools.inbox import inbox
@@ -22,6 +24,8 @@ from verify.tools.waiting import until
 _REASON = "verify: does it notify?"
 _ALARM = "ALARM"
 _FAULT = 5
+# With every character that a tag's value may have, beside letters and digits.
+_BY = "verify +-=._:/@"
 # The alarms that use Metrics Insights: stacks/monitoring/alarms.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
 
@@ -84,6 +88,33 @@ def set_state(target: Target) -> Seen:
         "old_state": told["OldStateValue"] == alarm["StateValue"],
         "reason": told["NewStateReason"],
     }
+
+
+@question(
+    "alarms.acknowledged",
+    expected={"by": _BY, "kept": True},
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_TagResource.html",
+    relied_on_by=("station/iort_station/operations/alarms.py",),
+)
+def acknowledged(target: Target) -> Seen:
+    """A raised alarm takes a tag that says who has seen it and when, and keeps it."""
+    cloud, alarm = target.cloud, _quiet_alarm(target)
+    name, cloudwatch = alarm["AlarmName"], cloud.client("cloudwatch")
+
+    def entry() -> AlarmEntry:
+        return next(one for one in alarms.alarms(cloud) if one["name"] == name)
+
+    cloudwatch.set_alarm_state(AlarmName=name, StateValue=_ALARM, StateReason=_REASON)
+    try:
+        raised = entry()
+        seen = alarms.acknowledge(cloud, raised["key"], raised["since_s"], _BY)
+        kept = entry()["acknowledged"]
+    finally:
+        cloudwatch.set_alarm_state(
+            AlarmName=name, StateValue=alarm["StateValue"], StateReason=alarm.get("StateReason", "")
+        )
+    same = kept is not None and abs(kept["at_s"] - seen["at_s"]) < 0.01
+    return {"by": kept["by"] if kept else None, "kept": same}
 
 
 set_state_with_key = replace(

@@ -1,4 +1,4 @@
-"""A deployment is taken down as the README says, beside another one in the same account."""
+"""A deployment is taken down as docs/how-to/take-down.md says, beside another one in the same account."""
 
 from __future__ import annotations
 

@@ -1,29 +1,42 @@
-"""The notebook of docs/tutorials/first-question.md, on the embedded cloud."""
+"""The Python of the pages, on the embedded cloud."""
 
 from __future__ import annotations
 
 import re
 
+import pytest
+
 from iort_station.cloud import EMBEDDED
 from local.deployment import ROOT
 from tests.local.conftest import recorded, run_agent
 
-PAGE = ROOT / "docs" / "tutorials" / "first-question.md"
 
-
-def test_the_notebook_answers_its_questions(embedded, bundle, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def follow(embedded, bundle, tmp_path, monkeypatch):
+    """Run a page's Python for a car that has driven for eight seconds; its names afterwards."""
     car = bundle(sources=[{"type": "sim", "rate_hz": 50, "duration_s": 8}])
     run_agent(car)
     recorded(embedded, car.robot, "vesc")
-    # The demo's folder, with its car.
+    # The folder in which a demo runs.
     (tmp_path / EMBEDDED.parent.parent).mkdir(parents=True)
     (tmp_path / EMBEDDED.parent).symlink_to(embedded.folder)
     monkeypatch.chdir(tmp_path)
-    code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
-    names = {}
-    exec(code.replace('"car1"', repr(car.robot)), names)
+
+    def run(page):
+        code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
+        names = {"EMBEDDED": EMBEDDED}
+        exec(re.sub(r'"car\d"', repr(car.robot), code.replace("Cloud()", "Cloud.load(EMBEDDED)")), names)
+        return names
+
+    return run
+
+
+def test_the_notebook_answers_its_questions(follow, capsys):
+    names = follow("docs/tutorials/first-question.md")
     assert len(names["frame"]) == 400
     assert names["fastest"] == names["frame"]["speed_mps"].max() > 1
     assert names["hardest"]["current_motor"].iloc[0] == names["frame"]["current_motor"].min()
     assert 0 < names["energy_wh"] < 1
     assert "m/s, at" in capsys.readouterr().out
+    follow("README.md")
+    assert len(follow("docs/reference/queries.md")["ride"].times_us) == 400

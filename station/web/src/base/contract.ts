@@ -8,6 +8,7 @@ export const GONE_S = 4.5;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
+export const TACHOMETER_COUNTS = 6;
 export const MAX_LEASE_MS = 10000;
 export const KEY_HEADER = "X-Iort-Key";
 export const POSE_STREAM = "pose";

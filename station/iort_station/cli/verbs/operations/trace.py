@@ -28,7 +28,7 @@ commands = typer.Typer()
 _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 
 
-@commands.command("trace", epilog=examples("trace car7 --updates 100"))
+@commands.command("trace", epilog=examples("trace car7 --updates 20"))
 def trace_(
     context: typer.Context,
     robot: Robot,

@@ -31,7 +31,7 @@ commands = typer.Typer()
 _REFRESH_S = 0.25
 
 
-@commands.command("watch", epilog=examples("watch", "watch --json --seconds 10"))
+@commands.command("watch", epilog=examples("watch", "watch --json --seconds 5"))
 def watch(
     context: typer.Context,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for every update.")] = False,
