@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
 
@@ -70,12 +71,18 @@ class Lab:
 
     def __init__(self) -> None:
         self.asked: list[dict[str, str]] = []
+        self.refuses = False
         self.alarms = [
             alarm("FaultSamples", robots=["car-1", "car-2"], named=True),
             alarm("Quarantined"),
             alarm("SummarizeErrors", acknowledged={"by": "ada", "at_s": NOW_S - 60}),
             *(alarm(name, "OK") for name, metric in METRICS.items() if metric.alarm and name[0] in "TBP"),
         ]
+
+    def answer_alarms(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        if self.refuses:
+            raise StationError("no such right")
+        return {"alarms": self.alarms, "user": "operator@lab"}
 
     def acknowledge(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.asked.append(dict(asked))
@@ -114,7 +121,7 @@ class Lab:
                 "from_s": 0,
                 "to_s": 60,
             },
-            "alarms": lambda _: {"alarms": self.alarms, "user": "operator@lab"},
+            "alarms": self.answer_alarms,
             "rejected": lambda _: {
                 "found": 1,
                 "rejected": [
