@@ -26,6 +26,7 @@ from bench.meters import chromium
 from iort_station.fleet import robots
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
+from iort_station.page.downloads import downloads
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 
@@ -72,6 +73,7 @@ def _take(views: Sequence[str], out: Path) -> None:
             **cloud.keys.reading(),
             vehicles=vehicles,
             answers=answers(cloud.cloud),
+            downloads=downloads(cloud.cloud),
             actions=actions(cloud.cloud) | control.actions(cloud.cloud),
         )
         url = stack.enter_context(server).url

@@ -33,6 +33,7 @@ from iort_station.fleet import robots
 from iort_station.operations import delivery
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
+from iort_station.page.downloads import downloads
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
 from local.cloud import FOLDER, EmbeddedCloud
@@ -150,6 +151,7 @@ class _Demo:
                     **embedded.keys.reading(),
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
+                    downloads=downloads(embedded.cloud),
                     track=HALL if self._options.bag is None else None,
                     actions=actions(embedded.cloud) | control.actions(embedded.cloud),
                     port=self._options.port,

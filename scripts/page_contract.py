@@ -10,6 +10,7 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 
 from iort_contract import checks, limits, topics
 from iort_contract import page as served
+from iort_contract.catalog import vesc
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
@@ -68,6 +69,7 @@ def _constants() -> Iterator[str]:
         limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
         topics: ("NAME",),
         checks: ("BOOT", "FIELD_NAME"),
+        vesc: ("TACHOMETER_COUNTS",),
         commands: ("MAX_LEASE_MS",),
         served: ("KEY_HEADER",),
     }.items():

@@ -49,7 +49,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     yield open_
     for context in contexts:
         context.close()
-    assert not errors
+    assert not errors, errors
 
 
 def until(true: Callable[[], Any], what: str, seconds: float = 60) -> None:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.page import AlarmEntry, HistoryAnswer
+    from iort_contract.messages.page import AlarmEntry, Extent, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 
@@ -30,6 +31,11 @@ VIEWS = {
     "fleet": View("#/", "[data-robot=car-1]"),
     "car": View("#/car/car-1", ".gauge"),
     "history": View("#/history/car-1", ".history .charts canvas"),
+    "compare": View(
+        "#/compare?runs=car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:01:00.000Z,"
+        "car-1/2026-05-04T11:00:00.000Z/2026-05-04T11:01:00.000Z",
+        ".compare-view .charts canvas",
+    ),
     "alarms": View("#/alarms", "[data-alarm=Quarantined] .cases li"),
     "cloudwatch": View("#/cloudwatch", ".log summary"),
 }
@@ -65,12 +71,18 @@ class Lab:
 
     def __init__(self) -> None:
         self.asked: list[dict[str, str]] = []
+        self.refuses = False
         self.alarms = [
             alarm("FaultSamples", robots=["car-1", "car-2"], named=True),
             alarm("Quarantined"),
             alarm("SummarizeErrors", acknowledged={"by": "ada", "at_s": NOW_S - 60}),
             *(alarm(name, "OK") for name, metric in METRICS.items() if metric.alarm and name[0] in "TBP"),
         ]
+
+    def answer_alarms(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        if self.refuses:
+            raise StationError("no such right")
+        return {"alarms": self.alarms, "user": "operator@lab"}
 
     def acknowledge(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.asked.append(dict(asked))
@@ -98,7 +110,7 @@ class Lab:
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": [VESC_STREAM]},
-            "runs": lambda _: {"runs": []},
+            "runs": lambda _: runs(),
             "history": history,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
@@ -109,7 +121,7 @@ class Lab:
                 "from_s": 0,
                 "to_s": 60,
             },
-            "alarms": lambda _: {"alarms": self.alarms, "user": "operator@lab"},
+            "alarms": self.answer_alarms,
             "rejected": lambda _: {
                 "found": 1,
                 "rejected": [
@@ -151,6 +163,13 @@ class Lab:
                 for i, widget in enumerate(widgets)
             ],
         }
+
+
+def runs() -> RunsAnswer:
+    extent: Extent = {"from_us": round(NOW_S - 60) * 1_000_000, "to_us": round(NOW_S) * 1_000_000}
+    part: RunPart = {**extent, "batches": 60, "samples": 3000}
+    run: Run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 2, "streams": {VESC_STREAM: part}}
+    return {"runs": [run], "older": True, "streams": {VESC_STREAM: extent}}
 
 
 def history(asked: Mapping[str, str]) -> HistoryAnswer:

@@ -75,3 +75,9 @@ def test_live_values_raise_the_alarms_of_cars(open_page: Callable[..., Page], pu
         }
         words = page.inner_text("[data-alarm=FaultSamples] li").split("\n")
         assert words[:2] == ["car-1", "under voltage (2)"]
+        # Without an answer nobody knows.
+        lab.refuses = True
+        page.reload()
+        until(lambda: page.inner_text("#alarms") == "?", "the badge without a number")
+        until(lambda: "no such right" in page.inner_text(".history-note"), "the reason")
+        assert page.locator("text=No alarm is raised").is_hidden()

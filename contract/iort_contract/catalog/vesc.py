@@ -16,6 +16,8 @@ _NUMBERS = (int, float)
 # of 1e-4 Ah and Wh. The ROS 2 driver divides by 1e4 first. Nothing on the way to the tables converts either,
 # so fractional values come from the ROS 2 driver.
 VESC_STREAM = "vesc"
+# The counts of the tachometer in an electrical revolution of the motor.
+TACHOMETER_COUNTS = 6
 # The fields behind alert mails.
 FAULT_FIELD, VOLTAGE_FIELD = "fault_code", "voltage_input"
 VESC = Stream(

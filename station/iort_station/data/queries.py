@@ -83,6 +83,7 @@ def query(
     on: str = CLIENT,
     scan: bool = False,
     progress: PageProgress | None = None,
+    most: int | None = None,
 ) -> Result:
     """The samples of a robot's stream from ``start`` (inclusive) to ``end`` (exclusive).
 
@@ -93,8 +94,8 @@ def query(
     Lambda 2 has written; a field then stands for its ``_min``, ``_mean``, ``_max`` and ``_last``.
     ``on="lambda"`` selects the samples in the cloud. ``scan`` reads by Scan instead of Query.
 
-    Raises `StationError` for an unknown robot, stream or field, naming the known ones; and for an invalid
-    time or condition.
+    Raises `StationError` for an unknown robot, stream or field, naming the known ones; for an invalid time or
+    condition; and for more samples than ``most``.
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
@@ -113,7 +114,13 @@ def query(
 
     def watched() -> Iterator[Block]:
         nonlocal ros2
+        read = 0
         for block in found:
+            read += len(block.times_us)
+            if most is not None and read > most:
+                raise StationError(
+                    f"the range has more than {most:,} samples: choose a shorter one, or run `iort query`"
+                )
             ros2 = ros2 or has_fraction(block)
             yield block
 

@@ -22,7 +22,8 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
@@ -37,9 +38,13 @@ from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
+# Writes a file into a folder and returns it.
+Download = Callable[[Mapping[str, str], Path], Path]
+_T = TypeVar("_T")
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
+_CHUNK_BYTES = 256 * 1024
 # The most answers that are worked on at a time; further requests wait.
 MOST_ANSWERS = 16
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
@@ -59,10 +64,10 @@ class PageServer(BackgroundServer):
 
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
     from the parameters of the request. ``actions`` are those that change something: they need a POST with
-    the page's own origin and the key of ``/config.json``. The
-    server accepts a Host that is localhost, an address or one of ``names``, and no other. Raises
-    `StationError` if the page is not built, if the port is in use, and for a configuration that it must not
-    serve.
+    the page's own origin and the key of ``/config.json``. ``downloads`` maps a name to the function that
+    writes the file ``/<name>``. The server accepts a Host that is localhost, an address or one of ``names``,
+    and no other. Raises `StationError` if the page is not built, if the port is in use, and for a
+    configuration that it must not serve.
     """
 
     def __init__(
@@ -76,6 +81,7 @@ class PageServer(BackgroundServer):
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
         actions: Mapping[str, Answer] | None = None,
+        downloads: Mapping[str, Download] | None = None,
         track: Track | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -85,6 +91,7 @@ class PageServer(BackgroundServer):
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
         self._actions = {f"/{name}.json": action for name, action in (actions or {}).items()}
+        self._downloads = {f"/{name}": download for name, download in (downloads or {}).items()}
         # A page elsewhere cannot read it.
         self._key = secrets.token_urlsafe(32)
         self._free = asyncio.Semaphore(MOST_ANSWERS)
@@ -149,6 +156,8 @@ class PageServer(BackgroundServer):
             parameters = dict(request.query)
             status, body = await self._off_the_loop(lambda: _answered(answer, parameters))
             return self._response(request, body, status)
+        if path in self._downloads:
+            return await self._download(request, self._downloads[path])
         file = self._files.get(path)
         if file is None:
             return self._response(request, _body(TYPES[".txt"], b"404 Not Found\n"), 404)
@@ -160,11 +169,33 @@ class PageServer(BackgroundServer):
             response.body = None
         return response
 
-    async def _off_the_loop(self, work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
+    async def _download(self, request: web.BaseRequest, download: Download) -> web.StreamResponse:
+        parameters = dict(request.query)
+        with TemporaryDirectory(prefix="iort-download-") as folder:
+            found = await self._off_the_loop(lambda: _tried(lambda: download(parameters, Path(folder))))
+            if isinstance(found, tuple):
+                return self._response(request, found[1], found[0])
+            response = web.StreamResponse(
+                headers={
+                    **self._headers,
+                    "Content-Type": "application/octet-stream",
+                    "Content-Disposition": f'attachment; filename="{found.name}"',
+                }
+            )
+            file = await asyncio.to_thread(found.open, "rb")
+            with file:
+                response.content_length = found.stat().st_size
+                await response.prepare(request)
+                while request.method == "GET" and (part := await asyncio.to_thread(file.read, _CHUNK_BYTES)):
+                    await response.write(part)
+            await response.write_eof()
+            return response
+
+    async def _off_the_loop(self, work: Callable[[], _T]) -> _T:
         """Run ``work`` in a daemon thread, so that a slow answer delays neither a file nor the exit."""
         await self._free.acquire()
         loop = asyncio.get_running_loop()
-        done: Future[tuple[int, _Body]] = Future()
+        done: Future[_T] = Future()
         done.set_running_or_notify_cancel()
 
         def run() -> None:
@@ -243,8 +274,13 @@ def _takes_gzip(accepted: str) -> bool:
 
 
 def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:
+    return _tried(lambda: (200, _json(answer(parameters), level=1)))
+
+
+def _tried(work: Callable[[], _T]) -> _T | tuple[int, _Body]:
+    """The result, or the status and the body of its error."""
     try:
-        return 200, _json(answer(parameters), level=1)
+        return work()
     except (StationError, ContractError) as error:
         return 400, _json({"error": str(error)})
     except (BotoCoreError, ClientError) as error:

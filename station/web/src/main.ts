@@ -15,6 +15,7 @@ import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
 import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
+import { CompareView } from "./views/compare";
 import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
 import { HistoryView } from "./views/history";
@@ -35,6 +36,7 @@ class Page {
   private readonly fleetView: FleetView;
   private readonly carView: CarView;
   private readonly historyView: HistoryView;
+  private readonly compareView: CompareView;
   private readonly cloudWatchView: CloudWatchView;
   private readonly alarmsView: AlarmsView;
   private readonly stage = byId("stage");
@@ -60,6 +62,7 @@ class Page {
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
+    this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
     this.alarmsView = new AlarmsView(config, alarms);
     for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
@@ -75,9 +78,9 @@ class Page {
     this.route = readRoute(location.hash);
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
     document.body.dataset["view"] = view;
-    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", car: "iort live", history: "iort live" }[view];
+    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", compare: "Compare · iort", car: "iort live", history: "iort live" }[view];
     if (this.stage.firstElementChild !== shown.node) {
       this.stage.replaceChildren(shown.node);
       window.scrollTo(0, 0);
@@ -88,6 +91,7 @@ class Page {
     }
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
+    this.compareView.show(this.route.view === "compare" ? this.route.query : undefined);
     this.cloudWatchView.show(view === "cloudwatch");
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});

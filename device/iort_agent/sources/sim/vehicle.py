@@ -15,12 +15,11 @@ from iort_agent.common.schema import number, setting
 from iort_agent.sources.sim.circuit import HALL, Circuit, Grip, wrapped
 from iort_agent.sources.sim.driver import Driver, Pose, Wish
 from iort_contract.catalog.derived import F1TENTH
+from iort_contract.catalog.vesc import TACHOMETER_COUNTS
 from iort_contract.limits import Value
 
 _G = 9.81
 _AMBIENT_DEGC = 24.0
-# The VESC's tachometer counts six steps in an electrical revolution.
-_COUNTS_PER_EREV = 6
 # The power that the VESC's logic draws from the battery.
 _IDLE_W = 1.5
 # The board's heat capacity, and its cooling while the car stands.
@@ -90,7 +89,7 @@ class Vehicle:
         mean_mps = self._accelerate(dt)
         self._move(mean_mps, wish.steering_rad, dt)
         self._electrics(dt)
-        counts = mean_mps * c.speed_to_erpm_gain / 60 * _COUNTS_PER_EREV * dt
+        counts = mean_mps * c.speed_to_erpm_gain / 60 * TACHOMETER_COUNTS * dt
         self._counts += counts
         self._counts_abs += abs(counts)
 

@@ -8,6 +8,7 @@ export const GONE_S = 4.5;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
+export const TACHOMETER_COUNTS = 6;
 export const MAX_LEASE_MS = 10000;
 export const KEY_HEADER = "X-Iort-Key";
 export const POSE_STREAM = "pose";
@@ -395,6 +396,35 @@ export interface RunsAnswer {
 /** Answers ``dashboards``: their names. */
 export interface DashboardsAnswer {
   readonly dashboards: readonly string[];
+}
+
+/** What values a setting has. */
+export interface SettingKind {
+  readonly kind: "flag" | "number" | "choice" | "fields";
+  readonly low: number;
+  readonly high: number;
+  readonly unit: string;
+  readonly names: readonly string[];
+}
+
+/** A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's. ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has not taken yet; ``reason`` says why it rejected the last one. */
+export interface SettingEntry {
+  readonly kind: "flag" | "number" | "choice" | "fields";
+  readonly low: number;
+  readonly high: number;
+  readonly unit: string;
+  readonly names: readonly string[];
+  readonly name: string;
+  readonly value: string;
+  readonly desired: boolean;
+  readonly pending: string;
+  readonly reason: string;
+}
+
+/** Answers ``settings`` and ``set``. */
+export interface SettingsAnswer {
+  readonly settings: readonly SettingEntry[];
+  readonly online: boolean;
 }
 
 /** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */

@@ -1,14 +1,27 @@
 // The views, their addresses and parameters: #/history/car7?stream=vesc. They are behind the #, so that a
 // static site serves them all, and a link shows what its sender saw.
 
+import { NAME } from "./contract";
+import { readRange, writeTime, type Range } from "./range";
+
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
   fleet: ["find", "sort", "group"],
   car: ["window", "charts"],
-  history: ["stream", "from", "to"],
+  history: ["stream", "from", "to", "fields", "at"],
+  compare: ["runs", "stream", "fields", "x", "zoom"],
   cloudwatch: [],
   alarms: [],
 } as const;
+
+/** A robot's range: a run, a lap, or any other. */
+export interface Part {
+  readonly robot: string;
+  readonly range: Range;
+}
+
+/** The most ranges that are compared. */
+export const MOST_PARTS = 6;
 
 type View = keyof typeof PARAMETERS;
 export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string | undefined>>>;
@@ -20,7 +33,7 @@ interface Address<V extends View> {
 interface RobotAddress<V extends View> extends Address<V> {
   readonly robot: string;
 }
-export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | RobotAddress<"car"> | RobotAddress<"history">;
+export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history">;
 
 export function route(to: Route): string {
   const view = to.view === "fleet" ? "" : to.view;
@@ -38,6 +51,7 @@ export function readRoute(hash: string): Route {
   if ((name === "car" || name === "history") && robot !== undefined) return { view: name, robot, query: read(name) };
   if (name === "cloudwatch") return { view: name, query: read(name) };
   if (name === "alarms") return { view: name, query: read(name) };
+  if (name === "compare") return { view: name, query: read(name) };
   return { view: "fleet", query: read("fleet") };
 }
 
@@ -47,4 +61,18 @@ export function setAddress(to: Route, step = false): void {
   if (address === location.hash) return;
   if (step) history.pushState(null, "", address);
   else history.replaceState(null, "", address);
+}
+
+/** Ranges in an address: car1/2026-05-04T10:00:00.000Z/2026-05-04T10:05:00.000Z,car2/… */
+export function writeParts(parts: readonly Part[]): string {
+  return parts.map(({ robot, range }) => [robot, ...range.map(writeTime)].join("/")).join(",");
+}
+
+/** The ranges of an address, without those that cannot be read. */
+export function readParts(text = ""): Part[] {
+  return text.split(",").flatMap((part) => {
+    const [robot = "", from, to] = part.split("/");
+    const range = readRange(from, to);
+    return NAME.test(robot) && range ? [{ robot, range }] : [];
+  });
 }

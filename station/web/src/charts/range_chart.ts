@@ -1,7 +1,10 @@
-// A chart of a past range by uPlot, with the time of day below it.
+// A chart of a range by uPlot: of a past time, with the time of day below it, or of any other quantity.
 
 import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { gestures } from "./gestures";
+import { Spoken, type About } from "./spoken";
+import type { Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
 
 export interface Curve {
@@ -14,26 +17,53 @@ export interface Curve {
   readonly points?: boolean;
 }
 
+/** What a viewer does on a chart. Without it the chart only has a cursor. */
+export interface Hands {
+  /** The viewer has dragged over a range. */
+  readonly zoom: (to: Range) => void;
+  /** The viewer pans or zooms by wheel or fingers; as in `Gestures`. */
+  readonly move: (to: Range, upright: boolean) => boolean;
+  /** The viewer has clicked twice. */
+  readonly back: () => void;
+  /** The viewer has clicked. */
+  readonly pick: () => void;
+}
+
 export interface RangeChartOptions {
   readonly curves: readonly Curve[];
   readonly zero?: boolean;
   /** Charts with the same name share their cursor. */
   readonly sync?: string;
-  /** A line has a gap after this time without a value. */
+  /** A line has a gap after this much of x without a value. */
   readonly hole_s: number;
   /** Draw a band from minimum to maximum of the first curve: columns two and three of the data. */
   readonly band?: boolean;
+  /** The unit of x; without it x is a time. */
+  readonly unit?: string;
   readonly onCursor?: (index: number | null) => void;
+  readonly hands?: Hands;
+  /** The chart in words; without it, it is only for the eye. */
+  readonly about?: About;
 }
 
-const TIME = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" } as const;
+// A shorter drag is a click.
+const LEAST_DRAG_PX = 5;
+const NO_SELECTION = { left: 0, top: 0, width: 0, height: 0 };
+/** The chart on which a drag began: uPlot draws the selection on all that share a cursor. */
+let dragged: RangeChart | undefined;
 
 export class RangeChart {
   private readonly plot: uPlot;
+  private readonly themed: () => void;
+  private readonly spoken: Spoken | undefined;
   private palette: string[] = [];
   private paint = paint();
+  private range: Range;
+  private hole_s: number;
 
-  constructor(host: HTMLElement, options: RangeChartOptions, data: uPlot.AlignedData, range: readonly [number, number]) {
+  constructor(host: HTMLElement, options: RangeChartOptions, data: uPlot.AlignedData, range: Range) {
+    this.range = range;
+    this.hole_s = options.hole_s;
     const read = (): void => {
       this.palette = options.curves.map((curve) => colour(curve.colour));
       this.paint = paint();
@@ -48,55 +78,120 @@ export class RangeChart {
       stroke: () => this.palette[i]!,
       width: 1.6,
       points: { show: curve.points ?? false, size: 4, fill: () => this.palette[i]! },
-      gaps: holes(() => options.hole_s),
+      gaps: holes(() => this.hole_s),
       ...(curve.dash ? { dash: [...curve.dash] } : {}),
     }));
     const edge: uPlot.Series = { stroke: "transparent", width: 0, points: { show: false } };
+    const { hands } = options;
     this.plot = new uPlot(
       {
         ...PLAIN,
         width: Math.max(1, host.clientWidth),
         height: Math.max(1, host.clientHeight),
         padding: [rem(0.5), right ? 0 : rem(1.7), 0, 0],
+        select: { ...PLAIN.select, show: hands !== undefined },
         cursor: {
           y: false,
-          drag: { x: false, y: false, setScale: false },
+          drag: { x: hands !== undefined, y: false, setScale: false },
           points: { size: 7, width: 0 },
           ...(options.sync ? { sync: { key: options.sync, setSeries: false } } : {}),
         },
-        scales: { x: { time: true, auto: false, range: () => [...range] }, y: { range: rounded }, right: { range: rounded } },
+        scales: { x: { time: options.unit === undefined, auto: false, range: () => [...this.range] }, y: { range: rounded }, right: { range: rounded } },
         axes: [
-          axis(colours, 1.5, 0.3, { space: rem(5), values: (_, splits) => timeLabels(splits) }),
+          axis(colours, 1.5, 0.3, { space: rem(5), values: (_, splits) => (options.unit === undefined ? timeLabels(splits) : labels(splits).map((text) => `${text} ${options.unit}`)) }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
           ...(right ? [axis(colours, 3.1, 0.4, { side: 1, scale: "right", space: rem(2.2), grid: { show: false }, values: (_, splits) => labels(splits) })] : []),
         ],
         series: [{}, ...series, ...(options.band ? [edge, edge] : [])],
         ...(options.band ? { bands: [{ series: [3, 2], fill: () => faint(this.palette[0]!, 0.22) }] } : {}),
-        hooks: { setCursor: [(plot) => options.onCursor?.(plot.cursor.idx ?? null)] },
+        hooks: {
+          setCursor: [(plot) => options.onCursor?.(plot.cursor.idx ?? null)],
+          setSelect: [(plot) => this.selected(plot, hands)],
+        },
       },
       data,
       host,
     );
+    this.spoken = options.about && new Spoken(host, this.plot, options.about);
+    if (hands) this.listen(host, hands);
     fit(host, this.plot, () => {});
-    onTheme(() => {
+    this.themed = onTheme(() => {
       read();
       this.plot.redraw(false, true);
     });
   }
 
+  /** Show other data of the same curves. */
+  set(data: uPlot.AlignedData, range: Range, hole_s: number): void {
+    this.hole_s = hole_s;
+    this.range = range;
+    this.plot.setData(data);
+    this.spoken?.refresh();
+  }
+
+  /** Show another range of the same data. */
+  move(range: Range): void {
+    this.range = range;
+    this.plot.setScale("x", { min: range[0], max: range[1] });
+  }
+
   /** Put the cursor on a row. */
   point(index: number): void {
-    const at = this.plot.data[0][index];
-    if (at !== undefined) this.plot.setCursor({ left: this.plot.valToPos(at, "x"), top: 0 }, false);
+    // After uPlot has drawn new data or another range, in a microtask of its own.
+    queueMicrotask(() => {
+      const at = this.plot.data[0][index];
+      if (at !== undefined) this.plot.setCursor({ left: this.plot.valToPos(at, "x"), top: 0 }, false);
+    });
   }
 
   destroy(): void {
+    this.themed();
     this.plot.destroy();
+  }
+
+  private listen(host: HTMLElement, hands: Hands): void {
+    host.addEventListener("keydown", (event) => {
+      if (event.key === "-") hands.back();
+      if (event.key !== "+") return;
+      const [from, to] = this.range;
+      const at = this.plot.data[0][this.plot.cursor.idx ?? -1] ?? (from + to) / 2;
+      hands.zoom([at - (at - from) / 2, at + (to - at) / 2]);
+    });
+    const { over } = this.plot;
+    let at = 0;
+    over.addEventListener("mousedown", (event) => {
+      dragged = this;
+      at = event.clientX;
+    });
+    over.addEventListener("click", (event) => Math.abs(event.clientX - at) < LEAST_DRAG_PX && hands.pick());
+    over.addEventListener("dblclick", () => hands.back());
+    gestures(over, { range: () => this.range, move: hands.move });
+  }
+
+  private selected(plot: uPlot, hands: Hands | undefined): void {
+    const { left, width } = plot.select;
+    if (width <= 0) return;
+    plot.setSelect(NO_SELECTION, false);
+    if (dragged !== this || width < LEAST_DRAG_PX) return;
+    hands?.zoom([plot.posToVal(left, "x"), plot.posToVal(left + width, "x")]);
   }
 }
 
+const DAY_S = 86_400;
+
+/** Times as precise as their steps. */
 function timeLabels(splits: readonly number[]): string[] {
-  const seconds = splits.length > 1 && splits[1]! - splits[0]! < 60;
-  const format = new Intl.DateTimeFormat("en-GB", seconds ? { ...TIME, second: "2-digit" } : TIME);
+  const step = splits.length > 1 ? splits[1]! - splits[0]! : 60;
+  const day = { day: "numeric", month: "short" } as const;
+  const time = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" } as const;
+  const options: Intl.DateTimeFormatOptions =
+    step >= 300 * DAY_S ? { year: "numeric" }
+    : step >= 27 * DAY_S ? { month: "short", year: "numeric" }
+    : step >= DAY_S * 0.9 ? day
+    : step >= DAY_S / 8 ? { ...day, ...time }
+    : step >= 60 ? time
+    : step >= 1 ? { ...time, second: "2-digit" }
+    : { minute: "2-digit", second: "2-digit", fractionalSecondDigits: step >= 0.1 ? 1 : step >= 0.01 ? 2 : 3 };
+  const format = new Intl.DateTimeFormat("en-GB", options);
   return splits.map((at) => format.format(at * 1000));
 }

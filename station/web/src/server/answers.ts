@@ -8,18 +8,44 @@ type Parameters = Readonly<Record<string, string>>;
 
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
 export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
-  return answered(`${name}.json?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+  const answer = await get(`${name}.json`, parameters, signal);
+  return (await answer.json()) as T;
 }
 
 /** Have the server change something; throws `AnswerError` if it does not, or if the change is refused. */
 export async function act<T>(name: string, parameters: Parameters): Promise<T> {
   // Asked each time, because a server that was started again has another key.
-  const { key } = await answered<Config>("config.json", { cache: "no-store" });
+  const { key } = await ask<Config>("config", {});
   const headers = { "Content-Type": "application/json", [KEY_HEADER]: key };
-  return answered(`${name}.json`, { method: "POST", headers, body: JSON.stringify(parameters) });
+  const answer = await answered(`${name}.json`, { method: "POST", headers, body: JSON.stringify(parameters) });
+  return (await answer.json()) as T;
 }
 
-async function answered<T>(address: string, request: RequestInit): Promise<T> {
+/** Ask for a file, and report the bytes received; throws `AnswerError` also if the file is cut off. */
+export async function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<{ readonly content: Blob; readonly name: string }> {
+  const answer = await get(name, parameters, signal);
+  const parts: Uint8Array<ArrayBuffer>[] = [];
+  let size = 0;
+  try {
+    for (const reader = answer.body!.getReader(); ; ) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      parts.push(value);
+      received((size += value.length));
+    }
+  } catch (error) {
+    if (signal.aborted) throw error;
+    throw new AnswerError("The download was cut off, and nothing was saved. The server's terminal has the reason.");
+  }
+  const named = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1];
+  return { content: new Blob(parts), name: named ?? name };
+}
+
+function get(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
+  return answered(`${name}?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+}
+
+async function answered(address: string, request: RequestInit): Promise<Response> {
   let answer: Response;
   try {
     answer = await fetch(address, request);
@@ -27,7 +53,7 @@ async function answered<T>(address: string, request: RequestInit): Promise<T> {
     if (request.signal?.aborted) throw error;
     throw new AnswerError("The page's server does not answer. Is `iort dashboard` still running?");
   }
+  if (answer.ok) return answer;
   const body = (await answer.json().catch(() => ({}))) as { error?: unknown };
-  if (!answer.ok) throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
-  return body as T;
+  throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
 }

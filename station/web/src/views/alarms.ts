@@ -29,7 +29,7 @@ export class AlarmsView {
   private failure = "";
 
   constructor(
-    config: Config,
+    private readonly config: Config,
     private readonly alarms: Alarms,
   ) {
     this.name.value = stored();
@@ -56,10 +56,10 @@ export class AlarmsView {
   clock(now: number): void {
     const { entries, error, askedAt, user } = this.alarms;
     this.name.placeholder = user;
-    this.note.set(this.failure || error || (entries ? `as of ${clockTime(askedAt)} ${zone(askedAt)}` : ""));
+    this.note.set(this.failure || error || (entries ? `as of ${clockTime(askedAt)} ${zone(askedAt)}` : this.config.answers ? "Loading …" : ""));
     const raised = this.alarms.raised(now);
     if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt) void this.find(askedAt);
-    this.none.hidden = raised.length > 0 || (entries === undefined && error !== "");
+    this.none.hidden = raised.length > 0 || (this.config.answers && entries === undefined);
     const shown = raised.map((alarm) => this.card(alarm));
     if (shown.some((node, i) => this.list.children[i] !== node) || this.list.children.length !== shown.length) this.list.replaceChildren(...shown);
     for (const key of this.cards.keys()) if (!raised.some((alarm) => alarm.key === key)) this.cards.delete(key);

@@ -55,9 +55,10 @@ export class StatusBar {
     const fresh = raised.filter((alarm) => alarm.fresh).length;
     const badge = byId("alarms");
     setAttribute(badge, "data-fresh", String(fresh > 0));
-    setAttribute(badge, "aria-label", `${raised.length} raised, ${fresh} of them not acknowledged`);
+    setAttribute(badge, "aria-label", this.alarms.error || `${raised.length} raised, ${fresh} of them not acknowledged`);
     // It keeps its room, so that nothing moves when it comes and goes.
-    write("alarms", raised.length > 0 ? String(raised.length) : "");
+    write("alarms", raised.length > 0 ? String(raised.length) : this.alarms.error ? "?" : "");
+    badge.title = this.alarms.error;
   }
 
   private announce(link: LinkState, at: number): void {

@@ -39,6 +39,7 @@ def dashboard(
     # numpy and aiohttp take longer to load than most commands to run.
     from iort_station.page import control  # noqa: PLC0415 - as above
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.downloads import downloads  # noqa: PLC0415 - as above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
@@ -48,6 +49,7 @@ def dashboard(
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
+        downloads=downloads(cloud),
         # Whoever reaches the page can use it, and only people at this machine may move a robot.
         actions=actions(cloud) | (control.actions(cloud) if on_loopback(host) else {}),
         track=None if track is None else load_track(track),

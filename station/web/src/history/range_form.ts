@@ -1,0 +1,84 @@
+// The controls of a range: its ends, the last minutes, the stream.
+
+import { el, Text } from "../base/dom";
+import { zone } from "../base/format";
+import type { Range } from "../base/range";
+
+const LAST = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
+// Shorter ranges show milliseconds.
+const FINE_S = 20;
+
+export interface RangeFormEvents {
+  readonly range: (range: Range) => void;
+  readonly last: (seconds: number) => void;
+  readonly stream: () => void;
+  readonly out: () => void;
+}
+
+export class RangeForm {
+  readonly node: HTMLFormElement;
+  private readonly from = el("input", { type: "datetime-local", step: "1", id: "from", name: "from" });
+  private readonly to = el("input", { type: "datetime-local", step: "1", id: "to", name: "to" });
+  private readonly zone = new Text("zone");
+  private readonly select = el("select", { id: "stream", name: "stream" });
+  /** Goes back to the range before the zoom. */
+  readonly out = el("button", { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" }, "Zoom out");
+
+  constructor(events: RangeFormEvents) {
+    this.node = el(
+      "form",
+      { class: "range", novalidate: "" },
+      ...LAST.map(([label, seconds]) => {
+        const button = el("button", { type: "button", class: "tool" }, `Last ${label}`);
+        button.addEventListener("click", () => events.last(seconds));
+        return button;
+      }),
+      el("label", {}, "from ", this.from),
+      el("label", {}, "to ", this.to, " ", this.zone.node),
+      el("label", {}, "stream ", this.select),
+      el("button", { type: "submit", class: "tool primary" }, "Load"),
+    );
+    this.node.addEventListener("submit", (event) => {
+      event.preventDefault();
+      events.range([seconds(this.from), seconds(this.to)]);
+    });
+    this.select.addEventListener("change", events.stream);
+    this.out.addEventListener("click", events.out);
+    for (const each of [this.from, this.to]) each.addEventListener("input", () => this.sayZone());
+  }
+
+  get stream(): string {
+    return this.select.value;
+  }
+
+  set stream(name: string) {
+    this.select.value = name;
+  }
+
+  streams(names: readonly string[]): void {
+    this.select.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+  }
+
+  show([from, to]: Range, zoomed: boolean): void {
+    const digits = to - from < FINE_S ? 23 : 19;
+    this.from.value = local(from).slice(0, digits);
+    this.to.value = local(to).slice(0, digits);
+    this.out.hidden = !zoomed;
+    this.sayZone();
+  }
+
+  /** Show the time zone of the form's times; it may change with the season. */
+  private sayZone(): void {
+    const zones = [this.from, this.to].map(seconds).filter((at) => !Number.isNaN(at)).map(zone);
+    this.zone.set([...new Set(zones)].join(" to "));
+  }
+}
+
+/** A time in the input's format, in this device's time zone. */
+function local(at: number): string {
+  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 23);
+}
+
+function seconds(input: HTMLInputElement): number {
+  return new Date(input.value).getTime() / 1000;
+}

@@ -1,0 +1,100 @@
+// A robot's runs: each opens its range, and several open side by side.
+
+import type { Extent, Run, RunsAnswer } from "../base/contract";
+import { el } from "../base/dom";
+import { age, dayTime, number, zone } from "../base/format";
+import { writeTime, type Range } from "../base/range";
+import { MOST_PARTS, route, writeParts } from "../base/route";
+
+export class RunsList {
+  readonly node = el("details", { class: "panel runs" });
+  private readonly about = el("summary", {}, "Runs");
+  private readonly body = el("tbody");
+  private readonly more = el("button", { type: "button", class: "tool" }, "Older runs");
+  private readonly compare = el("a", { class: "tool" }, "Compare");
+  private readonly chosen = new Map<string, Range>();
+  private robot = "";
+  private stream = "";
+  private runs: readonly Run[] = [];
+  private extents: Readonly<Record<string, Extent>> = {};
+
+  /** `older` is called for the runs before a time in microseconds. */
+  constructor(older: (before_us: number) => void) {
+    const head = el("tr", {}, ...["Compare", "Start", "Length", "Samples", "State"].map((name) => el("th", { scope: "col" }, name)));
+    this.more.addEventListener("click", () => older(this.runs.at(-1)!.from_us));
+    this.node.append(this.about, el("table", {}, el("thead", {}, head), this.body), el("p", { class: "tools" }, this.more, this.compare));
+  }
+
+  /** The newest run that has the stream. */
+  newest(stream: string): Range | undefined {
+    const run = this.runs.find(({ streams }) => Object.hasOwn(streams, stream));
+    return run && range(run.streams[stream]!);
+  }
+
+  /** All that is stored of a stream, where known. */
+  extent(stream: string): Range | undefined {
+    return Object.hasOwn(this.extents, stream) ? range(this.extents[stream]!) : undefined;
+  }
+
+  set(robot: string, answer: RunsAnswer | undefined): void {
+    if (robot !== this.robot) this.chosen.clear();
+    this.robot = robot;
+    this.runs = answer?.runs ?? [];
+    this.extents = answer?.streams ?? {};
+    this.more.hidden = answer?.older !== true;
+    this.show(this.stream);
+  }
+
+  /** Say why the runs are not known. */
+  fail(reason: string): void {
+    this.node.hidden = false;
+    this.about.textContent = `Runs: ${reason}`;
+  }
+
+  add(answer: RunsAnswer): void {
+    this.runs = [...this.runs, ...answer.runs];
+    this.more.hidden = !answer.older;
+    this.show(this.stream);
+  }
+
+  /** List the runs that have a stream. */
+  show(stream: string): void {
+    if (stream !== this.stream) this.chosen.clear();
+    this.stream = stream;
+    const runs = this.runs.filter((run) => Object.hasOwn(run.streams, stream));
+    const extent = this.extent(stream);
+    this.node.hidden = runs.length === 0;
+    this.about.textContent = `Runs${extent ? `: ${stream} is stored from ${when(extent[0])} to ${when(extent[1])}` : ""}`;
+    this.body.replaceChildren(...runs.map((run) => this.row(run)));
+    this.choose();
+  }
+
+  private row(run: Run): HTMLElement {
+    const part = run.streams[this.stream]!;
+    const [from, to] = range(part);
+    const { robot, stream } = this;
+    const check = el("input", { type: "checkbox", "aria-label": `Compare the run of ${when(from)}` });
+    check.checked = this.chosen.has(run.run);
+    check.addEventListener("change", () => {
+      if (check.checked) this.chosen.set(run.run, [from, to]);
+      else this.chosen.delete(run.run);
+      this.choose();
+    });
+    const link = el("a", { href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, when(from));
+    const samples = part.samples === null ? "" : number(part.samples);
+    const state = run.lost > 0 ? `${run.state}, ${number(run.lost)} lost` : run.state;
+    return el("tr", { "data-run": run.run }, el("td", {}, check), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
+  }
+
+  private choose(): void {
+    const parts = [...this.chosen.values()].map((range) => ({ robot: this.robot, range }));
+    const few = parts.length < 2 ? "Check two runs to compare them" : parts.length > MOST_PARTS ? `At most ${MOST_PARTS} runs can be compared` : "";
+    this.compare.textContent = few || `Compare ${parts.length} runs`;
+    if (few) this.compare.removeAttribute("href");
+    else this.compare.href = route({ view: "compare", query: { runs: writeParts(parts), stream: this.stream } });
+  }
+}
+
+const range = ({ from_us, to_us }: Extent): Range => [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000];
+
+const when = (at_s: number): string => `${dayTime(at_s)} ${zone(at_s)}`;

@@ -1,0 +1,195 @@
+// Two to six runs, laps or robots on one axis: the time since each began, or the distance since then.
+
+import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
+import { el, Text } from "../base/dom";
+import { age, dayTime, number, zone } from "../base/format";
+import { writeTime, type Range } from "../base/range";
+import { MOST_PARTS, readParts, route, setAddress, writeParts, type Part, type Query } from "../base/route";
+import { AddPart } from "../history/add_part";
+import type { Axis } from "../history/align";
+import { CompareCharts, hue } from "../history/compare_charts";
+import { NoDistance, Parts } from "../history/parts";
+import type { Fleet } from "../live/fleet";
+import { ask, AnswerError } from "../server/answers";
+
+const SETTLED_MS = 200;
+const AXES: Readonly<Record<Axis, string>> = { time: "Time since the start", distance: "Distance" };
+
+export class CompareView {
+  readonly node: HTMLElement;
+  private readonly stream = el("select", { id: "compare-stream" });
+  private readonly axis = el("select", { id: "compare-axis" }, ...Object.entries(AXES).map(([value, label]) => el("option", { value }, label)));
+  private readonly out = el("button", { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" }, "Zoom out");
+  private readonly note = new Text("history-note", "p", { role: "status" });
+  private readonly at = new Text("num");
+  private readonly list = el("ul", { class: "parts" });
+  private readonly charts: CompareCharts;
+  private readonly add: AddPart;
+  private readonly loader: Parts;
+  private parts: readonly Part[] = [];
+  private wanted: readonly string[] = [];
+  private grid: readonly number[] = [];
+  private unit = "";
+  private extent: Range = [0, 1];
+  private zooms: Range[] = [];
+  private zoom: Range | undefined;
+  private loading: AbortController | undefined;
+  private settling: number | undefined;
+
+  constructor(
+    private readonly config: Config,
+    private readonly table: FieldTable,
+    fleet: Fleet,
+  ) {
+    this.loader = new Parts(table, fleet);
+    this.add = new AddPart(fleet, (part) => this.choose([...this.parts, part].slice(-MOST_PARTS)));
+    const hands = { zoom: (to: Range) => this.go(to), move: (to: Range, upright: boolean) => this.move(to, upright), back: () => this.back(), pick: () => undefined };
+    this.charts = new CompareCharts(
+      (field) => this.loader.spec(field, this.stream.value, this.parts),
+      hands,
+      (index) => index !== null && this.read(index),
+      () => {
+        this.wanted = this.charts.fields;
+        this.write();
+      },
+    );
+    this.stream.addEventListener("change", () => this.restart());
+    this.axis.addEventListener("change", () => this.restart());
+    this.out.addEventListener("click", () => this.back());
+    const form = el("div", { class: "range" }, el("label", {}, "stream ", this.stream), el("label", {}, "over ", this.axis));
+    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To compare runs, run ", el("code", {}, "iort dashboard"), ".");
+    const served = [form, this.list, this.add.node, el("div", { class: "history-status" }, this.note.node, this.at.node, this.out), this.charts.chips, this.charts.node];
+    this.node = el("article", { class: "history compare-view" }, el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Compare")), ...(config.answers ? served : [told]));
+  }
+
+  /** Show what an address says; undefined when the viewer leaves. */
+  show(query: Query<"compare"> | undefined): void {
+    if (!query) this.loading?.abort();
+    if (!query || !this.config.answers) return;
+    this.parts = readParts(query.runs).slice(0, MOST_PARTS);
+    this.wanted = query.fields?.split(",") ?? [];
+    this.axis.value = query.x === "distance" ? "distance" : "time";
+    const [from = NaN, to = NaN] = (query.zoom ?? "").split(",").map(Number);
+    this.zoom = to > from ? [from, to] : undefined;
+    this.zooms = [];
+    void this.enter(query.stream ?? this.table.stream);
+  }
+
+  /** Find the streams of the first robot. */
+  private async enter(stream: string): Promise<void> {
+    this.stream.replaceChildren(el("option", {}, stream));
+    const loaded = this.load();
+    const robot = this.parts[0]?.robot;
+    if (robot === undefined) return loaded;
+    try {
+      const { streams } = await ask<StreamsAnswer>("streams", { robot });
+      const chosen = this.stream.value;
+      this.stream.replaceChildren(...[...new Set([...streams, chosen])].map((name) => el("option", { value: name }, name)));
+      this.stream.value = chosen;
+    } catch {
+      // The request for the samples says why.
+    }
+    return loaded;
+  }
+
+  private choose(parts: readonly Part[]): void {
+    this.parts = parts;
+    this.restart();
+  }
+
+  /** Show everything of other parts, of another stream, or over another axis. */
+  private restart(): void {
+    [this.zoom, this.zooms] = [undefined, []];
+    this.write(true);
+    void this.load();
+  }
+
+  private go(to: Range | undefined, step = true): void {
+    window.clearTimeout(this.settling);
+    if (step) this.zooms.push(this.zoom ?? this.extent);
+    this.zoom = to;
+    this.charts.move(to ?? this.extent);
+    this.write();
+    void this.load();
+  }
+
+  private back(): void {
+    const before = this.zooms.pop();
+    if (before || this.zoom) this.go(before && before[1] - before[0] < this.extent[1] - this.extent[0] ? before : undefined, false);
+  }
+
+  private move(to: Range, upright: boolean): boolean {
+    const zoomed = this.zoom !== undefined;
+    if ((upright && !zoomed) || to[1] <= this.extent[0] || to[0] >= this.extent[1] || to[1] - to[0] < 1e-3) return false;
+    if (this.zooms.length === 0) this.zooms.push(this.zoom ?? this.extent);
+    this.zoom = to;
+    this.charts.move(to);
+    window.clearTimeout(this.settling);
+    this.settling = window.setTimeout(() => this.go(to, false), SETTLED_MS);
+    return true;
+  }
+
+  private write(step = false): void {
+    const query = {
+      runs: writeParts(this.parts),
+      stream: this.stream.value,
+      x: this.axis.value,
+      ...(this.wanted.length > 0 ? { fields: this.wanted.join(",") } : {}),
+      ...(this.zoom ? { zoom: this.zoom.map((at) => at.toFixed(3)).join(",") } : {}),
+    };
+    setAddress({ view: "compare", query }, step);
+  }
+
+  private async load(): Promise<void> {
+    this.loading?.abort();
+    const loading = (this.loading = new AbortController());
+    const { parts, zoom } = this;
+    const stream = this.stream.value;
+    this.showParts();
+    this.add.show(stream, [...new Set(parts.map(({ robot }) => robot))]);
+    this.out.hidden = zoom === undefined;
+    this.note.set(parts.length < 2 ? `Add ${parts.length === 0 ? "two runs" : "another run"} to compare.` : "Loading …");
+    try {
+      const { samples, extent, compared } = await this.loader.load(parts, stream, this.axis.value as Axis, zoom, loading.signal);
+      if (loading.signal.aborted) return;
+      this.extent = extent;
+      [this.grid, this.unit] = [compared.grid, compared.unit];
+      this.charts.set(compared, parts.map(named), zoom ?? extent, this.wanted);
+      if (parts.length >= 2) this.note.set(samples === 0 ? "Nothing was stored in these ranges." : `${number(samples)} samples.`);
+      this.read(0);
+    } catch (error) {
+      if (loading.signal.aborted) return;
+      if (error instanceof NoDistance) {
+        this.axis.value = "time";
+        await this.load();
+        this.note.set(`${error.message} has no distance in ${stream}: it needs a position, or the tachometer and the car's speed_to_erpm_gain. Shown over time.`);
+        return;
+      }
+      this.note.set(error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`);
+    }
+  }
+
+  private showParts(): void {
+    const stream = this.stream.value;
+    this.list.replaceChildren(
+      ...this.parts.map((part, i) => {
+        const [from, to] = part.range;
+        const remove = el("button", { type: "button", class: "close", "aria-label": `Remove ${named(part)}` }, "×");
+        remove.addEventListener("click", () => this.choose(this.parts.filter((_, other) => other !== i)));
+        const link = el("a", { href: route({ view: "history", robot: part.robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, named(part));
+        return el("li", { class: "panel" }, el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }), link, el("span", { class: "note" }, age(to - from)), remove);
+      }),
+    );
+  }
+
+  private read(index: number): void {
+    const at = this.grid[index];
+    if (at === undefined) return;
+    this.at.set(`at ${number(at, 2)} ${this.unit}`);
+    this.charts.read(index);
+  }
+}
+
+function named({ robot, range: [from] }: Part): string {
+  return `${robot}, ${dayTime(from)} ${zone(from)}`;
+}
