@@ -10,7 +10,7 @@ import os
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -20,6 +20,12 @@ from iort_station.errors import StationError
 
 if TYPE_CHECKING:
     import boto3
+    from types_boto3_dynamodb import DynamoDBClient
+    from types_boto3_iot import IoTClient
+    from types_boto3_iot_data import IoTDataPlaneClient
+    from types_boto3_s3 import S3Client
+    from types_boto3_sqs import SQSClient
+    from types_boto3_ssm import SSMClient
 
 # The embedded cloud's description, relative to the checkout.
 EMBEDDED = Path("build/local/cloud.json")
@@ -109,6 +115,20 @@ class Cloud:
     def _clients(self) -> dict[tuple[str, str | None], Any]:
         return {}
 
+    @overload
+    def client(self, service: Literal["dynamodb"], region: str | None = None) -> DynamoDBClient: ...
+    @overload
+    def client(self, service: Literal["iot"], region: str | None = None) -> IoTClient: ...
+    @overload
+    def client(self, service: Literal["iot-data"], region: str | None = None) -> IoTDataPlaneClient: ...
+    @overload
+    def client(self, service: Literal["s3"], region: str | None = None) -> S3Client: ...
+    @overload
+    def client(self, service: Literal["sqs"], region: str | None = None) -> SQSClient: ...
+    @overload
+    def client(self, service: Literal["ssm"], region: str | None = None) -> SSMClient: ...
+    @overload
+    def client(self, service: str, region: str | None = None) -> Any: ...
     def client(self, service: str, region: str | None = None) -> Any:
         """A cached boto3 client; ``region`` is for services that few regions have.
 

@@ -15,7 +15,7 @@ from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.page import AlarmEntry, HistoryAnswer
+    from iort_contract.messages.page import AlarmEntry, Extent, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 
@@ -26,13 +26,16 @@ class View(NamedTuple):
     filled: str
 
 
-LAP = "car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:00:20.000Z"
 # Every view of the page. A new view belongs here: tests then look at it.
 VIEWS = {
     "fleet": View("#/", "[data-robot=car-1]"),
     "car": View("#/car/car-1", ".gauge"),
     "history": View("#/history/car-1", ".history .charts canvas"),
-    "compare": View(f"#/compare?runs={LAP},{LAP}&stream={VESC_STREAM}", ".compare-view .charts canvas"),
+    "compare": View(
+        "#/compare?runs=car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:01:00.000Z,"
+        "car-1/2026-05-04T11:00:00.000Z/2026-05-04T11:01:00.000Z",
+        ".compare-view .charts canvas",
+    ),
     "alarms": View("#/alarms", "[data-alarm=Quarantined] .cases li"),
     "cloudwatch": View("#/cloudwatch", ".log summary"),
 }
@@ -107,7 +110,7 @@ class Lab:
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": [VESC_STREAM]},
-            "runs": runs,
+            "runs": lambda _: runs(),
             "history": history,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
@@ -162,11 +165,11 @@ class Lab:
         }
 
 
-def runs(_asked: Mapping[str, str]) -> dict[str, Any]:
-    extent = {"from_us": round((NOW_S - 3600) * 1e6), "to_us": round(NOW_S * 1e6)}
-    part = {**extent, "batches": 10, "samples": 500}
-    run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 0, "streams": {VESC_STREAM: part}}
-    return {"runs": [run], "older": False, "streams": {VESC_STREAM: extent}}
+def runs() -> RunsAnswer:
+    extent: Extent = {"from_us": round(NOW_S - 60) * 1_000_000, "to_us": round(NOW_S) * 1_000_000}
+    part: RunPart = {**extent, "batches": 60, "samples": 3000}
+    run: Run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 2, "streams": {VESC_STREAM: part}}
+    return {"runs": [run], "older": True, "streams": {VESC_STREAM: extent}}
 
 
 def history(asked: Mapping[str, str]) -> HistoryAnswer:

@@ -147,7 +147,7 @@ def closed(target: Target) -> Seen:
         expired, code = until(refused, "the expiry of an address that was signed for a second")
         unsigned = {method: sent(context, method, url.split("?")[0])[0] for method in ("GET", "PUT")}
     finally:
-        s3.delete_object(**place)
+        s3.delete_object(Bucket=place["Bucket"], Key=place["Key"])
     blocked = s3.get_public_access_block(Bucket=place["Bucket"])["PublicAccessBlockConfiguration"]
     return {
         "expired": expired,

@@ -26,7 +26,7 @@ def _rule(
 ) -> Iterator[str]:
     """A rule for this question; yields its name."""
     iot, name = target.cloud.client("iot"), f"{target.cloud.namespace}_verify_{uuid.uuid4().hex[:8]}"
-    payload = {
+    payload: Any = {
         "sql": f"{select} FROM '{topic}'",
         "awsIotSqlVersion": "2016-03-23",
         "actions": [action],

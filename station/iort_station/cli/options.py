@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -87,26 +90,55 @@ class Range:
     start_us: int | None
     end_us: int | None
 
-    @classmethod
-    def of(cls, start: str | None, end: str | None, last: str | None, usual: str = "all") -> Range:
-        """The range of --from, --to and --last; ``usual`` is the --last of a command without any of them.
+
+@dataclass(frozen=True)
+class When:
+    """The options --from, --to and --last, as they were given; a verb has them by `ranged`."""
+
+    start: From = None
+    end: To = None
+    last: Last = None
+
+    def range(self, usual: str = "all") -> Range:
+        """The range of the options; ``usual`` is the --last of a verb that got none of them.
 
         Raises `UsageError` for a text that is not a time, and if the options contradict one another.
         """
         now_us = time.time_ns() // 1000
-        if start is None and end is None:
-            if last is None and usual != "all":
+        if self.start is None and self.end is None:
+            if self.last is None and usual != "all":
                 say(f"no range is given: the last {usual}; --last all reads everything")
-            last = last or usual
-            return cls(None, None) if last == "all" else cls(now_us - duration_us(last), now_us)
-        if last is not None:
+            last = self.last or usual
+            return Range(None, None) if last == "all" else Range(now_us - duration_us(last), now_us)
+        if self.last is not None:
             raise UsageError("give --last, or --from and --to")
-        for text in (start, end):
+        for text in (self.start, self.end):
             if text is not None and not has_zone(text):
                 zone = datetime.now().astimezone()
                 say(f"{text} is read as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
-        start_us = None if start is None else time_us(start, now_us)
-        end_us = now_us if end is None else time_us(end, now_us)
+        start_us = None if self.start is None else time_us(self.start, now_us)
+        end_us = now_us if self.end is None else time_us(self.end, now_us)
         if start_us is not None and start_us > end_us:
             raise UsageError("the range ends before it starts")
-        return cls(start_us, end_us)
+        return Range(start_us, end_us)
+
+
+def ranged(verb: Callable[..., None]) -> Callable[..., None]:
+    """Give a verb the options of its parameter ``when``, which typer does not know how to read."""
+    hints = get_type_hints(When, include_extras=True)
+    options = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
+        for name, hint in hints.items()
+    ]
+
+    @functools.wraps(verb)
+    def called(**given: Any) -> None:
+        verb(when=When(*(given.pop(name) for name in hints)), **given)
+
+    signature = inspect.signature(verb, eval_str=True)
+    parameters: list[inspect.Parameter] = []
+    for one in signature.parameters.values():
+        parameters += options if one.name == "when" else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+    called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # read by inspect
+    called.__annotations__ = {one.name: one.annotation for one in parameters}
+    return called

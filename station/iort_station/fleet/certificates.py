@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -14,6 +14,9 @@ from cryptography.x509.oid import NameOID
 
 from iort_contract.cloud import fleet_name
 from iort_station.cloud import Cloud
+
+if TYPE_CHECKING:
+    from types_boto3_iot import IoTClient
 
 
 class Certificate(NamedTuple):
@@ -35,7 +38,7 @@ class Made(NamedTuple):
     private_key_pem: str
 
 
-def make(iot: Any, name: str) -> Made:
+def make(iot: IoTClient, name: str) -> Made:
     """Make a key on the curve P-256, which stays on this machine, and an active certificate for it.
 
     Raises botocore's `ClientError` if AWS refuses.
@@ -68,7 +71,7 @@ def attached(cloud: Cloud, robot: str) -> list[Certificate]:
     return sorted((_described(iot, arn) for arn in arns), key=lambda certificate: certificate.created)
 
 
-def _described(iot: Any, arn: str) -> Certificate:
+def _described(iot: IoTClient, arn: str) -> Certificate:
     number = arn.rsplit("/", 1)[-1]
     said = iot.describe_certificate(certificateId=number)["certificateDescription"]
     expires = said.get("validity", {}).get("notAfter")
@@ -88,7 +91,7 @@ def delete(cloud: Cloud, robot: str, certificate: Certificate) -> None:
     once_detached(iot, iot.delete_certificate, certificateId=certificate.id, forceDelete=True)
 
 
-def once_detached(iot: Any, change: Callable[..., Any], **what: Any) -> None:
+def once_detached(iot: IoTClient, change: Callable[..., Any], **what: Any) -> None:
     """Delete something that was just detached: AWS takes seconds to register that, and sends no event."""
     for pause_s in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
         try:

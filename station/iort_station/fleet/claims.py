@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from botocore.exceptions import ClientError
@@ -20,6 +20,9 @@ from iort_station.fleet import certificates, registry
 from iort_station.fleet.bundle import connection, write_private
 from iort_station.fleet.certificates import once_detached
 from iort_station.fleet.robots import F1TENTH
+
+if TYPE_CHECKING:
+    from types_boto3_iot import IoTClient
 
 # AWS' own claims can connect for five minutes; the margin is for one that connects at the end.
 _CLAIM_S = 6 * 60
@@ -103,13 +106,12 @@ def revoke_all(cloud: Cloud) -> int:
     return len(targets)
 
 
-def _serial_of(iot: Any, robot: str) -> dict[str, str]:
+def _serial_of(iot: IoTClient, robot: str) -> dict[str, str]:
     """The serial number of an existing thing, which provisioning must repeat; its name if it has none."""
     try:
         attributes = iot.describe_thing(thingName=robot).get("attributes", {})
     except iot.exceptions.ResourceNotFoundException:
         return {}
     if "serial" not in attributes:
-        merged = {"attributes": {"serial": robot}, "merge": True}
-        iot.update_thing(thingName=robot, attributePayload=merged)
+        iot.update_thing(thingName=robot, attributePayload={"attributes": {"serial": robot}, "merge": True})
     return {"serial": attributes.get("serial", robot)}

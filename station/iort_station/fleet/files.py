@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 from urllib3.exceptions import HTTPError
@@ -18,6 +18,9 @@ from iort_contract.messages.files import FILES_PREFIX, parse_file_key
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+
+if TYPE_CHECKING:
+    from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
 
 _CHUNK_BYTES = 1024 * 1024
 # DeleteObjects takes at most so many keys.
@@ -93,8 +96,9 @@ def download(
     progress(there)
     if there < file.size:
         # The object must be the one of the head.
-        wanted = {"Range": f"bytes={there}-"} if there else {}
-        body = client.get_object(Bucket=bucket, Key=file.key, IfMatch=head["ETag"], **wanted)["Body"]
+        body = client.get_object(Bucket=bucket, Key=file.key, IfMatch=head["ETag"], Range=f"bytes={there}-")[
+            "Body"
+        ]
         with part.open("ab") as written:
             for chunk in _chunks(body, file.key):
                 digest.update(chunk)
@@ -125,8 +129,9 @@ def empty(cloud: Cloud, progress: CountProgress = lambda _count: None) -> None:
         progress(1)
     pages = client.get_paginator("list_objects_v2").paginate(Bucket=bucket)
     keys = iter([one["Key"] for page in pages for one in page.get("Contents", ())])
-    while chunk := [{"Key": key} for key in islice(keys, _DELETE_SIZE)]:
-        answer = client.delete_objects(Bucket=bucket, Delete={"Objects": chunk, "Quiet": True})
+    while chunk := list(islice(keys, _DELETE_SIZE)):
+        objects: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in chunk]
+        answer = client.delete_objects(Bucket=bucket, Delete={"Objects": objects, "Quiet": True})
         if answer.get("Errors"):
             first = answer["Errors"][0]
             raise StationError(f"{first['Key']} cannot be deleted: {first['Code']} {first['Message']}")

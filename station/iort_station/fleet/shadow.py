@@ -9,7 +9,7 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from email.utils import parsedate_to_datetime
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from iort_contract.messages.shadow import (
     Desired,
@@ -23,6 +23,9 @@ from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+
+if TYPE_CHECKING:
+    from types_boto3_iot_data import IoTDataPlaneClient
 
 _POLL_S = 0.3
 # HTTP's Date has whole seconds, so smaller differences may be rounding.
@@ -85,7 +88,7 @@ def over_share(cloud: Cloud, robot: str) -> OverShare | None:
     return _read(cloud.client("iot-data"), robot).desired.over_share
 
 
-def _read(data: Any, robot: str) -> State:
+def _read(data: IoTDataPlaneClient, robot: str) -> State:
     try:
         answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
     except data.exceptions.ResourceNotFoundException:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,12 +62,15 @@ def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Ite
         "ExpressionAttributeNames": names,
         "ExpressionAttributeValues": {":since": {"N": str(since_ms)}},
     }
-    operation = "scan"
-    if robot is not None:
-        operation = "query"
+    dynamodb = cloud.client("dynamodb")
+    pages: Iterable[Mapping[str, Any]]
+    if robot is None:
+        pages = dynamodb.get_paginator("scan").paginate(**request)
+    else:
         request["KeyConditionExpression"] = f"#{ROBOT} = :robot"
         request["ExpressionAttributeValues"][":robot"] = {"S": robot}
-    for page in cloud.client("dynamodb").get_paginator(operation).paginate(**request):
+        pages = dynamodb.get_paginator("query").paginate(**request)
+    for page in pages:
         yield from map(_letter, page["Items"])
 
 
@@ -113,14 +116,14 @@ def recover(cloud: Cloud) -> int:
 
 
 def _depth(cloud: Cloud, queue: str) -> int:
-    names = ["ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible"]
-    answer = cloud.client("sqs").get_queue_attributes(
-        QueueUrl=cloud.output("quarantine", queue), AttributeNames=names
-    )
-    return sum(int(answer["Attributes"][name]) for name in names)
+    counts = cloud.client("sqs").get_queue_attributes(
+        QueueUrl=cloud.output("quarantine", queue),
+        AttributeNames=["ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible"],
+    )["Attributes"]
+    return int(counts["ApproximateNumberOfMessages"]) + int(counts["ApproximateNumberOfMessagesNotVisible"])
 
 
-def _letter(item: dict[str, Any]) -> DeadLetter:
+def _letter(item: Mapping[str, Any]) -> DeadLetter:
     values = plain(item)
     source = values.get(SOURCE, "")
     return DeadLetter(

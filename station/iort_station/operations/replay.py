@@ -174,7 +174,8 @@ def _publish(cloud: Cloud, letter: DeadLetter, batch: Batch) -> str:
     if _stored(cloud, letter.topic, batch):
         return ""
     rule = letter.source.removeprefix(f"{BY_RULE} ")
-    cloud.client("iot-data").publish(topic=f"$aws/rules/{rule}/{letter.topic}", qos=1, payload=letter.payload)
+    topic = f"$aws/rules/{rule}/{letter.topic}"
+    cloud.client("iot-data").publish(topic=topic, qos=1, payload=letter.payload or b"")
     deadline = time.monotonic() + _CONFIRM_S
     while time.monotonic() < deadline:
         if _stored(cloud, letter.topic, batch):

@@ -6,13 +6,17 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import ClientError
 
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, TYPES, built_files
+
+if TYPE_CHECKING:
+    from types_boto3_s3 import S3Client
+    from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
 
 # Names do not change with their content, so a browser must ask each time if a file is still the same.
 _CACHE = "no-cache"
@@ -30,7 +34,7 @@ def files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
     }
 
 
-def upload(s3: Any, bucket: str, content: Mapping[str, bytes]) -> list[str]:
+def upload(s3: S3Client, bucket: str, content: Mapping[str, bytes]) -> list[str]:
     """Make the bucket hold exactly ``content``; returns the other keys, which are deleted.
 
     The page itself comes last, after the files that it needs.
@@ -43,7 +47,7 @@ def upload(s3: Any, bucket: str, content: Mapping[str, bytes]) -> list[str]:
         entry["Key"] for page in pages for entry in page.get("Contents", []) if entry["Key"] not in content
     ]
     for at in range(0, len(old), _MANY):
-        gone = [{"Key": key} for key in old[at : at + _MANY]]
+        gone: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in old[at : at + _MANY]]
         s3.delete_objects(Bucket=bucket, Delete={"Objects": gone, "Quiet": True})
     return old
 

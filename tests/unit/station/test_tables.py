@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from iort_station.cli import tables
-from iort_station.cli.options import Range
+from iort_station.cli.options import Range, When
 from iort_station.data import Result
 from iort_station.errors import StationError
 from iort_station.recordings import tabular
@@ -141,16 +141,16 @@ def test_a_long_text_is_folded():
 
 
 def test_ranges_are_parsed(capsys):
-    assert Range.of(None, None, "all") == Range(None, None)
-    found = Range.of(None, None, "2s")
+    assert When(last="all").range() == Range(None, None)
+    found = When(last="2s").range()
     assert found.end_us - found.start_us == 2_000_000
-    found = Range.of("2023-11-14T22:13:20Z", "2023-11-14T22:13:21Z", None)
+    found = When("2023-11-14T22:13:20Z", "2023-11-14T22:13:21Z").range()
     assert (found.start_us, found.end_us) == (1_700_000_000_000_000, 1_700_000_001_000_000)
     assert capsys.readouterr().err == ""
-    Range.of("2023-11-14T22:13:20", None, None)
+    When("2023-11-14T22:13:20").range()
     assert "this machine's zone" in capsys.readouterr().err
-    assert Range.of(None, None, None) == Range(None, None)
-    found = Range.of(None, None, None, "5m")
+    assert When().range() == Range(None, None)
+    found = When().range("5m")
     assert found.end_us - found.start_us == 300_000_000
     assert "--last all" in capsys.readouterr().err
 
@@ -158,7 +158,7 @@ def test_ranges_are_parsed(capsys):
 @pytest.mark.parametrize("options", [("-1m", None, "1m"), ("now", "-1m", None), (None, None, "soon")])
 def test_invalid_ranges_are_refused(options):
     with pytest.raises(StationError):
-        Range.of(*options)
+        When(*options).range()
 
 
 def written(to, found):

@@ -4,7 +4,7 @@ import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { gestures } from "./gestures";
 import type { Range } from "../base/range";
-import { clockTime, dayTime, number, zone } from "../base/format";
+import { dayTime, number, zone } from "../base/format";
 import { colour, onTheme } from "../base/theme";
 import { Spoken, type About } from "./spoken";
 
@@ -118,11 +118,11 @@ export class RangeChart {
       ...options.about,
       lines: options.curves.map(({ label }) => label),
       range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${dayTime(this.range[1])} ${zone(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
-      at: (x) => (unit === undefined ? clockTime(x) : `${number(x, 2)} ${unit}`),
+      at: (x) => (unit === undefined ? dayTime(x, { fractionalSecondDigits: 1 }) : `${number(x, 2)} ${unit}`),
       timeless: unit !== undefined,
       band: options.band ?? false,
     });
-    if (hands) this.listen(hands);
+    if (hands) this.listen(host, hands);
     fit(host, this.plot, () => {});
     this.themed = onTheme(() => {
       read();
@@ -159,7 +159,14 @@ export class RangeChart {
     this.plot.destroy();
   }
 
-  private listen(hands: Hands): void {
+  private listen(host: HTMLElement, hands: Hands): void {
+    host.addEventListener("keydown", (event) => {
+      if (event.key === "-") hands.back();
+      if (event.key !== "+") return;
+      const [from, to] = this.range;
+      const at = this.plot.data[0][this.plot.cursor.idx ?? -1] ?? (from + to) / 2;
+      hands.zoom([at - (at - from) / 2, at + (to - at) / 2]);
+    });
     const { over } = this.plot;
     let at = 0;
     over.addEventListener("mousedown", (event) => {

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import tell
-from iort_station.cli.options import SHORT, AsJson, Force, From, Last, Range, Robot, To, to_file
+from iort_station.cli.options import SHORT, AsJson, Force, Robot, When, ranged, to_file
 from iort_station.cli.progress import reading
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
@@ -18,14 +18,13 @@ commands = typer.Typer()
 
 
 @commands.command("export", epilog=examples("export car7 vesc --last 10m --out car7.mcap"))
+@ranged
 def export(
     context: typer.Context,
     robot: Robot,
+    when: When,
     streams: Annotated[list[str], typer.Argument(help="One stream or more, for example vesc.")],
     out: Annotated[Path, to_file("The file to write: .mcap or .bag.")],
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -45,13 +44,13 @@ def export(
     if kind is None:
         raise UsageError(f"the file must end in {' or '.join(recordings.KINDS)}, got {out}")
     check_free(out, force=force)
-    when = Range.of(start, end, last, SHORT)
+    within = when.range(SHORT)
     cloud = context.obj.cloud()
     written = 0
     with kind(out, force=force) as file:
         for stream in dict.fromkeys(streams):
-            selection = select(robot, stream, when.start_us, when.end_us)
-            with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
+            selection = select(robot, stream, within.start_us, within.end_us)
+            with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
                 written += write(cloud, selection, file, say=say, progress=progress)
         if not written:
             for stream in streams:

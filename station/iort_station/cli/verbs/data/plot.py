@@ -16,14 +16,13 @@ from iort_station.cli.options import (
     Every,
     Fields,
     Force,
-    From,
-    Last,
     Range,
     Robot,
     Stream,
-    To,
+    When,
     Where,
     names,
+    ranged,
     to_file,
 )
 from iort_station.cli.progress import reading
@@ -57,18 +56,17 @@ class Align(str, Enum):
         "plot car7 pose --kind trajectory --last 10m --out track.png",
     ),
 )
+@ranged
 def plot(
     context: typer.Context,
     robot: Robot,
     stream: Stream,
+    when: When,
     out: Annotated[Path, to_file("The picture: .png, .svg or .pdf.")],
     kind: Annotated[
         Kind, typer.Option(help="Fields over time, the way from above, or the distribution of values.")
     ] = Kind.time,
     fields: Fields = None,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     also: Annotated[list[str] | None, typer.Option("--with", help="Another robot; may be repeated.")] = None,
     runs: Annotated[
         list[str] | None,
@@ -92,9 +90,9 @@ def plot(
 
     plots.check_ending(out)
     check_free(out, force=force)
-    if runs and (start, end, last) != (None, None, None):
+    if runs and when != When():
         raise UsageError("give either --run or --from, --to and --last")
-    ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last, SHORT)]
+    ranges = [_run(run) for run in runs] if runs else [when.range(SHORT)]
     cloud = context.obj.cloud()
     wanted = names(fields)
     drawn: list[plots.Run] = []
@@ -139,4 +137,4 @@ def _run(text: str) -> Range:
         raise UsageError(
             f"--run must be FROM/TO, for example 2026-05-04T10:00Z/2026-05-04T10:05Z, got {text!r}"
         )
-    return Range.of(first, last, None)
+    return When(first, last).range()

@@ -17,14 +17,12 @@ from iort_station.cli.options import (
     Every,
     Fields,
     Force,
-    From,
-    Last,
-    Range,
     Robot,
     Stream,
-    To,
+    When,
     Where,
     names,
+    ranged,
     to_file,
 )
 from iort_station.cli.progress import reading
@@ -62,13 +60,12 @@ class On(str, Enum):
         "query car7 vesc --last 7d --format parquet --out car7.parquet",
     ),
 )
+@ranged
 def query(
     context: typer.Context,
     robot: Robot,
     stream: Stream,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
+    when: When,
     fields: Fields = None,
     where: Where = None,
     every: Every = None,
@@ -102,16 +99,16 @@ def query(
         raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
     if out is not None:
         check_free(out, force=force)
-    when = Range.of(start, end, last, SHORT)
+    within = when.range(SHORT)
     cloud = context.obj.cloud()
     began = time.monotonic()
-    with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
+    with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
         result = data.query(
             cloud,
             robot,
             stream,
-            when.start_us,
-            when.end_us,
+            within.start_us,
+            within.end_us,
             fields=names(fields),
             where=where,
             every=every,

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from iort_contract.messages.page import Run
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.data.runs import runs as find
@@ -24,12 +24,11 @@ Gaps = dict[tuple[str, str], list[Missing]]
 
 
 @commands.command("runs", epilog=examples("runs car7", "runs car7 --last 7d --gaps"))
+@ranged
 def runs(
     context: typer.Context,
     robot: Robot,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
+    when: When,
     count: Annotated[int, typer.Option(min=1, max=1000, help="The most runs to list; the newest.")] = 20,
     with_gaps: Annotated[
         bool, typer.Option("--gaps", help="Count missing batches; reads every batch of the listed runs.")
@@ -42,7 +41,7 @@ def runs(
     agent, up to its last report (every 30 s, and at a proper end). Lost is what the agent says it could not
     record.
     """
-    within, cloud = Range.of(start, end, last), context.obj.cloud()
+    within, cloud = when.range(), context.obj.cloud()
     gaps: Gaps = {}
     with errors.status("reading") as status:
         found = find(cloud, robot, start_us=within.start_us, end_us=within.end_us, count=count)

@@ -13,7 +13,7 @@ import typer
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_station.cli import completion, console
-from iort_station.cli.options import AsJson, Force, From, Last, Range, Robot, To, Yes, agreed, to_file
+from iort_station.cli.options import AsJson, Force, Range, Robot, When, Yes, agreed, ranged, to_file
 from iort_station.cli.progress import bar
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
@@ -30,21 +30,20 @@ _Name = Annotated[str, typer.Option(help="Only names that match, for example '*.
 
 
 @commands.command("list", epilog=examples("files list car7 --name '*.bag' --last 7d"))
+@ranged
 def list_(
     context: typer.Context,
     robot: Robot,
+    when: When,
     name: _Name = "*",
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     as_json: AsJson = False,
 ) -> None:
     """List a robot's files in the order of their time. With --json, print a line of JSON for each.
 
     The files of a robot that is no longer registered stay, and are listed.
     """
-    when, one = Range.of(start, end, last), None
-    for one in _chosen(context.obj.cloud(), robot, name, when):
+    within, one = when.range(), None
+    for one in _chosen(context.obj.cloud(), robot, name, within):
         text = f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}"
         console.out.print(json.dumps(_as_json(one)) if as_json else text, soft_wrap=True)
     if one is None:
@@ -52,9 +51,11 @@ def list_(
 
 
 @commands.command("get", epilog=examples("files get car7 --name '*.bag' --out bags"))
+@ranged
 def get(
     context: typer.Context,
     robot: Robot,
+    when: When,
     which: Annotated[
         list[str] | None,
         typer.Argument(
@@ -63,9 +64,6 @@ def get(
         ),
     ] = None,
     name: _Name = "*",
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     out: Annotated[Path, to_file("The folder to write the files into.")] = Path(),
     force: Force = False,
     as_json: AsJson = False,
@@ -74,9 +72,9 @@ def get(
 
     Files of the same name get a folder for each time. An interrupted download continues.
     """
-    when = Range.of(start, end, last)
+    within = when.range()
     cloud = context.obj.cloud()
-    found = list(_chosen(cloud, robot, name, when))
+    found = list(_chosen(cloud, robot, name, within))
     if which:
         found = [_newest(found, robot, one) for one in which]
     if not found:
@@ -100,9 +98,9 @@ def empty(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> 
     console.tell({"deleted": sum(counts)}, f"{sum(counts)} deleted", as_json=as_json)
 
 
-def _chosen(cloud: Cloud, robot: str, name: str, when: Range) -> Iterator[StoredFile]:
+def _chosen(cloud: Cloud, robot: str, name: str, within: Range) -> Iterator[StoredFile]:
     one = None
-    for one in files.listed(cloud, robot, start_us=when.start_us, end_us=when.end_us):
+    for one in files.listed(cloud, robot, start_us=within.start_us, end_us=within.end_us):
         if fnmatch.fnmatch(one.name, name):
             yield one
     if one is None and next(files.listed(cloud, robot), None) is None:

@@ -30,7 +30,7 @@ from iort_contract.tables import (
 )
 from iort_station.cli import completion
 from iort_station.cli.console import Console, errors, out, print_json, tell
-from iort_station.cli.options import AsJson, From, Last, Range, Robot, Yes, agreed
+from iort_station.cli.options import AsJson, From, Last, Robot, When, Yes, agreed
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import examples, say
@@ -71,7 +71,7 @@ def set_(
     they are. A second run changes nothing; after an interruption it does the rest.
     """
     vehicle = robots.checked_vehicle(dict(_parameter(text) for text in parameters))
-    from_us = Range.of(start, None, last).start_us
+    from_us = When(start, last=last).range().start_us
     cloud = context.obj.cloud()
     before = registry.set_vehicle(cloud, name, vehicle)
     for key, value in vehicle.items():

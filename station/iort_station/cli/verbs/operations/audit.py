@@ -14,7 +14,7 @@ from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, From, Last, Range, Robot, To
+from iort_station.cli.options import AsJson, Range, Robot, When, ranged
 from iort_station.cli.words import examples
 from iort_station.data import inventory
 from iort_station.errors import UsageError
@@ -28,9 +28,11 @@ _LISTED = 20
 
 
 @commands.command("audit", epilog=examples("audit car7 --last 1h"))
+@ranged
 def audit_(
     context: typer.Context,
     robot: Robot,
+    when: When,
     streams: Annotated[
         list[str] | None,
         typer.Option(
@@ -39,9 +41,6 @@ def audit_(
             autocompletion=completion.streams,
         ),
     ] = None,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     late: Annotated[
         str, typer.Option(help="Count a batch as late if it took so much longer than the fastest.")
     ] = "5s",
@@ -56,7 +55,7 @@ def audit_(
     agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
     and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
-    within, late_us = Range.of(start, end, last), duration_us(late)
+    within, late_us = when.range(), duration_us(late)
     cloud = context.obj.cloud()
     try:
         check_robot(robot)

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, From, Last, OneRobot, Range, To
+from iort_station.cli.options import AsJson, OneRobot, Range, When, ranged
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.operations import quarantine
@@ -22,24 +22,23 @@ _HEX_WIDTH = 16
 
 
 @commands.command("errors", epilog=examples("errors --robot car7 --last 1h"))
+@ranged
 def errors_(
     context: typer.Context,
+    when: When,
     entry_id: Annotated[
         str | None, typer.Argument(metavar="ID", help="Show this message with its bytes.")
     ] = None,
     robot: OneRobot = None,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     as_json: AsJson = False,
 ) -> None:
     """List the messages that were rejected or could not be processed, or show one."""
-    when = Range.of(start, end, last)
+    within = when.range()
     cloud = context.obj.cloud()
     if entry_id is not None:
         _show(quarantine.find(cloud, entry_id), as_json=as_json)
         return
-    found = sorted(entries(cloud, robot, when), key=lambda entry: (entry.last_ms, entry.id))
+    found = sorted(entries(cloud, robot, within), key=lambda entry: (entry.last_ms, entry.id))
     waiting = quarantine.waiting(cloud)
     if as_json:
         print_json({"entries": [as_fields(entry) for entry in found], "waiting": asdict(waiting)})
@@ -54,10 +53,10 @@ def errors_(
         errors.print(f"{waiting.last} that the table did not take: `iort replay-errors` tries again")
 
 
-def entries(cloud: Cloud, robot: str | None, when: Range) -> list[DeadLetter]:
+def entries(cloud: Cloud, robot: str | None, within: Range) -> list[DeadLetter]:
     """The rejected messages that were seen in a range."""
-    found = quarantine.entries(cloud, robot=robot, since_ms=(when.start_us or 0) // 1000)
-    return [entry for entry in found if when.end_us is None or entry.first_ms * 1000 < when.end_us]
+    found = quarantine.entries(cloud, robot=robot, since_ms=(within.start_us or 0) // 1000)
+    return [entry for entry in found if within.end_us is None or entry.first_ms * 1000 < within.end_us]
 
 
 def _print(entry: DeadLetter) -> None:

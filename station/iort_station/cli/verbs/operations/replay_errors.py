@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, DryRun, From, Last, OneRobot, Range, To
+from iort_station.cli.options import AsJson, DryRun, OneRobot, When, ranged
 from iort_station.cli.progress import bar
 from iort_station.cli.verbs.operations.errors import as_fields, entries, one_line
 from iort_station.cli.words import examples
@@ -19,12 +19,11 @@ commands = typer.Typer()
 
 
 @commands.command("replay-errors", epilog=examples("replay-errors --robot car7 --dry-run"))
+@ranged
 def replay_errors(
     context: typer.Context,
+    when: When,
     robot: OneRobot = None,
-    start: From = None,
-    end: To = None,
-    last: Last = None,
     dry_run: DryRun = False,
     again: Annotated[
         bool, typer.Option("--again", help=f"Also messages replayed {replay.MAX_REPLAYS} times already.")
@@ -34,11 +33,11 @@ def replay_errors(
     """Process rejected recordings again, and delete those that arrive.
 
     Exit status 1 if any fails again."""
-    when = Range.of(start, end, last)
+    within = when.range()
     cloud = context.obj.cloud()
     if not dry_run and (moved := quarantine.recover(cloud)):
         errors.print(f"{moved} messages that the table did not take are on the way to it again")
-    found = sorted(entries(cloud, robot, when), key=lambda entry: (entry.first_ms, entry.id))
+    found = sorted(entries(cloud, robot, within), key=lambda entry: (entry.first_ms, entry.id))
     outcomes = []
     with bar("putting back", len(found)) as progress:
         for outcome in replay.replay(cloud, found, dry_run=dry_run, again=again):
