@@ -15,7 +15,7 @@ from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.page import AlarmEntry, HistoryAnswer
+    from iort_contract.messages.page import AlarmEntry, Extent, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 
@@ -31,6 +31,11 @@ VIEWS = {
     "fleet": View("#/", "[data-robot=car-1]"),
     "car": View("#/car/car-1", ".gauge"),
     "history": View("#/history/car-1", ".history .charts canvas"),
+    "compare": View(
+        "#/compare?runs=car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:01:00.000Z,"
+        "car-1/2026-05-04T11:00:00.000Z/2026-05-04T11:01:00.000Z",
+        ".compare-view .charts canvas",
+    ),
     "alarms": View("#/alarms", "[data-alarm=Quarantined] .cases li"),
     "cloudwatch": View("#/cloudwatch", ".log summary"),
 }
@@ -105,7 +110,7 @@ class Lab:
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": [VESC_STREAM]},
-            "runs": lambda _: {"runs": []},
+            "runs": lambda _: runs(),
             "history": history,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
@@ -158,6 +163,13 @@ class Lab:
                 for i, widget in enumerate(widgets)
             ],
         }
+
+
+def runs() -> RunsAnswer:
+    extent: Extent = {"from_us": round(NOW_S - 60) * 1_000_000, "to_us": round(NOW_S) * 1_000_000}
+    part: RunPart = {**extent, "batches": 60, "samples": 3000}
+    run: Run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 2, "streams": {VESC_STREAM: part}}
+    return {"runs": [run], "older": True, "streams": {VESC_STREAM: extent}}
 
 
 def history(asked: Mapping[str, str]) -> HistoryAnswer:

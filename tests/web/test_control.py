@@ -1,4 +1,4 @@
-"""What the page has its server do with a car: one command, and its answer. A static site offers neither."""
+"""What the page has its server do with a car: commands and settings. A static site offers neither."""
 
 from __future__ import annotations
 
@@ -24,7 +24,29 @@ class Robot:
 
     def __init__(self) -> None:
         self.sent: list[dict[str, Any]] = []
+        self.online = True
+        rate = {"name": "live.rate_hz", "kind": "number", "low": 0.1, "high": 10.0, "unit": "Hz", "names": []}
+        self.told: dict[str, dict[str, Any]] = {
+            "live.rate_hz": {**rate, "value": "10", "desired": False, "pending": "", "reason": ""}
+        }
         self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
+
+    def settings(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        return {"settings": [dict(one) for one in self.told.values()], "online": self.online}
+
+    def set(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        """Take all but rates above 5 Hz."""
+        self.sent.append(dict(asked))
+        entry = self.told[asked["name"]]
+        if not self.online:
+            entry["pending"], entry["desired"] = asked["value"], True
+        elif "value" not in asked:
+            entry["value"], entry["desired"] = "10", False
+        elif float(asked["value"]) > 5:
+            return self.settings({}) | {"settings": [{**entry, "reason": "rate_hz must be at most 5"}]}
+        else:
+            entry["value"], entry["desired"] = asked["value"], True
+        return self.settings({})
 
     def send(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.sent.append({**asked, "message": json.loads(asked["message"])})
@@ -41,7 +63,9 @@ def robot() -> Robot:
 @pytest.fixture
 def served(pubnub: PubNubStandIn, robot: Robot) -> Iterator[str]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", actions={"send": robot.send}, **told) as server:
+    with PageServer(
+        namespace="iort", actions={"send": robot.send, "settings": robot.settings, "set": robot.set}, **told
+    ) as server:
         yield server.url
 
 
@@ -51,7 +75,7 @@ def test_a_command_is_sent_and_its_answer_shown(
     page = open_page(f"{served}#/car/car-1")
     show(page, car.send())
     page.get_by_role("heading", name="Commands").click()
-    said = page.locator(".said")
+    said = page.locator(".control .said")
     page.fill("[name=speed]", "1.2")
     page.fill("[name=turn]", "-0.1")
     page.fill("[name=lease]", "800")
@@ -79,6 +103,36 @@ def test_a_command_is_sent_and_its_answer_shown(
     until(lambda: said.inner_text() == "there is no such command", "the server's refusal")
 
 
+def test_a_setting_is_checked_changed_and_reset(
+    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+) -> None:
+    page = open_page(f"{served}#/car/car-1")
+    show(page, car.send())
+    page.get_by_role("heading", name="Settings").click()
+    rate, row = page.locator("[name='live.rate_hz']"), page.locator(".setting").first
+    until(lambda: rate.count() == 1 and rate.input_value() == "10", "the value in force")
+    # A stream's fields can be selected, too.
+    assert page.locator(".setting [name='fields.vesc']").count() == 1
+    rate.fill("11")
+    row.get_by_role("button", name="Set").click()
+    assert not robot.sent
+    rate.fill("8")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: "rejected: rate_hz must be at most 5" in row.inner_text(), "the rejection")
+    assert rate.input_value() == "10"
+    rate.fill("2.5")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: row.get_by_role("button", name="Reset").is_visible(), "the new value")
+    assert (rate.input_value(), robot.sent[-1]["value"]) == ("2.5", "2.5")
+    row.get_by_role("button", name="Reset").click()
+    until(lambda: rate.input_value() == "10", "the file's value")
+    robot.online = False
+    rate.fill("3")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: "pending; in force is 10" in row.inner_text(), "the pending value")
+
+
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
     show(page, car.send())
     assert page.get_by_role("heading", name="Commands").count() == 0
+    assert page.get_by_role("heading", name="Settings").count() == 0

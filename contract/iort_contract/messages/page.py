@@ -114,6 +114,36 @@ class DashboardsAnswer(TypedDict):
     dashboards: list[str]
 
 
+class SettingKind(TypedDict):
+    """What values a setting has."""
+
+    kind: Literal["flag", "number", "choice", "fields"]
+    low: float
+    high: float
+    unit: str
+    names: list[str]
+
+
+class SettingEntry(SettingKind):
+    """A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's.
+    ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it
+    was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has
+    not taken yet; ``reason`` says why it rejected the last one."""
+
+    name: str
+    value: str
+    desired: bool
+    pending: str
+    reason: str
+
+
+class SettingsAnswer(TypedDict):
+    """Answers ``settings`` and ``set``."""
+
+    settings: list[SettingEntry]
+    online: bool
+
+
 class SendAnswer(TypedDict):
     """Answers ``send``: null if the robot did not answer, or its reason if it rejected the command."""
 
@@ -263,4 +293,5 @@ Answer = Union[
     RejectedAnswer,
     RunsAnswer,
     SendAnswer,
+    SettingsAnswer,
 ]

@@ -25,17 +25,17 @@ class Measured(NamedTuple):
 # One second with this many samples. In a shorter batch above 50 Hz values change less between samples, so it
 # is up to a quarter smaller than in this table.
 TABLE = (
-    Measured(1, 257, 240, 377),
-    Measured(2, 273, 256, 515),
-    Measured(5, 329, 312, 532),
-    Measured(10, 374, 356, 540),
-    Measured(20, 462, 444, 546),
-    Measured(50, 746, 728, 569),
-    Measured(100, 1055, 1036, 562),
-    Measured(200, 1571, 1552, 572),
-    Measured(500, 3019, 3000, 563),
-    Measured(1000, 5364, 5344, 563),
-    Measured(2000, 10132, 10112, 579),
+    Measured(1, 257, 240, 383),
+    Measured(2, 281, 264, 540),
+    Measured(5, 337, 320, 557),
+    Measured(10, 398, 380, 552),
+    Measured(20, 498, 480, 573),
+    Measured(50, 734, 716, 589),
+    Measured(100, 1043, 1024, 586),
+    Measured(200, 1551, 1532, 587),
+    Measured(500, 3087, 3068, 580),
+    Measured(1000, 5444, 5424, 576),
+    Measured(2000, 10280, 10260, 581),
 )
 
 
@@ -53,7 +53,7 @@ class Sizes:
     ping: int = 71
     update: int = 480
     sample: int = 356
-    sample_item: int = 276
+    sample_item: int = 277
 
 
 def sizes_of(rate_hz: float, batch_s: float) -> Sizes:

@@ -1,24 +1,38 @@
-"""What the page may have its server do with a robot: send one command, as `iort send`."""
+"""What the page's server does with a robot: one command, as `iort send`, and settings, as `iort config`."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
 
+from iort_contract.limits import ContractError
 from iort_contract.messages.commands import MAX_LEASE_MS
-from iort_contract.messages.page import SendAnswer
+from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
+from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, Flag, Number, check_setting
+from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import commands
+from iort_station.fleet import commands, registry
+from iort_station.fleet import settings as fleet_settings
+from iort_station.fleet.shadow import Shadow, State
 from iort_station.page.answers import text, whole
 from iort_station.page.server import Answer
 
+# A viewer waits for it.
+_ANSWER_S = 10.0
+
 
 def actions(cloud: Cloud) -> dict[str, Answer]:
-    """Every action that moves or changes a robot, by its name; only for a server on loopback."""
-    return {"send": lambda asked: send(cloud, asked)}
+    """What moves or changes a robot, by its name; only for a server on loopback."""
+    return {
+        "send": lambda asked: send(cloud, asked),
+        "settings": lambda asked: settings(cloud, asked),
+        "set": lambda asked: change(cloud, asked),
+    }
 
 
 def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
@@ -37,3 +51,69 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
         return {"accepted": None, "reason": "", "after_ms": after_ms}
     accepted = sent.outcome == ACCEPTED
     return {"accepted": accepted, "reason": "" if accepted else sent.outcome, "after_ms": after_ms}
+
+
+def settings(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+    """The settings of ``robot``: those in force, and what is pending."""
+    robot = text(asked, "robot")
+    state = Shadow(cloud, robot).read()
+    return {"settings": _entries(state, {}), "online": bool(registry.get(cloud, robot).get(ONLINE))}
+
+
+def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+    """Change the setting ``name`` of ``robot`` to ``value``; without a value, car.yaml's applies again."""
+    robot, name = text(asked, "robot"), text(asked, "name")
+    value = _parsed(name, asked["value"]) if "value" in asked else None
+    changed = fleet_settings.change(cloud, robot, {name: value}, _ANSWER_S)
+    reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
+    return {"settings": _entries(changed.state, reasons), "online": changed.online}
+
+
+def _parsed(name: str, written: str) -> Any:
+    value: Any = written
+    if name.startswith(f"{FIELDS}."):
+        value = [field.strip() for field in written.split(",") if field.strip()]
+    elif not isinstance(SETTINGS.get(name), Choice):
+        with suppress(ValueError):  # refused below
+            value = json.loads(written)
+    try:
+        check_setting(name, value)
+    except ContractError as error:
+        raise StationError(f"{error}; nothing is changed") from error
+    return value
+
+
+def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
+    in_force, desired, pending = state.reported.settings, state.desired.settings, state.pending()
+    selections = sorted(name for name in {*in_force, *desired} if name.startswith(f"{FIELDS}."))
+    rejected = {name: one.reason for name, one in state.reported.rejected.items()}
+    return [
+        {
+            **_kind(SETTINGS.get(name)),
+            "name": name,
+            "value": _written(in_force.get(name)),
+            # A rejected change is withdrawn.
+            "desired": name in desired and name not in reasons,
+            "pending": _written(pending.get(name)),
+            "reason": reasons.get(name) or rejected.get(name, ""),
+        }
+        for name in (*SETTINGS, *selections)
+    ]
+
+
+def _kind(setting: Flag | Number | Choice | None) -> SettingKind:
+    """The part of an entry that the contract knows; None is a selection of fields."""
+    plain: SettingKind = {"kind": "fields", "low": 0.0, "high": 0.0, "unit": "", "names": []}
+    if isinstance(setting, Number):
+        return {**plain, "kind": "number", "low": setting.low, "high": setting.high, "unit": setting.unit}
+    if isinstance(setting, Choice):
+        return {**plain, "kind": "choice", "names": list(setting.names)}
+    return {**plain, "kind": "flag"} if isinstance(setting, Flag) else plain
+
+
+def _written(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:g}"
+    return ",".join(map(str, value)) if isinstance(value, list) else json.dumps(value).strip('"')

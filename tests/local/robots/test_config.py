@@ -9,8 +9,9 @@ import pytest
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_station.errors import UsageError
+from iort_station.errors import StationError, UsageError
 from iort_station.operations import delivery
+from iort_station.page import control
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import driving
 
@@ -105,6 +106,18 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
     with driving(car):
         # It accepts no motion before it knows the cloud's clock.
         until(lambda: iort(*asked).exit_code == 0)
+        # The page's server does what both commands do.
+        again = {"robot": car.robot, "command": "drive", "message": '{"drive": {"speed": -1.0}}'}
+        assert control.send(embedded.cloud, again)["reason"].startswith("without lease, sent ")
+        assert control.send(embedded.cloud, {**again, "lease_ms": "3000"})["accepted"]
+        rate = {"robot": car.robot, "name": "live.rate_hz", "value": "4"}
+        told = control.change(embedded.cloud, rate)["settings"]
+        (entry,) = (one for one in told if one["name"] == "live.rate_hz")
+        assert (entry["value"], entry["desired"], entry["pending"]) == ("4", True, "")
+        sped = control.change(embedded.cloud, {**rate, "name": "fields.vesc", "value": "sped"})["settings"]
+        assert "did you mean speed?" in sped[-1]["reason"]
+        with pytest.raises(StationError, match="got 40; nothing is changed"):
+            control.change(embedded.cloud, {**rate, "value": "40"})
         ended = "command drive: nobody renews it, stopping"
         until(lambda: ended in recorded(LOG_STREAM, "text"))
         # Then its own driver drives on.

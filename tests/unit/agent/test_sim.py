@@ -207,7 +207,7 @@ def test_a_command_drives_the_car_until_its_lease_ends_and_then_it_finds_its_lap
     car.drive(3)
     car.rig.send({"drive": {"speed": 1.0, "steering_angle": 0.3}}, name="drive", lease_ms=4000)
     driven = car.drive(4)
-    assert driven[-1][0] == pytest.approx(1.0, abs=0.15)
+    assert driven[-1][0] == pytest.approx(1.0, abs=0.03)
     turned = sum(wrapped(b[1].heading_rad - a[1].heading_rad) for a, b in zip(driven, driven[1:]))
     assert turned > 3, "it turns to the left"
     stopped = car.drive(1)
@@ -224,7 +224,7 @@ def test_a_command_reverses_stops_and_holds() -> None:
     car.drive(1)
     car.rig.send({"drive": {"speed": -1.0}}, name="drive", lease_ms=5000)
     speeds = [speed for speed, _ in car.drive(3)]
-    assert speeds[-1] == pytest.approx(-1.0, abs=0.15)
+    assert speeds[-1] == pytest.approx(-1.0, abs=0.03)
     sample = car.vehicle.sample()
     assert sample["duty_cycle"] < 0
     assert sample["displacement"] < sample["distance_traveled"]

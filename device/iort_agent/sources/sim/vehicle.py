@@ -137,9 +137,12 @@ class Vehicle:
         )
 
     def _throttle(self, target_mps: float, dt: float) -> None:
-        """Set the motor current in proportion to the missing speed, within the limits."""
+        """Set the motor current in proportion to the missing speed, and to hold it, within the limits."""
         c = self._config
         wanted = (target_mps - self._speed_mps) * c.mass_kg * 4 / self._newtons_per_amp
+        if target_mps:
+            held = math.copysign(self._resistance_n(target_mps), target_mps)
+            wanted += held / c.drivetrain_efficiency / self._newtons_per_amp
         # Against the motion it brakes, as far as the car moves.
         forwards = c.max_current_a if self._speed_mps >= 0 else c.max_brake_current_a
         backwards = c.max_current_a if self._speed_mps <= 0 else c.max_brake_current_a
@@ -155,15 +158,18 @@ class Vehicle:
         force = self._current_a * self._newtons_per_amp
         # The losses of the gears always work against the motion.
         force *= c.drivetrain_efficiency if force * before >= 0 else 1 / c.drivetrain_efficiency
-        way = math.copysign(1.0, before or force)
-        drag = way * 0.5 * 1.2 * c.drag_area_m2 * before**2
-        rolling = way * c.rolling_resistance * c.mass_kg * _G
-        if before == 0 and abs(force) <= abs(rolling):
+        resistance = self._resistance_n(before)
+        if before == 0 and abs(force) <= resistance:
             return 0.0
-        after = before + (force - drag - rolling) / c.mass_kg * dt
+        after = before + (force - math.copysign(resistance, before or force)) / c.mass_kg * dt
         # A car that brakes to a stand stands.
         self._speed_mps = after if before * after >= 0 else 0.0
         return (before + self._speed_mps) / 2
+
+    def _resistance_n(self, speed_mps: float) -> float:
+        """The drag of the air and of the wheels."""
+        c = self._config
+        return 0.5 * 1.2 * c.drag_area_m2 * speed_mps**2 + c.rolling_resistance * c.mass_kg * _G
 
     def _move(self, speed_mps: float, steering_rad: float, dt: float) -> None:
         """Turn the wheels, and move along the arc of a bicycle, or of what the tyres hold."""

@@ -398,6 +398,35 @@ export interface DashboardsAnswer {
   readonly dashboards: readonly string[];
 }
 
+/** What values a setting has. */
+export interface SettingKind {
+  readonly kind: "flag" | "number" | "choice" | "fields";
+  readonly low: number;
+  readonly high: number;
+  readonly unit: string;
+  readonly names: readonly string[];
+}
+
+/** A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's. ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has not taken yet; ``reason`` says why it rejected the last one. */
+export interface SettingEntry {
+  readonly kind: "flag" | "number" | "choice" | "fields";
+  readonly low: number;
+  readonly high: number;
+  readonly unit: string;
+  readonly names: readonly string[];
+  readonly name: string;
+  readonly value: string;
+  readonly desired: boolean;
+  readonly pending: string;
+  readonly reason: string;
+}
+
+/** Answers ``settings`` and ``set``. */
+export interface SettingsAnswer {
+  readonly settings: readonly SettingEntry[];
+  readonly online: boolean;
+}
+
 /** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */
 export interface SendAnswer {
   readonly accepted: boolean | null;

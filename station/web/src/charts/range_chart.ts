@@ -3,6 +3,7 @@
 import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { gestures } from "./gestures";
+import { Spoken, type About } from "./spoken";
 import type { Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
 
@@ -41,6 +42,8 @@ export interface RangeChartOptions {
   readonly unit?: string;
   readonly onCursor?: (index: number | null) => void;
   readonly hands?: Hands;
+  /** The chart in words; without it, it is only for the eye. */
+  readonly about?: About;
 }
 
 // A shorter drag is a click.
@@ -52,6 +55,7 @@ let dragged: RangeChart | undefined;
 export class RangeChart {
   private readonly plot: uPlot;
   private readonly themed: () => void;
+  private readonly spoken: Spoken | undefined;
   private palette: string[] = [];
   private paint = paint();
   private range: Range;
@@ -108,7 +112,8 @@ export class RangeChart {
       data,
       host,
     );
-    if (hands) this.listen(hands);
+    this.spoken = options.about && new Spoken(host, this.plot, options.about);
+    if (hands) this.listen(host, hands);
     fit(host, this.plot, () => {});
     this.themed = onTheme(() => {
       read();
@@ -121,6 +126,7 @@ export class RangeChart {
     this.hole_s = hole_s;
     this.range = range;
     this.plot.setData(data);
+    this.spoken?.refresh();
   }
 
   /** Show another range of the same data. */
@@ -143,7 +149,14 @@ export class RangeChart {
     this.plot.destroy();
   }
 
-  private listen(hands: Hands): void {
+  private listen(host: HTMLElement, hands: Hands): void {
+    host.addEventListener("keydown", (event) => {
+      if (event.key === "-") hands.back();
+      if (event.key !== "+") return;
+      const [from, to] = this.range;
+      const at = this.plot.data[0][this.plot.cursor.idx ?? -1] ?? (from + to) / 2;
+      hands.zoom([at - (at - from) / 2, at + (to - at) / 2]);
+    });
     const { over } = this.plot;
     let at = 0;
     over.addEventListener("mousedown", (event) => {

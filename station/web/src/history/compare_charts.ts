@@ -86,23 +86,19 @@ export class CompareCharts {
     const columns = this.data.fields.get(field)!;
     const { label, unit, digits } = this.spec(field);
     const readings = names.map((name) => new Text("num", "span", { "aria-label": name }));
-    const plot = el("div", { class: "plot", "aria-hidden": "true" });
-    const extents = el("p", { class: "visually-hidden" }, ...names.map((name, i) => `${name}: ${extent(columns[i] ?? [], digits)} ${unit}. `));
+    const plot = el("div", { class: "plot" });
     const values = readings.map(({ node }, i) => el("p", { class: "reading" }, el("span", { class: `key ${hue(i)}` }), node));
-    const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values), extents, plot);
+    const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values), plot);
     this.node.append(node);
     const curves = names.map((name, i) => ({ label: name, colour: `--${hue(i)}`, dash: dash(i) }));
+    const place = (at: number): string => `${number(at, 2)} ${this.data.unit}`;
+    const about = { title: label, lines: names, write: (value: number) => `${number(value, digits)} ${unit}`, range: () => this.range.map(place).join(" to "), at: place };
     const chart = new RangeChart(
       plot,
-      { curves, sync: "compare", hole_s: Infinity, unit: this.data.unit, hands: this.hands, onCursor: this.onCursor },
+      { about, curves, sync: "compare", hole_s: Infinity, unit: this.data.unit, hands: this.hands, onCursor: this.onCursor },
       [[...this.data.grid], ...columns.map((column) => [...column])] as [number[], ...(number | null)[][]],
       this.range,
     );
     this.shown.set(field, { node, chart, readings });
   }
-}
-
-function extent(column: readonly (number | null)[], digits: number | undefined): string {
-  const known = column.filter((value) => value !== null);
-  return known.length > 0 ? `${number(Math.min(...known), digits)} to ${number(Math.max(...known), digits)}` : "no values";
 }

@@ -2,7 +2,7 @@
 
 import type { HistoryAnswer } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
-import { linear, number, write, type Spec } from "../base/format";
+import { dayTime, linear, number, write, type Spec } from "../base/format";
 import type { Range } from "../base/range";
 import { RangeChart, type Hands } from "../charts/range_chart";
 
@@ -106,9 +106,9 @@ export class FieldCharts {
     shown.extent.set(extent(band ? [scaled(least), scaled(most)] : [scaled(mean)], as));
   }
 
-  private make(field: string, { label, unit }: Spec, data: [number[], ...(number | null)[][]], band: boolean, hole_s: number): Shown {
+  private make(field: string, { label, unit, digits }: Spec, data: [number[], ...(number | null)[][]], band: boolean, hole_s: number): Shown {
     const [reading, extent] = [new Text("num", "span", { "data-reading": field }), new Text("note")];
-    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    const plot = el("div", { class: "plot" });
     const value = el("p", { class: "reading" }, reading.node, el("span", { class: "unit" }, unit));
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), extent.node, value), plot);
     const old = this.shown.get(field);
@@ -116,7 +116,14 @@ export class FieldCharts {
     if (old) old.node.replaceWith(node);
     else this.node.append(node);
     const { onCursor, hands } = this.options;
-    const options = { curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
+    const about = {
+      title: label,
+      lines: [],
+      write: (value: number) => `${number(value, digits)} ${unit}`,
+      range: () => this.range.map((at) => dayTime(at)).join(" to "),
+      at: (seconds: number) => dayTime(seconds, { fractionalSecondDigits: 1 }),
+    };
+    const options = { about, curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
     const shown = { node, chart: new RangeChart(plot, options, data, this.range), band, reading, extent };
     this.shown.set(field, shown);
     return shown;

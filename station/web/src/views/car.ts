@@ -16,6 +16,7 @@ import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { Commands } from "../car/commands";
+import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
 import { StreamSection } from "../car/field_tiles";
@@ -34,6 +35,7 @@ export class CarView {
   private readonly tools: BoardTools;
   private readonly past: Past;
   private readonly commands = new Commands();
+  private readonly settings = new Settings();
   private readonly log: AgentLog;
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall = new Waterfall();
@@ -69,7 +71,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(config.actions.includes("send") ? [this.commands.node] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(config.actions.includes("send") ? [this.commands.node, this.settings.node] : []))),
       this.streams,
     );
   }
@@ -89,6 +91,7 @@ export class CarView {
     }
     this.name = name;
     this.commands.of(name);
+    this.settings.of(name);
     this.log.of(name);
     this.tools.read(query);
     this.drawn = -1;
@@ -105,6 +108,7 @@ export class CarView {
       this.screens = new Ring(2, SCREENS, MEDIAN_S);
       this.title.set(robot?.name ?? "");
       this.tools.of(robot);
+      this.settings.heard(robot);
       this.fleet.watch(robot);
     }
     this.arrange();

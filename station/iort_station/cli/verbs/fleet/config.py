@@ -12,19 +12,14 @@ import typer
 from iort_contract.limits import ContractError
 from iort_contract.messages.settings import FIELDS, check_setting
 from iort_contract.messages.shadow import Rejection
-from iort_contract.tables import ONLINE
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry
-from iort_station.fleet.shadow import Shadow, State, answered
+from iort_station.fleet import settings
+from iort_station.fleet.shadow import Shadow, State
 
 commands = typer.Typer()
-# How long a robot may take to return to the file's value.
-_WITHDRAWN_S = 3.0
-# A robot that the registry does not yet know to be connected may still answer.
-_OFFLINE_S = 2.0
 
 
 @commands.command(
@@ -52,21 +47,16 @@ def config(
     """
     wanted = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
     cloud = context.obj.cloud()
-    shadow = Shadow(cloud, robot)
     if not wanted:
-        state = shadow.read()
+        state = Shadow(cloud, robot).read()
         rejected = state.reported.rejected
         _print(robot, state, rejected, {}, as_json=as_json)
         if rejected and not as_json:
             options = " ".join(f"--unset {name}" for name in rejected)
             errors.print(f"`iort config {robot} {options}` withdraws what is rejected", soft_wrap=True)
         return
-    online = bool(registry.get(cloud, robot).get(ONLINE))
-    before = shadow.read()
-    answer = _change_and_wait(shadow, before, wanted, seconds if online else min(seconds, _OFFLINE_S))
-    state = shadow.read()
-    rejected = {name: one for name, one in state.reported.rejected.items() if name in wanted}
-    _withdraw(shadow, before, state, {name: wanted[name] for name in rejected})
+    with errors.status(f"waiting for {robot}"):
+        state, rejected, online, answer = settings.change(cloud, robot, wanted, seconds)
     _print(robot, state, rejected, wanted, as_json=as_json)
     pending = state.pending().keys() & wanted.keys()
     if not answer and online:
@@ -97,36 +87,6 @@ def _change(text: str) -> tuple[str, Any]:
     return name, value
 
 
-def _change_and_wait(shadow: Shadow, before: State, wanted: Mapping[str, Any], seconds: float) -> bool:
-    """Request the changes; whether the robot has answered in time."""
-    shadow.desire(wanted)
-    with errors.status(f"waiting for {shadow.robot}"):
-        if shadow.wait(lambda state: answered(wanted, state), seconds) is None:
-            return False
-        old, requested = before.reported.settings, before.desired.settings
-        withdrawn = [n for n, value in wanted.items() if value is None and requested.get(n) == old.get(n)]
-        if withdrawn:
-            # The file may hold the same value, which the robot does not report again.
-            shadow.wait(
-                lambda state: all(state.reported.settings.get(n) != old.get(n) for n in withdrawn) or None,
-                min(seconds, _WITHDRAWN_S),
-            )
-    return True
-
-
-def _withdraw(shadow: Shadow, before: State, state: State, rejected: Mapping[str, Any]) -> None:
-    """Replace rejected changes by the desired values before them, unless somebody has changed them since."""
-    old, now = before.desired.settings, state.desired.settings
-    known = before.reported.rejected
-    again = {
-        name: None if name in known else old.get(name)
-        for name, value in rejected.items()
-        if now.get(name) == value
-    }
-    if again:
-        shadow.desire(again)
-
-
 def _print(
     robot: str,
     state: State,
@@ -135,17 +95,17 @@ def _print(
     *,
     as_json: bool,
 ) -> None:
-    settings, pending = state.reported.settings, state.pending()
+    in_force, pending = state.reported.settings, state.pending()
     if as_json:
         reasons = {name: one._asdict() for name, one in rejected.items()}
-        print_json({"robot": robot, "settings": settings, "rejected": reasons, "pending": pending})
+        print_json({"robot": robot, "settings": in_force, "rejected": reasons, "pending": pending})
         return
-    if not settings:
+    if not in_force:
         out.print(f"{robot} has reported no settings yet")
     said = {name: "  (withdrawn)" if value is None else "  (changed)" for name, value in wanted.items()}
     said |= dict.fromkeys(rejected, "  (unchanged: the change is rejected)")
     said |= {name: f"  (pending: {_shown(value)})" for name, value in pending.items()}
-    for name, value in {**dict.fromkeys(pending, "?"), **settings}.items():
+    for name, value in {**dict.fromkeys(pending, "?"), **in_force}.items():
         out.print(f"{name}={_shown(value)}{said.get(name, '')}")
     for one in rejected.values():
         errors.print(f"rejected: {one.reason}", style="red")
