@@ -25,10 +25,11 @@ export class RunsList {
     this.node.append(this.about, el("table", {}, el("thead", {}, head), this.body), el("p", { class: "tools" }, this.more, this.compare));
   }
 
-  /** The newest run that has the stream. */
+  /** The newest run that has the stream, or else the newest: the runs do not tell of the agent's own streams. */
   newest(stream: string): Range | undefined {
     const run = this.runs.find(({ streams }) => Object.hasOwn(streams, stream));
-    return run && range(run.streams[stream]!);
+    const part = run ? run.streams[stream] : this.runs[0];
+    return part && range(part);
   }
 
   /** All that is stored of a stream, where known. */
