@@ -84,7 +84,7 @@ export class RunsList {
     const link = el("a", { href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, when(from));
     const samples = part.samples === null ? "" : number(part.samples);
     const state = run.lost > 0 ? `${run.state}, ${number(run.lost)} lost` : run.state;
-    return el("tr", { "data-run": run.run }, el("td", {}, check), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
+    return el("tr", { "data-run": run.run }, el("td", {}, el("label", {}, check)), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
   }
 
   private choose(): void {
