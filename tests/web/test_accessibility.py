@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-from tests.browser import drawn, show, until
+from tests.browser import drawn, plain, show, until
 from tests.web.cars import SAMPLE, Car
 from tests.web.lab import VIEWS, Lab
 
@@ -26,9 +26,9 @@ RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"
 TARGET_PX = 44
 SMALL = """(least) => [...document.querySelectorAll("a, button, input, select, summary, [tabindex='0']")]
   .filter((node) => node.checkVisibility() && getComputedStyle(node).display !== "inline")
-  .map((node) => [node.outerHTML.slice(0, 90), node.getBoundingClientRect()])
+  .map((node) => [node, (node.closest("label:has([type=checkbox])") ?? node).getBoundingClientRect()])
   .filter(([_, { width, height }]) => width < least - 0.5 || height < least - 0.5)
-  .map(([html, { width, height }]) => `${Math.round(width)} x ${Math.round(height)}: ${html}`)"""
+  .map(([node, { width, height }]) => `${width} x ${height}: ${node.outerHTML.slice(0, 90)}`)"""
 
 
 def violations(page: Page) -> list[str]:
@@ -93,3 +93,19 @@ def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page: Page, ca
     page.keyboard.press("Escape")
     until(lambda: spoken.inner_text() == "", "the cursor to be gone")
     assert page.url.endswith("#/car/car-1")
+
+
+def test_a_chart_of_the_past_is_told_in_words_and_has_a_cursor_for_arrow_keys(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(server.url + VIEWS["history"].address)
+        chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
+        extent = f"minimum -{SAMPLE['voltage_input']} V, maximum {SAMPLE['voltage_input']} V"
+        until(lambda: extent in plain(chart.get_attribute("aria-label") or ""), "the figures")
+        chart.focus()
+        page.keyboard.press("Home")
+        until(lambda: page.inner_text("#spoken").endswith(": 0.00 V"), "the first value")
+        page.keyboard.press("Shift+ArrowRight")
+        until(lambda: page.inner_text("#spoken").endswith(": 1.29 V"), "the second value")
+        assert page.inner_text("[data-reading=voltage_input]") == "1.29"

@@ -183,6 +183,11 @@ def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page: Page
     assert shown(page)[1] - shown(page)[0] == pytest.approx(before[1] - before[0], abs=0.01)
     page.get_by_role("button", name="Zoom out").click()
     loaded(page, "1500 samples")
+    page.locator("[role=img][aria-label^='Chart Speed']").focus()
+    page.keyboard.press("+")
+    until(lambda: shown(page)[1] - shown(page)[0] < 16, "the zoom by key")
+    page.keyboard.press("-")
+    loaded(page, "1500 samples")
     chart(page, "Speed").hover()
     page.mouse.wheel(0, 100)
     until(lambda: page.evaluate("scrollY") > 0, "the page to scroll")
@@ -300,6 +305,13 @@ def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer
     page.get_by_role("link", name="Compare 2 runs").click()
     note = page.locator(".compare-view .history-note")
     until(lambda: "4500 samples" in plain(note.inner_text()), "the two runs")
+    until(lambda: page.locator("#part-run option").count() == 2, "the runs that can be added")
+    page.get_by_role("button", name="Add").click()
+    until(lambda: "is compared already" in note.inner_text(), "the refusal")
+    page.get_by_role("button", name="Remove car, Tue 14 Nov 23:13:20 UTC").click()
+    until(lambda: "Add another run" in note.inner_text(), "one run alone")
+    page.get_by_role("button", name="Add").click()
+    until(lambda: "4500 samples" in plain(note.inner_text()), "the two runs again")
     # A lap is a range: twenty seconds from the start, and as many ten seconds later.
     laps = (
         "car/2023-11-14T22:13:20.000Z/2023-11-14T22:13:40.000Z",

@@ -52,7 +52,11 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
         (("files", "list", "nobody"), "robot nobody is not registered; "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
         (("files", "get", "nobody"), "robot nobody is not registered"),
-        (("trace", "nobody"), "robot nobody is not registered"),
+        *(
+            ((*verb, "nobody"), "robot nobody is not registered; ")
+            for verb in (("trace",), ("runs",), ("streams",), ("audit",), ("config",), ("errors", "--robot"))
+        ),
+        (("query", "nobody", "vesc"), "robot nobody is not registered; "),
         (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )

@@ -20,7 +20,8 @@ COMMAND = re.compile(r"^(?:sudo -u iort )?(?:/opt/iort/bin/)?((?:iort|iort-agent
 
 
 def in_blocks(text: str) -> Iterator[str]:
-    """The commands of a page's shell blocks."""
+    """The commands of a page's shell blocks, fenced or indented."""
+    yield from re.findall(r"^ {4,7}((?:iort|iort-agent) [a-z-].*)$", text, re.MULTILINE)
     for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
         yield from COMMAND.findall(block.replace("\\\n", " "))
 

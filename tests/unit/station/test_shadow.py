@@ -38,7 +38,8 @@ def test_a_desired_setting_is_pending_until_the_robot_applies_or_rejects_it():
 
 def test_a_rejection_of_an_earlier_value_does_not_reject_the_desired_one():
     """A robot that is offline still has the old one in its report."""
-    assert State(decode_desired({"ping": {"rate_hz": 99}}), STATE.reported).rejected().keys() == {"ping.rate_hz"}
+    older = State(decode_desired({"ping": {"rate_hz": 99}}), STATE.reported)
+    assert older.rejected().keys() == {"ping.rate_hz"}
     newer = State(decode_desired({"ping": {"rate_hz": 9}}), STATE.reported)
     assert (newer.rejected(), newer.pending()) == ({}, {"ping.rate_hz": 9})
     assert STATE.rejected() == {}

@@ -3,9 +3,10 @@
 import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { gestures } from "./gestures";
-import { Spoken, type About } from "./spoken";
 import type { Range } from "../base/range";
+import { dayTime, number, zone } from "../base/format";
 import { colour, onTheme } from "../base/theme";
+import { Spoken, type About } from "./spoken";
 
 export interface Curve {
   readonly label: string;
@@ -31,6 +32,8 @@ export interface Hands {
 
 export interface RangeChartOptions {
   readonly curves: readonly Curve[];
+  /** Its title, and a value with its unit. */
+  readonly about: Pick<About, "title" | "write">;
   readonly zero?: boolean;
   /** Charts with the same name share their cursor. */
   readonly sync?: string;
@@ -42,8 +45,6 @@ export interface RangeChartOptions {
   readonly unit?: string;
   readonly onCursor?: (index: number | null) => void;
   readonly hands?: Hands;
-  /** The chart in words; without it, it is only for the eye. */
-  readonly about?: About;
 }
 
 // A shorter drag is a click.
@@ -54,8 +55,8 @@ let dragged: RangeChart | undefined;
 
 export class RangeChart {
   private readonly plot: uPlot;
+  private readonly spoken: Spoken;
   private readonly themed: () => void;
-  private readonly spoken: Spoken | undefined;
   private palette: string[] = [];
   private paint = paint();
   private range: Range;
@@ -112,7 +113,15 @@ export class RangeChart {
       data,
       host,
     );
-    this.spoken = options.about && new Spoken(host, this.plot, options.about);
+    const { unit } = options;
+    this.spoken = new Spoken(host, this.plot, {
+      ...options.about,
+      lines: options.curves.map(({ label }) => label),
+      range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${dayTime(this.range[1])} ${zone(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
+      at: (x) => (unit === undefined ? dayTime(x, { fractionalSecondDigits: 1 }) : `${number(x, 2)} ${unit}`),
+      timeless: unit !== undefined,
+      band: options.band ?? false,
+    });
     if (hands) this.listen(host, hands);
     fit(host, this.plot, () => {});
     this.themed = onTheme(() => {
@@ -126,13 +135,14 @@ export class RangeChart {
     this.hole_s = hole_s;
     this.range = range;
     this.plot.setData(data);
-    this.spoken?.refresh();
+    this.spoken.changed();
   }
 
   /** Show another range of the same data. */
   move(range: Range): void {
     this.range = range;
     this.plot.setScale("x", { min: range[0], max: range[1] });
+    this.spoken.changed();
   }
 
   /** Put the cursor on a row. */

@@ -7,21 +7,28 @@ export interface About {
   readonly title: string;
   /** The names of its lines; one line needs none. */
   readonly lines: readonly string[];
-  /** The values with their units. */
+  /** A value with its unit. */
   readonly write: (value: number) => string;
-  /** The shown range of time. */
+  /** The shown range. */
   readonly range: () => string;
-  /** A time on the chart. */
-  readonly at: (seconds: number) => string;
+  /** A place on the x axis. */
+  readonly at: (x: number) => string;
+  /** The x axis is another quantity than time. */
+  readonly timeless?: boolean;
+  /** Columns two and three are the minimum and the maximum of the line. */
+  readonly band?: boolean;
 }
 
 // A label is written so often: writing costs a layout.
 export const AGAIN_MS = 2_000;
+// A range that is panned changes with every frame.
+const SETTLED_MS = 300;
 // An arrow key moves the cursor by this part of the chart; with Shift, by a value.
 const STEPS = 60;
 
 export class Spoken {
   private writtenAt = -Infinity;
+  private writing: number | undefined;
 
   constructor(
     private readonly host: HTMLElement,
@@ -41,29 +48,51 @@ export class Spoken {
     if (performance.now() - this.writtenAt >= AGAIN_MS) this.write();
   }
 
+  /** Called after a change of what is shown; several in a row are one. */
+  changed(): void {
+    window.clearTimeout(this.writing);
+    this.writing = window.setTimeout(() => this.write(), SETTLED_MS);
+  }
+
   private write(): void {
     this.writtenAt = performance.now();
-    const { title, lines, write, range } = this.about;
-    const figures = this.plot.data.slice(1, 1 + Math.max(1, lines.length)).map((column, i) => {
-      const { newest, least, most } = extremes(column);
-      return Number.isNaN(newest) ? "" : `${lines[i] ? `${lines[i]}: ` : ""}newest ${write(newest)}, minimum ${write(least)}, maximum ${write(most)}`;
+    const { title, write, range, timeless, band } = this.about;
+    const { data } = this.plot;
+    const [first, last] = this.visible();
+    const within = (column: number): Extremes => extremes(data[column]!, first, last + 1);
+    const figures = this.lines().map((name, i) => {
+      const { newest } = within(i + 1);
+      const [least, most] = [within(band ? 2 : i + 1).least, within(band ? 3 : i + 1).most];
+      return Number.isNaN(newest) ? "" : `${name ? `${name}: ` : ""}${timeless ? "last" : "newest"} ${write(newest)}, minimum ${write(least)}, maximum ${write(most)}`;
     });
     setAttribute(this.host, "aria-label", `Chart ${title}, ${range()}. ${figures.filter(Boolean).join("; ") || "No values"}.`);
+  }
+
+  private lines(): readonly string[] {
+    return this.about.lines.length > 1 ? this.about.lines : [""];
+  }
+
+  /** The first and the last index on the screen; none is -1 and before the first. */
+  private visible(): readonly [number, number] {
+    const { data, scales } = this.plot;
+    const { min, max } = scales["x"] ?? {};
+    const times = Array.from(data[0]);
+    const last = times.findLastIndex((x) => x <= (max ?? Infinity));
+    return [times.findIndex((x) => x >= (min ?? -Infinity)), last];
   }
 
   private key(event: KeyboardEvent): void {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const { plot } = this;
-    const [times] = plot.data;
     const shown = plot.cursor.left !== undefined && plot.cursor.left >= 0;
     if (event.key === "Escape" && shown) this.leave();
     else {
-      const last = times.length - 1;
-      const step = event.shiftKey ? 1 : Math.max(1, Math.round(times.length / STEPS));
+      const [first, last] = this.visible();
+      const step = event.shiftKey ? 1 : Math.max(1, Math.round((last - first) / STEPS));
       const from = (shown ? plot.cursor.idx : undefined) ?? last + step;
-      const to = { ArrowLeft: from - step, ArrowRight: from + step, Home: 0, End: last }[event.key];
-      if (to === undefined || last < 0) return;
-      this.point(Math.min(last, Math.max(0, to)));
+      const to = { ArrowLeft: from - step, ArrowRight: from + step, Home: first, End: last }[event.key];
+      if (to === undefined || first < 0 || last < first) return;
+      this.point(Math.min(last, Math.max(first, to)));
     }
     event.preventDefault();
     // The same keys change the car, and leave the view.
@@ -72,13 +101,13 @@ export class Spoken {
 
   private point(index: number): void {
     const { plot, about } = this;
-    const at = plot.data[0][index]!;
-    plot.setCursor({ left: plot.valToPos(at, "x"), top: 0 });
-    const values = plot.data.slice(1, 1 + Math.max(1, about.lines.length)).map((column, i) => {
-      const value = column[index];
-      return typeof value === "number" && !Number.isNaN(value) ? `${about.lines[i] ?? ""} ${about.write(value)}` : "";
+    const x = plot.data[0][index]!;
+    plot.setCursor({ left: plot.valToPos(x, "x"), top: 0 });
+    const values = this.lines().map((name, i) => {
+      const value = plot.data[i + 1]?.[index];
+      return typeof value === "number" && !Number.isNaN(value) ? `${name} ${about.write(value)}`.trim() : "";
     });
-    byId("spoken").textContent = `${about.at(at)}: ${values.filter(Boolean).join(", ") || "no value"}`;
+    byId("spoken").textContent = `${about.at(x)}: ${values.filter(Boolean).join(", ") || "no value"}`;
   }
 
   private leave(): void {
@@ -87,9 +116,15 @@ export class Spoken {
   }
 }
 
-export function extremes(column: ArrayLike<number | null | undefined>): { newest: number; least: number; most: number } {
+interface Extremes {
+  readonly newest: number;
+  readonly least: number;
+  readonly most: number;
+}
+
+export function extremes(column: ArrayLike<number | null | undefined>, from = 0, to = column.length): Extremes {
   let [newest, least, most] = [NaN, Infinity, -Infinity];
-  for (let i = 0; i < column.length; i += 1) {
+  for (let i = Math.max(0, from); i < to; i += 1) {
     const value = column[i];
     if (typeof value !== "number" || Number.isNaN(value)) continue;
     newest = value;

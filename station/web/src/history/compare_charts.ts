@@ -91,11 +91,9 @@ export class CompareCharts {
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values), plot);
     this.node.append(node);
     const curves = names.map((name, i) => ({ label: name, colour: `--${hue(i)}`, dash: dash(i) }));
-    const place = (at: number): string => `${number(at, 2)} ${this.data.unit}`;
-    const about = { title: label, lines: names, write: (value: number) => `${number(value, digits)} ${unit}`, range: () => this.range.map(place).join(" to "), at: place };
     const chart = new RangeChart(
       plot,
-      { about, curves, sync: "compare", hole_s: Infinity, unit: this.data.unit, hands: this.hands, onCursor: this.onCursor },
+      { about: { title: label, write: (value) => `${number(value, digits)} ${unit}` }, curves, sync: "compare", hole_s: Infinity, unit: this.data.unit, hands: this.hands, onCursor: this.onCursor },
       [[...this.data.grid], ...columns.map((column) => [...column])] as [number[], ...(number | null)[][]],
       this.range,
     );

@@ -2,7 +2,7 @@
 
 import type { HistoryAnswer } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
-import { dayTime, linear, number, write, type Spec } from "../base/format";
+import { linear, number, write, type Spec } from "../base/format";
 import type { Range } from "../base/range";
 import { RangeChart, type Hands } from "../charts/range_chart";
 
@@ -116,13 +116,7 @@ export class FieldCharts {
     if (old) old.node.replaceWith(node);
     else this.node.append(node);
     const { onCursor, hands } = this.options;
-    const about = {
-      title: label,
-      lines: [],
-      write: (value: number) => `${number(value, digits)} ${unit}`,
-      range: () => this.range.map((at) => dayTime(at)).join(" to "),
-      at: (seconds: number) => dayTime(seconds, { fractionalSecondDigits: 1 }),
-    };
+    const about = { title: label, write: (value: number) => `${number(value, digits)} ${unit}` };
     const options = { about, curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
     const shown = { node, chart: new RangeChart(plot, options, data, this.range), band, reading, extent };
     this.shown.set(field, shown);

@@ -14,6 +14,7 @@ const ROWS = 1500;
 const UNITS = { time: "s", distance: "m" } as const;
 const HOLES = 2.5;
 const LEAST_HOLE_S = 1;
+const MOST_KEPT = 24;
 
 interface Loaded {
   readonly part: Part;
@@ -58,6 +59,7 @@ export class Parts {
     const key = [part.robot, stream, ...part.range].join("/");
     let answer = this.whole.get(key);
     if (!answer) {
+      if (this.whole.size >= MOST_KEPT) this.whole.clear();
       answer = asked(part.robot, stream, part.range);
       this.whole.set(key, answer);
       answer.catch(() => this.whole.delete(key));

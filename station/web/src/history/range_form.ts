@@ -51,8 +51,9 @@ export class RangeForm {
     return this.select.value;
   }
 
+  /** Choose a stream; one that the car does not have is left out. */
   set stream(name: string) {
-    this.select.value = name;
+    if ([...this.select.options].some(({ value }) => value === name)) this.select.value = name;
   }
 
   streams(names: readonly string[]): void {

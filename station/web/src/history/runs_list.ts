@@ -25,10 +25,11 @@ export class RunsList {
     this.node.append(this.about, el("table", {}, el("thead", {}, head), this.body), el("p", { class: "tools" }, this.more, this.compare));
   }
 
-  /** The newest run that has the stream. */
+  /** The newest run that has the stream, or else the newest: the runs do not tell of the agent's own streams. */
   newest(stream: string): Range | undefined {
     const run = this.runs.find(({ streams }) => Object.hasOwn(streams, stream));
-    return run && range(run.streams[stream]!);
+    const part = run ? run.streams[stream] : this.runs[0];
+    return part && range(part);
   }
 
   /** All that is stored of a stream, where known. */
@@ -83,7 +84,7 @@ export class RunsList {
     const link = el("a", { href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, when(from));
     const samples = part.samples === null ? "" : number(part.samples);
     const state = run.lost > 0 ? `${run.state}, ${number(run.lost)} lost` : run.state;
-    return el("tr", { "data-run": run.run }, el("td", {}, check), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
+    return el("tr", { "data-run": run.run }, el("td", {}, el("label", {}, check)), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
   }
 
   private choose(): void {

@@ -141,7 +141,7 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
     node.append(legend);
     return [node, undefined];
   }
-  const plot = el("div", { class: "plot", "aria-hidden": "true", ...(any ? {} : { "data-empty": "no data in this range" }) });
+  const plot = el("div", { class: "plot", ...(any ? {} : { "data-empty": "no data in this range" }) });
   node.append(plot, legend);
   return [node, plot];
 }
@@ -162,13 +162,14 @@ function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
   );
 }
 
-function chart(host: HTMLElement, { series, period_s }: Widget, range: readonly [number, number]): RangeChart {
+function chart(host: HTMLElement, { title, series, period_s }: Widget, range: readonly [number, number]): RangeChart {
   const times = [...new Set(series.flatMap(({ times_s }) => times_s))].sort((a, b) => a - b);
   const curves: Curve[] = series.map(({ label, right }, i) => {
     const dash = DASHES[Math.floor(i / COLOURS.length) % DASHES.length];
     return { label, right, colour: COLOURS[i % COLOURS.length]!, points: true, ...(dash ? { dash } : {}) };
   });
-  return new RangeChart(host, { curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
+  const about = { title, write: (value: number) => number(value, digits(value)) };
+  return new RangeChart(host, { about, curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
 }
 
 function aligned({ times_s, values }: Series, times: readonly number[]): (number | null)[] {

@@ -3,7 +3,7 @@
 import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { age, dayTime, number, zone } from "../base/format";
-import { writeTime, type Range } from "../base/range";
+import { same, writeTime, type Range } from "../base/range";
 import { MOST_PARTS, readParts, route, setAddress, writeParts, type Part, type Query } from "../base/route";
 import { AddPart } from "../history/add_part";
 import type { Axis } from "../history/align";
@@ -42,7 +42,7 @@ export class CompareView {
     fleet: Fleet,
   ) {
     this.loader = new Parts(table, fleet);
-    this.add = new AddPart(fleet, (part) => this.choose([...this.parts, part].slice(-MOST_PARTS)));
+    this.add = new AddPart(fleet, (part) => this.include(part));
     const hands = { zoom: (to: Range) => this.go(to), move: (to: Range, upright: boolean) => this.move(to, upright), back: () => this.back(), pick: () => undefined };
     this.charts = new CompareCharts(
       (field) => this.loader.spec(field, this.stream.value, this.parts),
@@ -90,6 +90,12 @@ export class CompareView {
       // The request for the samples says why.
     }
     return loaded;
+  }
+
+  private include(part: Part): void {
+    if (this.parts.some(({ robot, range }) => robot === part.robot && same(range, part.range))) this.note.set(`${named(part)} is compared already.`);
+    else if (this.parts.length >= MOST_PARTS) this.note.set(`At most ${MOST_PARTS} runs can be compared: remove one first.`);
+    else this.choose([...this.parts, part]);
   }
 
   private choose(parts: readonly Part[]): void {

@@ -162,13 +162,9 @@ export class HistoryView {
 
   /** Follow the browser's Back and links to other ranges of this robot. */
   private follow(query: Query<"history">): void {
-    const stream = query.stream ?? this.form.stream;
-    if (stream !== this.form.stream) {
-      this.form.stream = stream;
-      this.runs.show(stream);
-    } else if (Object.keys(query).length === 0) {
-      this.write();
-    }
+    const before = this.form.stream;
+    if (query.stream !== undefined) this.form.stream = query.stream;
+    if (this.form.stream !== before) this.runs.show(this.form.stream);
     this.wanted = query.fields?.split(",") ?? this.wanted;
     if (query.at !== undefined) this.at = readTime(query.at);
     const range = readRange(query.from, query.to) ?? this.range!;

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -34,21 +33,6 @@ from iort_station.output import check_free
 commands = typer.Typer()
 
 
-class Kind(str, Enum):
-    """The content of a picture."""
-
-    time = "time"
-    trajectory = "trajectory"
-    distribution = "distribution"
-
-
-class Align(str, Enum):
-    """The common origin of several runs."""
-
-    time = "time"
-    start = "start"
-
-
 @commands.command(
     "plot",
     epilog=examples(
@@ -64,8 +48,9 @@ def plot(
     when: When,
     out: Annotated[Path, to_file("The picture: .png, .svg or .pdf.")],
     kind: Annotated[
-        Kind, typer.Option(help="Fields over time, the way from above, or the distribution of values.")
-    ] = Kind.time,
+        Literal["time", "trajectory", "distribution"],
+        typer.Option(help="Fields over time, the way from above, or the distribution of values."),
+    ] = "time",
     fields: Fields = None,
     also: Annotated[list[str] | None, typer.Option("--with", help="Another robot; may be repeated.")] = None,
     runs: Annotated[
@@ -73,8 +58,8 @@ def plot(
         typer.Option("--run", help="A run's range, FROM/TO, instead of --from and --to; may be repeated."),
     ] = None,
     align: Annotated[
-        Align, typer.Option(help="Draw several runs by the clock, or from their start.")
-    ] = Align.time,
+        Literal["time", "start"], typer.Option(help="Draw several runs by the clock, or from their start.")
+    ] = "time",
     where: Where = None,
     every: Every = None,
     force: Force = False,
@@ -106,11 +91,11 @@ def plot(
             drawn.append(plots.Run(label, result))
     if not drawn:
         raise StationError("there are no samples to draw")
-    if kind is Kind.trajectory:
+    if kind == "trajectory":
         figure = plots.trajectory(drawn)
-    elif kind is Kind.time:
+    elif kind == "time":
         shown = wanted or plots.usual(drawn[0].result)
-        figure = plots.over_time(drawn, shown, from_start=align is Align.start)
+        figure = plots.over_time(drawn, shown, from_start=align == "start")
     else:
         figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
     plots.save(figure, out, force=force)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Literal, TextIO
 
 import typer
 
@@ -36,20 +35,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-class Format(str, Enum):
-    """The format of the output."""
-
-    table = "table"
-    csv = "csv"
-    jsonl = "jsonl"
-    parquet = "parquet"
-
-
-class On(str, Enum):
-    """Where samples are selected."""
-
-    client = "client"
-    lambda_ = "lambda"
+Format = Literal["table", "csv", "jsonl", "parquet"]
 
 
 @commands.command(
@@ -72,7 +58,7 @@ def query(
     summary: Annotated[
         bool, typer.Option("--summary", help="The summary of each second instead of samples.")
     ] = False,
-    form: Annotated[Format, typer.Option("--format", help="The output format.")] = Format.table,
+    form: Annotated[Format, typer.Option("--format", help="The output format.")] = "table",
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
     raw: Annotated[
         bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
@@ -80,8 +66,9 @@ def query(
     out: Annotated[Path | None, to_file("The file to write. Default: standard output.")] = None,
     force: Force = False,
     on: Annotated[
-        On, typer.Option(help="Select samples on this machine, or in the cloud's query function.")
-    ] = On.client,
+        Literal["client", "lambda"],
+        typer.Option(help="Select samples on this machine, or in the cloud's query function."),
+    ] = "client",
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Scan the whole table, which is slow; for comparison."),
@@ -95,7 +82,7 @@ def query(
     from iort_station import data  # noqa: PLC0415 - see above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
 
-    if form is Format.parquet and out is None and sys.stdout.isatty():
+    if form == "parquet" and out is None and sys.stdout.isatty():
         raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
     if out is not None:
         check_free(out, force=force)
@@ -113,12 +100,12 @@ def query(
             where=where,
             every=every,
             summary=summary,
-            on=on.value,
+            on=on,
             scan=scan,
             progress=progress,
         )
     took_s = time.monotonic() - began
-    form = Format.jsonl if as_json else form
+    form = "jsonl" if as_json else form
     if out is None:
         _write(result, form, sys.stdout, raw=raw)
     else:
@@ -138,11 +125,11 @@ def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
     from iort_station.recordings import tabular  # noqa: PLC0415 - as above
 
-    if form is Format.parquet:
+    if form == "parquet":
         tabular.to_parquet(result, file.buffer)
-    elif form is Format.csv:
+    elif form == "csv":
         tabular.to_csv(result, file, raw=raw)
-    elif form is Format.jsonl:
+    elif form == "jsonl":
         tabular.to_json_lines(result, file)
     else:
         # In a file, every column fits.

@@ -79,6 +79,9 @@ def audit_(
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
+    for one in found if streams else ():
+        if not (one.runs or one.refused or one.taken):
+            inventory.check_there(cloud, robot, one.stream)
     if not found:
         inventory.check_recorded(cloud, robot)
     if as_json:

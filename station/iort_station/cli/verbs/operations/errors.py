@@ -9,10 +9,12 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
+from iort_contract.tables import NO_ROBOT
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, OneRobot, Range, When, ranged
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
+from iort_station.fleet import registry
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.times import iso_s, stamped
@@ -54,8 +56,10 @@ def errors_(
 
 
 def entries(cloud: Cloud, robot: str | None, within: Range) -> list[DeadLetter]:
-    """The rejected messages that were seen in a range."""
-    found = quarantine.entries(cloud, robot=robot, since_ms=(within.start_us or 0) // 1000)
+    """The rejected messages that were seen in a range; raises `StationError` for an unknown robot."""
+    found = list(quarantine.entries(cloud, robot=robot, since_ms=(within.start_us or 0) // 1000))
+    if not found and robot not in {None, NO_ROBOT}:
+        registry.get(cloud, str(robot))
     return [entry for entry in found if within.end_us is None or entry.first_ms * 1000 < within.end_us]
 
 

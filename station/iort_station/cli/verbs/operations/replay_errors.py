@@ -32,7 +32,8 @@ def replay_errors(
 ) -> None:
     """Process rejected recordings again, and delete those that arrive.
 
-    Exit status 1 if any fails again."""
+    Exit status 1 if any fails again.
+    """
     within = when.range()
     cloud = context.obj.cloud()
     if not dry_run and (moved := quarantine.recover(cloud)):
