@@ -40,7 +40,7 @@ class State(NamedTuple):
     desired: Desired = Desired()
     reported: Reported = Reported()
 
-    def rejected(self) -> dict[str, Rejection]:
+    def rejected(self) -> Mapping[str, Rejection]:
         """What the robot rejects of the desired settings; not its rejection of an earlier value."""
         desired = self.desired.settings
         return {
