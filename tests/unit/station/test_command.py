@@ -53,6 +53,10 @@ def test_help_imports_no_verb_and_nothing_heavy():
     assert not [name for name in found if name.startswith(f"{lazy.verbs.__name__}.")]
 
 
+def test_a_verb_loads_no_client_before_it_calls_the_cloud():
+    assert not loaded("files", "get", "--help") & {"boto3", "botocore.session", "numpy", "pubnub"}
+
+
 @pytest.mark.parametrize("file", VERBS)
 def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
     summary = VERBS[file]
