@@ -66,6 +66,15 @@ def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
     }  # type: ignore[typeddict-item]  # of any state
 
 
+_PLAIN = {"low": 0.0, "high": 10.0, "unit": "", "names": [], "desired": False, "pending": "", "reason": ""}
+SETTINGS: list[dict[str, Any]] = [
+    {**_PLAIN, "name": "live.enabled", "kind": "flag", "value": "true"},
+    {**_PLAIN, "name": "live.rate_hz", "kind": "number", "unit": "Hz", "value": "10", "pending": "5"},
+    {**_PLAIN, "name": "log_level", "kind": "choice", "names": ["info", "debug"], "value": ""},
+    {**_PLAIN, "name": "fields.vesc", "kind": "fields", "value": "speed", "desired": True, "reason": "sped"},
+]
+
+
 class Lab:
     """What the lab's server answers; a test may change it."""
 
@@ -101,13 +110,18 @@ class Lab:
             tls=False,
             vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
             answers=self.answers(),
-            actions={"acknowledge": self.acknowledge},
+            actions={
+                "acknowledge": self.acknowledge,
+                "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
+                "settings": lambda _: {"settings": SETTINGS, "online": False},
+            },
         )
 
     def answers(self) -> dict[str, Any]:
         presence = {"online": False, "since_ms": round(NOW_S - 3600) * 1000}
         return {
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
+            "tags": lambda _: {"tags": {"car-1": {"lab": "north"}}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": [VESC_STREAM]},
             "runs": lambda _: runs(),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
+from iort_contract.catalog.streams import LOG_STREAM
 from tests.browser import drawn, plain, show, until
 from tests.web.cars import SAMPLE, Car
 from tests.web.lab import VIEWS, Lab
@@ -63,6 +64,16 @@ def test_every_view_is_accessible(
             page.goto(server.url + address)
             show(page, car.send({**SAMPLE, "fault_code": 2}))
             page.locator(filled).first.wait_for()
+            if view == "car":
+                line = {
+                    "level": "error",
+                    "logger": "iort_agent",
+                    "text": "failed\nwith details",
+                    "left_out": 1,
+                }
+                show(page, car.send(line, stream=LOG_STREAM))
+                page.get_by_role("heading", name="Settings").click()
+                page.locator(".setting").first.wait_for()
             found[view] = violations(page)
             if device is PHONE:
                 found[f"{view}, by thumb"] = page.evaluate(SMALL, TARGET_PX)

@@ -265,11 +265,11 @@ def test_the_range_is_saved_as_csv_parquet_and_mcap(page: Page, server: PageServ
 def test_a_download_says_what_is_wrong_before_it_sends_anything(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("iort_station.page.downloads.MOST_SAMPLES", 1000)
+    monkeypatch.setattr("iort_station.page.downloads.MOST_VALUES", 1000)
     monkeypatch.setattr("iort_station.page.downloads.MOST_BYTES", 1000)
     note = page.locator(".download .note")
     page.get_by_role("button", name="CSV").click()
-    until(lambda: "more than 1,000 samples: choose a shorter one" in note.inner_text(), "the reason")
+    until(lambda: "more than 1,000 values: choose a shorter one" in note.inner_text(), "the reason")
     page.get_by_role("button", name="MCAP").click()
     until(lambda: "over 1,000 bytes: choose a shorter one" in note.inner_text(), "the other reason")
 

@@ -17,7 +17,7 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, config, load_track
-from iort_station.page.server import MOST_ANSWERS, PageServer
+from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -166,6 +166,32 @@ def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> N
         assert ask(page, "/slow.json")[0].status == 200
 
 
+def test_few_downloads_are_written_at_a_time_even_if_viewers_leave(built: Path) -> None:
+    begun, done = threading.Semaphore(0), threading.Event()
+    written = 0
+
+    def slow(_asked: Mapping[str, str], _folder: Path) -> Path:
+        nonlocal written
+        written += 1
+        begun.release()
+        done.wait()
+        raise StationError("nothing is stored")
+
+    with PageServer(**TOLD, built=built, downloads={"a.csv": slow}) as page, ExitStack() as viewers:
+        try:
+            for _ in range(MOST_DOWNLOADS + 2):
+                viewer = socket.create_connection((page.host, page.port))
+                viewers.enter_context(viewer).sendall(b"GET /a.csv HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            for _ in range(MOST_DOWNLOADS):
+                assert begun.acquire(timeout=60)
+            viewers.close()
+            assert ask(page, "/page.js")[0].status == 200
+            assert written == MOST_DOWNLOADS
+        finally:
+            done.set()
+        assert ask(page, "/a.csv")[0].status == 400
+
+
 def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) -> None:
     file = tmp_path / "track.csv"
     file.write_text("# x_m, y_m, w_right_m, w_left_m\n0,0,1,2\n4,0,1,2\n4,3,1,2\n0,3,1,2\n")
@@ -247,6 +273,8 @@ def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> Non
             assert post(page, '{"a": "b"}', X_Iort_Key=key)[0] == 403
         for wrong in ("", "[]", '{"a": 1}', "\ud800"):
             assert post(page, wrong)[0] == 400
+        assert post(page, "[" * 100_000)[0] == 400
+        assert post(page, "{}", "application/json; charset=nonsense")[0] == 400
         assert not done
         assert post(page, "{}") == (400, {"error": "nothing was asked"})
         assert post(page, '{"a": "b"}') == (200, {"done": True})

@@ -15,7 +15,7 @@ _OWN = ("iort_agent.", "iort-agent")
 _AT_ONCE, _EVERY_S = 20, 3.0
 _MAX_CHARACTERS = 1000
 # A user and password in an address, and a signature in the query of one.
-_SECRETS = ((re.compile(r"//[^/\s@]+@"), "//...@"), (re.compile(r"(\w://[^\s?]+\?)\S+"), r"\1..."))
+_SECRETS = ((re.compile(r"//[^/\s]+@"), "//...@"), (re.compile(r"(\w://[^\s?]+\?)\S+"), r"\1..."))
 
 
 def neutral(text: str) -> str:

@@ -91,8 +91,9 @@ class Commands:
                 for command in self._commands.values()
                 if (at := command.leases.next_due()) is not None
             ]
-        for topic in ended.difference(topic for _, topic in due):
-            self._graph.release(topic)
+            # Under the lock, so that no command that has just passed is released.
+            for topic in ended.difference(topic for _, topic in due):
+                self._graph.release(topic)
         return min((at for at, _ in due), default=None)
 
     def report(self) -> dict[str, Any]:

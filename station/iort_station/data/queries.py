@@ -95,7 +95,7 @@ def query(
     ``on="lambda"`` selects the samples in the cloud. ``scan`` reads by Scan instead of Query.
 
     Raises `StationError` for an unknown robot, stream or field, naming the known ones; for an invalid time or
-    condition; and for more samples than ``most``.
+    condition; and for more values than ``most``.
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
@@ -116,10 +116,10 @@ def query(
         nonlocal ros2
         read = 0
         for block in found:
-            read += len(block.times_us)
+            read += len(block.times_us) * len(block.columns)
             if most is not None and read > most:
                 raise StationError(
-                    f"the range has more than {most:,} samples: choose a shorter one, or run `iort query`"
+                    f"the range has more than {most:,} values: choose a shorter one, or run `iort query`"
                 )
             ros2 = ros2 or has_fraction(block)
             yield block

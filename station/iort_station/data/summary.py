@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
 from iort_contract import expression
 from iort_contract.codec.seconds import flat_second
-from iort_contract.dynamodb import seconds_between
+from iort_contract.dynamodb import deserialize, seconds_between
 from iort_contract.tables import (
     ABSENT,
     BATCHES,
@@ -31,7 +29,6 @@ from iort_station.errors import unknown
 
 # The counts of a second.
 _COUNTS = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
-_deserialize = TypeDeserializer().deserialize
 
 
 def seconds(
@@ -98,4 +95,4 @@ def _block(items: Sequence[Item]) -> Block:
 def _value(value: Any) -> Any:
     if "L" in value:
         return [_value(each) for each in value["L"]]
-    return float(value["N"]) if "N" in value else _deserialize(value)
+    return float(value["N"]) if "N" in value else deserialize(value)

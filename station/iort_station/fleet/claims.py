@@ -24,6 +24,8 @@ from iort_station.fleet.robots import F1TENTH
 if TYPE_CHECKING:
     from types_boto3_iot import IoTClient
 
+# The claim's file in its folder.
+FILE = "claim.yaml"
 # AWS' own claims can connect for five minutes; the margin is for one that connects at the end.
 _CLAIM_S = 6 * 60
 DAYS = 30
@@ -70,7 +72,7 @@ def claim(
         registry.open_name(cloud, robot, for_s=for_s, claim=known_by)
     out.mkdir(parents=True, exist_ok=True, mode=0o700)
     settings.update(connection(cloud, out, certificate, key, prefix="claim-"))
-    path = out / "claim.yaml"
+    path = out / FILE
     write_private(path, yaml.safe_dump(settings, sort_keys=False))
     return path
 

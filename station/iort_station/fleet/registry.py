@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from typing import Any, NamedTuple
 
-from boto3.dynamodb.types import TypeSerializer
-
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.page import RobotPresence
@@ -26,8 +24,6 @@ from iort_contract.tables import (
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
-
-_serialize = TypeSerializer().serialize
 
 
 def checked(robot: str) -> str:
@@ -99,13 +95,17 @@ def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
 
     Raises `StationError` for a registered robot.
     """
+    # TAB needs the names of robots, but not boto3, whose import takes longer than TAB may.
+    from boto3.dynamodb.types import TypeSerializer  # noqa: PLC0415 - see above
+
+    serialize = TypeSerializer().serialize
     item = {ROBOT: checked(robot), **row}
     numbers = {name: Decimal(repr(value)) for name, value in item.items() if isinstance(value, int | float)}
     dynamodb = cloud.client("dynamodb")
     try:
         dynamodb.put_item(
             TableName=_table(cloud),
-            Item={name: _serialize(value) for name, value in {**item, **numbers}.items()},
+            Item={name: serialize(value) for name, value in {**item, **numbers}.items()},
             ConditionExpression="attribute_not_exists(#robot)",
             ExpressionAttributeNames={"#robot": ROBOT},
         )

@@ -37,7 +37,7 @@ def change(cloud: Cloud, robot: str, wanted: Mapping[str, Any], seconds: float) 
     before = shadow.read()
     in_time = _change_and_wait(shadow, before, wanted, seconds if online else min(seconds, _OFFLINE_S))
     state = shadow.read()
-    rejected = {name: one for name, one in state.reported.rejected.items() if name in wanted}
+    rejected = {name: one for name, one in state.rejected().items() if name in wanted}
     _withdraw(shadow, before, state, {name: wanted[name] for name in rejected})
     return Changed(state, rejected, online, in_time)
 
@@ -61,7 +61,7 @@ def _change_and_wait(shadow: Shadow, before: State, wanted: Mapping[str, Any], s
 def _withdraw(shadow: Shadow, before: State, state: State, rejected: Mapping[str, Any]) -> None:
     """Replace rejected changes by the desired values before them, unless somebody has changed them since."""
     old, now = before.desired.settings, state.desired.settings
-    known = before.reported.rejected
+    known = before.rejected()
     again = {
         name: None if name in known else old.get(name)
         for name, value in rejected.items()

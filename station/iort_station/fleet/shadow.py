@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from iort_contract.messages.shadow import (
     Desired,
     OverShare,
+    Rejection,
     Reported,
     decode_desired,
     decode_reported,
@@ -39,9 +40,18 @@ class State(NamedTuple):
     desired: Desired = Desired()
     reported: Reported = Reported()
 
+    def rejected(self) -> Mapping[str, Rejection]:
+        """What the robot rejects of the desired settings; not its rejection of an earlier value."""
+        desired = self.desired.settings
+        return {
+            name: one
+            for name, one in self.reported.rejected.items()
+            if name in desired and _same(one.value, desired[name])
+        }
+
     def pending(self) -> dict[str, Any]:
         """The desired settings, by name, that the robot has neither applied nor rejected."""
-        in_force, rejected = self.reported.settings, self.reported.rejected
+        in_force, rejected = self.reported.settings, self.rejected()
         return {
             name: value
             for name, value in self.desired.settings.items()
@@ -105,7 +115,8 @@ def answered(wanted: Mapping[str, Any], state: State) -> bool | None:
         if name in rejected:
             if value is None or not _same(rejected[name].value, value):
                 return None
-        elif value is not None and value != [] and settings.get(name) != value:
+        # An empty list of fields means all, which is not reported.
+        elif value is not None and settings.get(name, []) != value:
             return None
     return True
 

@@ -86,7 +86,7 @@ def _parsed(name: str, written: str) -> Any:
 def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
     in_force, desired, pending = state.reported.settings, state.desired.settings, state.pending()
     selections = sorted(name for name in {*in_force, *desired} if name.startswith(f"{FIELDS}."))
-    rejected = {name: one.reason for name, one in state.reported.rejected.items()}
+    rejected = {name: one.reason for name, one in state.rejected().items()}
     return [
         {
             **_kind(SETTINGS.get(name)),

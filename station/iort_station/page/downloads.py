@@ -19,8 +19,8 @@ from iort_station.recordings import export, recordings, tabular
 from iort_station.recordings.recordings import Recording, Write
 from iort_station.times import iso_s
 
-# Half an hour at 500 Hz; a table of thirty fields then takes 240 MB of memory.
-MOST_SAMPLES = 1_000_000
+# Half an hour of thirty fields at 500 Hz; their table takes 240 MB of memory.
+MOST_VALUES = 30_000_000
 MOST_BYTES = 1_000_000_000
 
 
@@ -44,7 +44,7 @@ def _table(
         selection.stream,
         selection.start_us,
         selection.end_us,
-        most=MOST_SAMPLES,
+        most=MOST_VALUES,
     )
     if not len(found):
         raise StationError("no samples in this range")

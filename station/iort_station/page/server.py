@@ -47,6 +47,8 @@ IDLE_S = 30.0
 _CHUNK_BYTES = 256 * 1024
 # The most answers that are worked on at a time; further requests wait.
 MOST_ANSWERS = 16
+# A file of a long range takes a gigabyte of memory while it is written.
+MOST_DOWNLOADS = 2
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
 # A coding of Accept-Encoding and its weight.
 _CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
@@ -95,6 +97,7 @@ class PageServer(BackgroundServer):
         # A page elsewhere cannot read it.
         self._key = secrets.token_urlsafe(32)
         self._free = asyncio.Semaphore(MOST_ANSWERS)
+        self._free_to_write = asyncio.Semaphore(MOST_DOWNLOADS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
             namespace=namespace,
@@ -154,7 +157,7 @@ class PageServer(BackgroundServer):
         answer = self._answers.get(path)
         if answer is not None:
             parameters = dict(request.query)
-            status, body = await self._off_the_loop(lambda: _answered(answer, parameters))
+            status, body = await self._off_the_loop(lambda: _answered(answer, parameters), self._free)
             return self._response(request, body, status)
         if path in self._downloads:
             return await self._download(request, self._downloads[path])
@@ -172,7 +175,9 @@ class PageServer(BackgroundServer):
     async def _download(self, request: web.BaseRequest, download: Download) -> web.StreamResponse:
         parameters = dict(request.query)
         with TemporaryDirectory(prefix="iort-download-") as folder:
-            found = await self._off_the_loop(lambda: _tried(lambda: download(parameters, Path(folder))))
+            found = await self._off_the_loop(
+                lambda: _tried(lambda: download(parameters, Path(folder))), self._free_to_write
+            )
             if isinstance(found, tuple):
                 return self._response(request, found[1], found[0])
             response = web.StreamResponse(
@@ -191,9 +196,9 @@ class PageServer(BackgroundServer):
             await response.write_eof()
             return response
 
-    async def _off_the_loop(self, work: Callable[[], _T]) -> _T:
+    async def _off_the_loop(self, work: Callable[[], _T], free: asyncio.Semaphore) -> _T:
         """Run ``work`` in a daemon thread, so that a slow answer delays neither a file nor the exit."""
-        await self._free.acquire()
+        await free.acquire()
         loop = asyncio.get_running_loop()
         done: Future[_T] = Future()
         done.set_running_or_notify_cancel()
@@ -205,7 +210,7 @@ class PageServer(BackgroundServer):
                 done.set_exception(error)
             # Not where the answer is awaited: a viewer who leaves does not end the thread.
             with suppress(RuntimeError):  # the server has ended
-                loop.call_soon_threadsafe(self._free.release)
+                loop.call_soon_threadsafe(free.release)
 
         threading.Thread(target=run, name="page answer", daemon=True).start()
         return await asyncio.wrap_future(done)
@@ -227,11 +232,11 @@ class PageServer(BackgroundServer):
             )
         try:
             asked = json.loads(await request.text())
-        except ValueError:
+        except (ValueError, LookupError, RecursionError):  # also of an unknown charset
             asked = None
         if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
             return self._response(request, _json({"error": "the body must be an object of texts"}), 400)
-        status, body = await self._off_the_loop(lambda: _answered(action, asked))
+        status, body = await self._off_the_loop(lambda: _answered(action, asked), self._free)
         return self._response(request, body, status)
 
     def _accepts(self, host: str) -> bool:

@@ -63,7 +63,11 @@ def to_parquet(result: Result, file: IO[bytes]) -> None:
     arrays = [pa.array(result.times_us, type=pa.timestamp("us", tz="UTC"))]
     fields = [pa.field("time", arrays[0].type, nullable=False)]
     for name, column in result.columns.items():
-        array = pa.array(column, from_pandas=True)
+        try:
+            array = pa.array(column, from_pandas=True)
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
+            # Numbers and texts, or integers beyond every type of Parquet: all as texts.
+            array = pa.array([None if value is None else str(value) for value in values(column)])
         unit = result.unit(name)
         fields.append(pa.field(name, array.type, metadata={"unit": unit} if unit else None))
         arrays.append(array)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import pytest
@@ -99,6 +100,25 @@ def test_a_deadline_counts_by_the_clouds_clock_and_its_uncertainty() -> None:
             rig.send({"data": "hello"}, name="say", lease_ms=None, **times)
     assert len(rig.graph.published) == 4
     assert rig.refused() == {"cmd/iort/car1/say stale": 2}
+
+
+def test_a_command_that_passes_while_its_topic_is_released_stays() -> None:
+    rig = Rig()
+    graph, sending = rig.graph, threading.Thread(target=lambda: rig.send({"data": 2.0}))
+
+    def release(_topic: str) -> None:
+        graph.published.append(("released", b""))
+        sending.start()
+        sending.join(0.05)  # It cannot pass meanwhile.
+        graph.published.append(("free", b""))
+
+    graph.release = release  # type: ignore[method-assign]  # to send in the middle of it
+    rig.send({"data": 1.0})
+    while "free" not in [topic for topic, _ in graph.published]:
+        rig.clock.advance(0.25)
+        rig.downlink.tick()
+    sending.join()
+    assert [topic for topic, _ in graph.published][-3:] == ["released", "free", "/commands/motor/speed"]
 
 
 def test_a_command_that_waited_in_a_frozen_car_keeps_only_the_rest_of_its_lease() -> None:

@@ -66,6 +66,7 @@ def test_a_flood_is_counted_and_does_not_displace_an_error() -> None:
     ("text", "sent"),
     [
         ("ws://lab:hunter2@10.0.0.1:9090: closed", "ws://...@10.0.0.1:9090: closed"),
+        ("ws://lab:p@ss@10.0.0.1: closed", "ws://...@10.0.0.1: closed"),
         ("https://b.s3.aws.com/a.txt?X-Amz-Signature=0f&b=1 failed", "https://b.s3.aws.com/a.txt?... failed"),
         ("why? no idea", "why? no idea"),
         ("two\nlines", "two\\nlines"),

@@ -53,6 +53,10 @@ def test_help_imports_no_verb_and_nothing_heavy():
     assert not [name for name in found if name.startswith(f"{lazy.verbs.__name__}.")]
 
 
+def test_a_verb_loads_no_client_before_it_calls_the_cloud():
+    assert not loaded("files", "get", "--help") & {"boto3", "botocore.session", "numpy", "pubnub"}
+
+
 @pytest.mark.parametrize("file", VERBS)
 def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
     summary = VERBS[file]
@@ -65,7 +69,7 @@ def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
 @pytest.fixture
 def _files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("ride.csv", "ride.mcap", "ride.png"):
+    for name in ("ride.csv", "ride.mcap", "ride.png", "claim.yaml"):
         (tmp_path / name).touch()
 
 
@@ -81,6 +85,7 @@ def _files(tmp_path, monkeypatch):
         (["query", "car", "vesc", "--out", "ride.csv"], 1, "ride.csv exists: give another --out"),
         (["export", "car", "vesc", "--out", "ride.mcap"], 1, "ride.mcap exists: give another --out"),
         (["plot", "car", "vesc", "--out", "ride.png"], 1, "ride.png exists: give another --out"),
+        (["robots", "claim", "car", "--out", "."], 1, "claim.yaml exists: give another --out"),
     ],
 )
 def test_wrong_use_ends_with_status_2(arguments, status, said, monkeypatch, capsys):

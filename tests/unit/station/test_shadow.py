@@ -36,6 +36,15 @@ def test_a_desired_setting_is_pending_until_the_robot_applies_or_rejects_it():
     assert State(decode_desired(desired)).pending().keys() == {"live.rate_hz", "live.enabled", "ping.rate_hz"}
 
 
+def test_a_rejection_of_an_earlier_value_does_not_reject_the_desired_one():
+    """A robot that is offline still has the old one in its report."""
+    older = State(decode_desired({"ping": {"rate_hz": 99}}), STATE.reported)
+    assert older.rejected().keys() == {"ping.rate_hz"}
+    newer = State(decode_desired({"ping": {"rate_hz": 9}}), STATE.reported)
+    assert (newer.rejected(), newer.pending()) == ({}, {"ping.rate_hz": 9})
+    assert STATE.rejected() == {}
+
+
 class ShadowMissingError(Exception):
     """The thing has no shadow of this name."""
 
@@ -76,7 +85,8 @@ def test_the_clouds_notice_of_a_share_is_no_desired_setting():
         ({"live.rate_hz": 10.0, "fields.vesc": ["speed"]}, True),
         ({"live.rate_hz": 5}, None),
         ({"live.rate_hz": 10, "log_level": "debug"}, None),
-        ({"fields.vesc": []}, True),
+        ({"fields.vesc": []}, None),
+        ({"fields.imu": []}, True),
         ({"ping.rate_hz": 99}, True),
         # The rejected value belongs to an older desired setting.
         ({"ping.rate_hz": 98}, None),

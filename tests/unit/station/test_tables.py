@@ -100,6 +100,15 @@ def test_parquet_keeps_times_types_null_and_units():
     assert table.column("name").to_pylist() == ["a", None, "ü"]
 
 
+@pytest.mark.parametrize("values", [[1.5, "fast"], [True, 2.0], [2**60, 0.5], [2**70, 1]])
+def test_parquet_has_values_of_several_kinds_as_texts(values):
+    file = io.BytesIO()
+    column = np.array([*values, None], dtype=object)
+    tabular.to_parquet(Result("car", "odom", np.arange(3), {"mixed": column}), file)
+    table = pq.read_table(io.BytesIO(file.getvalue()))
+    assert table.column("mixed").to_pylist() == [*map(str, values), None]
+
+
 def test_a_terminal_shows_units_and_both_ends():
     console = Console(width=120, file=io.StringIO())
     shown = tables.terminal(result(1000), 120)

@@ -8,7 +8,8 @@ import type { Robot } from "../live/robot";
 import { ask, AnswerError } from "../server/answers";
 
 const BACK_S = 3600;
-const ROWS = 500;
+// More than an agent sends in an hour: a row of several lines would have the last one alone.
+const ROWS = 3000;
 const SHOWN = 100;
 
 export class AgentLog {
@@ -41,8 +42,9 @@ export class AgentLog {
   }
 
   private async find(robot: string): Promise<void> {
-    const us = (at_ms: number): string => String(Math.round(at_ms * 1000));
-    const asked = { robot, stream: LOG_STREAM, from_us: us(Date.now() - BACK_S * 1000), to_us: us(Date.now()), rows: String(ROWS) };
+    // Not a microsecond over an hour: longer ranges are answered from the summaries, which have no texts.
+    const to_us = Date.now() * 1000;
+    const asked = { robot, stream: LOG_STREAM, from_us: String(to_us - BACK_S * 1e6), to_us: String(to_us), rows: String(ROWS) };
     try {
       const { times_s, fields } = await ask<HistoryAnswer>("history", asked);
       if (robot !== this.robot) return;

@@ -2,18 +2,14 @@
 
 import type { Config, FieldTable, HistoryAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { age, asSpeed, dayTime, number, spec, zone, type Spec } from "../base/format";
+import { age, dayTime, number, zone } from "../base/format";
 import { LEAST_S, readRange, readTime, rounded, same, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
-import { Download } from "../history/download";
-import { FieldCharts } from "../history/field_charts";
-import { Pictures } from "../history/pictures";
-import { Playback } from "../history/playback";
 import { RangeForm } from "../history/range_form";
+import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import type { Fleet } from "../live/fleet";
 import { ask, AnswerError } from "../server/answers";
-import { Comparison } from "../widgets/comparison";
 
 // What is shown first, unless nothing was stored in it.
 const RECENT_S = 300;
@@ -28,30 +24,20 @@ export class HistoryView {
   private readonly title = new Text("car-name", "h2");
   private readonly back = el("a", { class: "tool" }, "Live");
   private readonly note = new Text("history-note", "p", { role: "status" });
-  private readonly result = el("div", { class: "result", hidden: "" });
   private readonly form: RangeForm;
   private readonly runs = new RunsList((before_us) => void this.findRuns(before_us));
-  private readonly playback: Playback;
-  private readonly charts: FieldCharts;
-  private readonly pictures: Pictures;
-  private readonly comparison = new Comparison();
+  private readonly result: Result;
   private robot = "";
   private range: Range | undefined;
   /** The ranges from which the viewer zoomed in. */
   private zooms: Range[] = [];
-  /** The fields that the viewer has chosen; empty for the usual ones. */
-  private wanted: readonly string[] = [];
-  /** The time that the viewer points at; NaN for the end. */
-  private at = NaN;
-  private drive: HistoryAnswer | undefined;
   private loading: AbortController | undefined;
   private settling: number | undefined;
-  private left = false;
 
   constructor(
     private readonly config: Config,
     private readonly table: FieldTable,
-    private readonly fleet: Fleet,
+    fleet: Fleet,
   ) {
     this.form = new RangeForm({
       range: (range) => this.open(range),
@@ -59,24 +45,12 @@ export class HistoryView {
       stream: () => this.choose(this.form.stream),
       out: () => this.zoomOut(),
     });
-    const rest = (): void => {
-      this.at = this.playback.time;
-      this.write();
-    };
-    this.playback = new Playback({ point: (index) => this.point(index), rest });
-    this.charts = new FieldCharts({
-      spec: (field) => this.spec(field),
-      hands: { zoom: (to) => this.zoom(to), move: (to, upright) => this.move(to, upright), back: () => this.zoomOut(), pick: rest },
-      onCursor: (index) => (index === null ? this.leave() : this.read(index)),
-      onFields: () => {
-        this.wanted = this.charts.fields;
-        this.write();
-      },
+    this.result = new Result(table, fleet, {
+      hands: { zoom: (to) => this.zoom(to), move: (to, upright) => this.move(to, upright), back: () => this.zoomOut() },
+      asked: () => this.asked(),
+      changed: () => this.write(),
     });
-    this.pictures = new Pictures(table);
-    const download = new Download(() => this.asked());
-    this.result.append(this.playback.node, this.pictures.node, this.charts.chips, this.charts.node, download.node, this.comparison.node);
-    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result];
+    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result.node];
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
     this.node = el(
       "article",
@@ -88,7 +62,7 @@ export class HistoryView {
 
   /** Show what an address says of a robot's past; undefined when the viewer leaves. */
   show(robot: string | undefined, query: Query<"history"> = {}): void {
-    this.playback.stop();
+    this.result.stop();
     if (robot === undefined) {
       this.loading?.abort();
       return;
@@ -102,7 +76,7 @@ export class HistoryView {
     this.title.set(robot);
     this.back.href = route({ view: "car", robot });
     [this.range, this.zooms] = [undefined, []];
-    this.clear();
+    this.result.clear();
     this.note.set("");
     this.runs.set(robot, undefined);
     this.form.node.inert = true;
@@ -110,7 +84,7 @@ export class HistoryView {
   }
 
   clock(_now: number): void {
-    if (this.drive) this.comparison.now(this.fleet.robots.get(this.robot)?.streams.get(this.form.stream));
+    this.result.clock();
   }
 
   /** Find the robot's streams and runs, and show what the address says, or the newest. */
@@ -129,8 +103,8 @@ export class HistoryView {
       this.form.streams(streams);
       this.form.stream = stream;
       this.runs.show(stream);
-      this.wanted = query.fields?.split(",") ?? [];
-      this.at = readTime(query.at);
+      this.result.wanted = query.fields?.split(",") ?? [];
+      this.result.at = readTime(query.at);
       const range = readRange(query.from, query.to);
       if (!range) await runs;
       if (!loading.signal.aborted) this.go(range ?? this.newest());
@@ -165,8 +139,8 @@ export class HistoryView {
     const before = this.form.stream;
     if (query.stream !== undefined) this.form.stream = query.stream;
     if (this.form.stream !== before) this.runs.show(this.form.stream);
-    this.wanted = query.fields?.split(",") ?? this.wanted;
-    if (query.at !== undefined) this.at = readTime(query.at);
+    this.result.wanted = query.fields?.split(",") ?? this.result.wanted;
+    if (query.at !== undefined) this.result.at = readTime(query.at);
     const range = readRange(query.from, query.to) ?? this.range!;
     if (same(range, this.zooms.at(-1))) this.zooms.pop();
     else if (!this.zooms.some(([from, to]) => from <= range[0] && range[1] <= to)) this.zooms = [];
@@ -174,7 +148,8 @@ export class HistoryView {
   }
 
   private choose(stream: string): void {
-    [this.wanted, this.zooms] = [[], []];
+    this.result.wanted = [];
+    this.zooms = [];
     this.runs.show(stream);
     this.go(this.range ?? this.newest(), true);
   }
@@ -209,7 +184,7 @@ export class HistoryView {
     if (span < LEAST_S || to[1] < least || to[0] > most) return false;
     if (this.zooms.length === 0) this.zooms.push(shown);
     this.range = rounded(to);
-    this.charts.move(this.range);
+    this.result.move(this.range);
     this.form.show(this.range, true);
     window.clearTimeout(this.settling);
     this.settling = window.setTimeout(() => this.go(this.range!), SETTLED_MS);
@@ -220,8 +195,8 @@ export class HistoryView {
   private go(range: Range, step = false): void {
     window.clearTimeout(this.settling);
     this.range = rounded(range);
-    if (!(this.range[0] <= this.at && this.at <= this.range[1])) this.at = NaN;
-    this.charts.move(this.range);
+    if (!(this.range[0] <= this.result.at && this.result.at <= this.range[1])) this.result.at = NaN;
+    this.result.move(this.range);
     this.form.show(this.range, this.zooms.length > 0);
     this.write(step);
     void this.load(this.range);
@@ -230,7 +205,7 @@ export class HistoryView {
   /** Put what is shown into the address. */
   private write(step = false): void {
     const [from, to] = this.range!.map(writeTime) as [string, string];
-    const more = { ...(this.wanted.length > 0 ? { fields: this.wanted.join(",") } : {}), ...(Number.isNaN(this.at) ? {} : { at: writeTime(this.at) }) };
+    const more = { ...(this.result.wanted.length > 0 ? { fields: this.result.wanted.join(",") } : {}), ...(Number.isNaN(this.result.at) ? {} : { at: writeTime(this.result.at) }) };
     setAddress({ view: "history", robot: this.robot, query: { stream: this.form.stream, from, to, ...more } }, step);
   }
 
@@ -247,7 +222,8 @@ export class HistoryView {
     try {
       const drive = await ask<HistoryAnswer>("history", { ...this.asked(), rows: String(ROWS) }, loading.signal);
       if (loading.signal.aborted) return;
-      this.set(drive, range);
+      if (drive.samples === 0) this.result.clear();
+      else this.result.set(this.robot, this.form.stream, drive, range);
       const each = drive.row_s > 0 ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max` : "";
       this.note.set(drive.samples === 0 ? this.nothing() : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
     } catch (error) {
@@ -259,67 +235,6 @@ export class HistoryView {
     const extent = this.runs.extent(this.form.stream);
     const [from, to] = extent?.map((at) => `${dayTime(at)} ${zone(at)}`) ?? [];
     return `Nothing was stored in this range.${extent ? ` ${this.form.stream} is stored from ${from} to ${to}.` : ""}`;
-  }
-
-  private clear(): void {
-    this.playback.set([]);
-    this.charts.clear();
-    this.drive = undefined;
-    this.result.hidden = true;
-  }
-
-  private set(drive: HistoryAnswer, range: Range): void {
-    if (drive.samples === 0) {
-      this.clear();
-      return;
-    }
-    this.drive = drive;
-    this.result.hidden = false;
-    const claims = this.pictures.set(drive);
-    // The speed of the car is shown as the field speed, where its parameters are known.
-    if (this.spec("speed").unit === "m/s" && Object.hasOwn(drive.fields, "speed")) claims.add("speed_mps");
-    const fields = Object.keys(drive.fields).filter((field) => !claims.has(field));
-    this.charts.set(drive, fields, range, this.wanted);
-    this.comparison.of(fields.map((field) => [field, this.spec(field)]));
-    this.playback.set(drive.times_s);
-    this.return();
-  }
-
-  /** Put the cursor where the viewer left it, or at the end. */
-  private return(): void {
-    const times = this.drive?.times_s ?? [];
-    const after = times.findIndex((time) => time >= this.at - 1e-3);
-    this.point(after < 0 ? times.length - 1 : after);
-  }
-
-  /** The pointer has left the charts, which all say so. */
-  private leave(): void {
-    if (this.left || Number.isNaN(this.at) || this.playback.playing) return;
-    this.left = true;
-    queueMicrotask(() => {
-      this.left = false;
-      this.return();
-    });
-  }
-
-  private spec(field: string): Spec {
-    return asSpeed(field, spec(field, this.table, this.drive?.ros2, this.form.stream), this.fleet.speed(this.robot));
-  }
-
-  /** Scrub to a row: in every chart, in the table and on the slider. */
-  private point(index: number): void {
-    this.charts.point(index);
-    // After the charts, whose cursor is elsewhere until then.
-    queueMicrotask(() => this.read(index));
-  }
-
-  private read(index: number): void {
-    const { drive } = this;
-    if (drive?.times_s[index] === undefined) return;
-    this.playback.show(index);
-    this.charts.read(index);
-    this.pictures.point(drive, index);
-    this.comparison.then(new Map(Object.entries(drive.fields).map(([field, { mean }]) => [field, mean[index] ?? null])));
   }
 }
 

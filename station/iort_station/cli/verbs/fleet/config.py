@@ -49,7 +49,7 @@ def config(
     cloud = context.obj.cloud()
     if not wanted:
         state = Shadow(cloud, robot).read()
-        rejected = state.reported.rejected
+        rejected = state.rejected()
         _print(robot, state, rejected, {}, as_json=as_json)
         if rejected and not as_json:
             options = " ".join(f"--unset {name}" for name in rejected)

@@ -9,10 +9,11 @@ import typer
 
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, tell
-from iort_station.cli.options import AsJson, Robot, Yes, agreed, to_file
+from iort_station.cli.options import AsJson, Force, Robot, Yes, agreed, to_file
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import claims, registry, robots, rotation
+from iort_station.output import check_free
 
 commands = typer.Typer()
 
@@ -63,6 +64,7 @@ def claim(
     name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
     folder: _ClaimFolder = Path("claim"),
     lasting: Annotated[bool, typer.Option(help="Valid until revoked, instead of five minutes.")] = False,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a provisioning claim, which the robot exchanges for a certificate of its own key.
@@ -72,6 +74,7 @@ def claim(
     """
     if name is None and not lasting:
         raise UsageError("give the robot's name, or --lasting for a claim of many robots")
+    check_free(folder / claims.FILE, force=force)
     path = claims.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
     text = (
         f"Copy {folder} to the robot, then run there:\n\n"
@@ -92,6 +95,7 @@ def rotate(
     settled_s: Annotated[
         float, typer.Option(help="Seconds that the robot must be connected with the new one.", min=0)
     ] = rotation.SETTLED_S,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Give a robot a new key and certificate; revoke the old one after the new one is in use.
@@ -101,6 +105,7 @@ def rotate(
     cloud = context.obj.cloud()
     if not finish:
         registry.get(cloud, name)
+        check_free(folder / claims.FILE, force=force)
         path = claims.claim(cloud, name, out=folder)
         text = (
             f"Copy {folder} to {name} within five minutes, then run there:\n\n"
