@@ -9,7 +9,9 @@ import pytest
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
+from iort_station.fleet import registry
 from iort_station.operations import delivery
 from iort_station.page import control
 from tests.local.conftest import until
@@ -20,9 +22,11 @@ def settings(outcome):
     return json.loads(outcome.output)["settings"]
 
 
-def test_a_running_agent_applies_a_setting_and_answers(iort, bundle):
+def test_a_running_agent_applies_a_setting_and_answers(iort, bundle, embedded):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     with driving(car):
+        # For a robot that the registry does not know to be connected, the command waits only shortly.
+        until(lambda: registry.get(embedded.cloud, car.robot).get(ONLINE))
         changed = iort("config", car.robot, "live.rate_hz=2", "fields.vesc=speed,voltage_input",
                        "log_level=debug", "--seconds", "120", "--json")  # fmt: skip
         assert changed.exit_code == 0, changed.output + str(changed.exception)
