@@ -28,6 +28,8 @@ from iort_contract.tables import ROBOT
 RATE_HZ = 10.0
 # Length of a simulation step; with larger ones the driver swerves.
 _STEP_S = 0.02
+# Hundreds of slow cars would need all of a processor for driving; they drive in slow motion instead.
+_MOST_STEPS = 5
 # The delays of a real car: before the publish, the sample left the car and reached the cloud this long ago.
 _SENT_MS, _RECEIVED_MS, _LAMBDA_MS = 11.0, 7.0, 3.0
 
@@ -48,8 +50,8 @@ class SimulatedCar:
         self._heading = self._vehicle.pose.heading_rad
 
     def updates(self, dt: float) -> list[dict[str, Any]]:
-        """Drive on for ``dt`` seconds; return one live update for each stream."""
-        for _ in range(round(dt / _STEP_S)):
+        """Drive on for ``dt`` seconds, at most `_MOST_STEPS`; return one live update for each stream."""
+        for _ in range(min(_MOST_STEPS, round(dt / _STEP_S))):
             self._vehicle.step(_STEP_S)
         sample = {**self._vehicle.sample(), "fault_code": self.fault_code}
         updates = [self._update(VESC_STREAM, sample)]

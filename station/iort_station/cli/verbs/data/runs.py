@@ -77,7 +77,7 @@ def _gaps(cloud: Cloud, robot: str, run: Run) -> Gaps:
 
 
 def _table(found: list[Run], gaps: Gaps | None) -> Table:
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, collapse_padding=True)
     for heading, justify in (
         ("start (UTC)", "left"),
         ("duration", "right"),
@@ -87,7 +87,11 @@ def _table(found: list[Run], gaps: Gaps | None) -> Table:
         table.add_column(heading, justify=justify, no_wrap=True)  # type: ignore[arg-type]  # rich's Literal
     for heading in ("stream", "samples", "batches", "missing", "lost"):
         if heading != "missing" or gaps is not None:
-            table.add_column(heading, justify="left" if heading == "stream" else "right")
+            # A long name takes a second line, so that a terminal of 80 characters shows every figure.
+            of_stream = heading == "stream"
+            table.add_column(
+                heading, justify="left" if of_stream else "right", no_wrap=not of_stream, overflow="fold"
+            )
     for run in found:
         lasted = timedelta(seconds=round((run["to_us"] - run["from_us"]) / 1e6))
         head = [iso_s(run["from_us"]).replace("T", " ")[:-1], str(lasted), run["run"][:8], run["state"]]
