@@ -112,15 +112,21 @@ class When:
             return Range(None, None) if last == "all" else Range(now_us - duration_us(last), now_us)
         if self.last is not None:
             raise UsageError("give --last, or --from and --to")
-        for text in (self.start, self.end):
-            if text is not None and not has_zone(text):
-                zone = datetime.now().astimezone()
-                say(f"{text} is read as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
-        start_us = None if self.start is None else time_us(self.start, now_us)
-        end_us = now_us if self.end is None else time_us(self.end, now_us)
+        start_us = None if self.start is None else _time_us(self.start, now_us)
+        end_us = now_us if self.end is None else _time_us(self.end, now_us)
         if start_us is not None and start_us > end_us:
             raise UsageError("the range ends before it starts")
         return Range(start_us, end_us)
+
+
+def _time_us(text: str, now_us: int) -> int:
+    """Parse a time, and say in which zone if it has none."""
+    t_us = time_us(text, now_us)
+    if not has_zone(text):
+        # Another season may have another offset than today.
+        zone = datetime.fromtimestamp(t_us / 1e6).astimezone()
+        say(f"{text} is read as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
+    return t_us
 
 
 def ranged(verb: Callable[..., None]) -> Callable[..., None]:

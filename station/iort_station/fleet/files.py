@@ -94,6 +94,7 @@ def download(
     digest = _sha256(part) if part.exists() else hashlib.sha256()
     there = part.stat().st_size if part.exists() else 0
     progress(there)
+    part.touch()  # Of an empty file nothing comes.
     if there < file.size:
         # The object must be the one of the head.
         body = client.get_object(Bucket=bucket, Key=file.key, IfMatch=head["ETag"], Range=f"bytes={there}-")[

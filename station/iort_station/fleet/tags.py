@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 from iort_contract.cloud import fleet_name
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError
+from iort_station.errors import UsageError
+from iort_station.fleet import registry
 
 # Provisioning compares it, so it is no tag.
 _SERIAL = "serial"
@@ -31,21 +32,22 @@ def listed(cloud: Cloud) -> dict[str, dict[str, str]]:
 def change(cloud: Cloud, robot: str, wanted: Mapping[str, str | None]) -> dict[str, str]:
     """Set tags, or remove those that are None; returns all tags of the robot.
 
-    Raises `StationError` if the robot is not registered, and for a tag that AWS IoT does not allow.
+    Raises `StationError` if the robot is not registered, `UsageError` for a tag that AWS IoT does not allow.
     """
     for name, value in wanted.items():
         if name == _SERIAL or not _NAME.fullmatch(name):
-            raise StationError(f"a tag's name must be letters, digits or _.,@/:#- and not serial, got {name}")
+            raise UsageError(f"a tag's name must be letters, digits or _.,@/:#- and not serial, got {name}")
         if value is not None and not _VALUE.fullmatch(value):
-            raise StationError(f"a tag's value must be letters, digits or _.,@/:#=[]- , got {value!r}")
+            raise UsageError(f"a tag's value must be letters, digits or _.,@/:#=[]- , got {value!r}")
     iot = cloud.client("iot")
     try:
-        known = iot.describe_thing(thingName=robot).get("attributes", {})
+        known = iot.describe_thing(thingName=registry.checked(robot)).get("attributes", {})
         changed = {**known, **wanted}
         kept = {name: value for name, value in changed.items() if value is not None}
-        iot.update_thing(thingName=robot, attributePayload={"attributes": kept, "merge": False})
+        if kept != known:
+            iot.update_thing(thingName=robot, attributePayload={"attributes": kept, "merge": False})
     except iot.exceptions.ResourceNotFoundException as error:
-        raise StationError(f"robot {robot} is not registered: `iort robots list`") from error
+        raise registry.not_registered(cloud, robot) from error
     return _tags(kept)
 
 

@@ -52,7 +52,8 @@ def acknowledge(cloud: Cloud, key: str, since_s: float, by: str = "") -> Acknowl
     """
     names = f"{cloud.namespace}-{key}"
     answer = cloud.client("cloudwatch").describe_alarms(AlarmNames=[names], AlarmTypes=["MetricAlarm"])
-    if not answer["MetricAlarms"]:
+    # The names of another deployment, such as iort-2, may begin like ours.
+    if not answer["MetricAlarms"] or not key.isalnum():
         raise StationError(f"alarm {key[:80]!r} does not exist; `iort alarms --all` lists them")
     (alarm,) = answer["MetricAlarms"]
     if alarm["StateValue"] != RAISED or _since_ms(alarm) != round(since_s * 1000):

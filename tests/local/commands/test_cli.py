@@ -40,6 +40,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     assert iort("robots", "tag", "cli-car", "lab=north", "team=blue").exit_code == 0
     assert iort("robots", "tag", "cli-car", "--remove", "team").output == "lab=north\nvehicle=vesc\n"
     assert "a tag's value must be" in str(iort("robots", "tag", "cli-car", "lab=two words").exception)
+    assert "is not registered; the nearest: " in str(iort("robots", "tag", "cli-cra").exception)
     assert iort("robots", "remove", "cli-car", "--yes").exit_code == 0
     assert "cli-car" not in iort("robots", "list").output
 

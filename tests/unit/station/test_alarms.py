@@ -88,6 +88,8 @@ def test_an_acknowledgement_ends_with_the_alarm(cloud):
     assert raised(cloud)["FaultSamples"]["acknowledged"] is None
     with pytest.raises(StationError, match="'Nothing' does not exist"):
         alarms.acknowledge(cloud, "Nothing", since_s)
+    with pytest.raises(StationError, match="'2-LiveErrors' does not exist"):
+        alarms.acknowledge(cloud, "2-LiveErrors", since_s)
 
 
 def test_an_alarm_names_the_cars_that_an_alert_named(cloud):

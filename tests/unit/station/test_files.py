@@ -136,6 +136,12 @@ def test_a_download_resumes_and_its_content_is_checked(cloud, store, tmp_path):
     assert path.read_bytes() == b"mine"
 
 
+def test_an_empty_file_is_downloaded(cloud, store, tmp_path):
+    store(b"")
+    (file,) = files.listed(cloud, "car")
+    assert files.download(cloud, file, tmp_path).read_bytes() == b""
+
+
 def test_a_content_with_a_wrong_sha256_is_refused(cloud, store, tmp_path):
     store(b"evil", sha256="0" * 64)
     (file,) = files.listed(cloud, "car")
