@@ -17,7 +17,7 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, config, load_track
-from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer
+from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer, on_loopback
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -279,6 +279,16 @@ def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> Non
         assert post(page, "{}") == (400, {"error": "nothing was asked"})
         assert post(page, '{"a": "b"}') == (200, {"done": True})
     assert done == [{}, {"a": "b"}]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
+def test_a_server_on_loopback_may_move_a_robot(host: str) -> None:
+    assert on_loopback(host)
+
+
+@pytest.mark.parametrize("host", ["", "0.0.0.0", "::", "192.168.1.7", "lab.example", "127.0.0.1.example"])
+def test_a_server_that_others_reach_may_not_move_a_robot(host: str) -> None:
+    assert not on_loopback(host)
 
 
 def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
