@@ -88,8 +88,12 @@ def runs(
     extents = {stream: whole.extent for stream, whole in zip(streams, wholes, strict=True) if whole}
     made = _by_run(dict(zip(streams, found, strict=True)), accounts)
     made.sort(key=lambda run: run["to_us"], reverse=True)
-    for run in made[1:]:
-        if run["state"] == "running":
+    goes_on = None if end_us is None else reports.boot_from(end_us)
+    for i, run in enumerate(made):
+        if run["run"] == goes_on:
+            # The report of its end is not read.
+            run["state"] = "unknown"
+        elif i and run["state"] == "running":
             run["state"] = "cut off"
     return {"runs": made[:count], "older": len(made) > count, "streams": extents}
 
@@ -153,6 +157,11 @@ class _Reader:
             first, before = self._first_of(last)
             yield Part(first, last, self._end_us(last))
             last = before
+
+    def boot_from(self, t_us: int) -> str | None:
+        """The run of the first batch from a time on."""
+        found = self._from(t_us)
+        return None if found is None else found.boot
 
     def account(self, part: Part) -> _Account:
         """The last report of a run."""

@@ -119,6 +119,16 @@ def test_a_run_has_every_stream_and_what_its_agent_reports():
     assert (older["state"], older["streams"]["vesc"]["samples"]) == ("unknown", None)
 
 
+def test_a_run_that_goes_on_after_the_range_is_not_cut_off():
+    cloud = cloud_of(*run_of(1, START, 3))
+    for second, ended in ((30, False), (60, True)):
+        count = StreamAccount("vesc", 6, 6, 0, 0, 0, 3, ended=ended)
+        put(cloud, ACCOUNT_STREAM, report(1, START + second * SECOND, count))
+    ends = (None, START + 61 * SECOND, START + 60 * SECOND, START + 2 * SECOND)
+    states = [runs(cloud, "car", end_us=end_us)["runs"][0]["state"] for end_us in ends]
+    assert states == ["ended", "ended", "unknown", "unknown"]
+
+
 def test_the_page_gets_the_newest_runs_and_then_the_older_ones():
     starts = [START + i * 1_000 * SECOND for i in range(5)]
     cloud = cloud_of(*(batch for i, at in enumerate(starts) for batch in run_of(i, at, 30)))

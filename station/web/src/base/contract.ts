@@ -376,7 +376,7 @@ export interface RunPart {
   readonly samples: number | null;
 }
 
-/** A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is "cut off" if it did not end properly, and "unknown" without a report of the agent. ``lost`` counts the messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was recorded. */
+/** A run of a robot's agent, from its start to its end. ``run`` is its name in batch ids. ``state`` is "cut off" if it did not end properly, and "unknown" without a report of the agent, or if it goes on after the range. ``lost`` counts the messages and samples that the agent reports as not recorded. ``streams`` is empty if nothing was recorded. */
 export interface Run {
   readonly from_us: number;
   readonly to_us: number;
