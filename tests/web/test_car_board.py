@@ -121,7 +121,7 @@ def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(
     page = open_page(f"{served}#/car/car-1")
     line = {"level": "error", "logger": "iort_agent.sources", "text": "source vesc failed\nOSError: gone"}
     show(page, car.send({**line, "left_out": 2}, stream=LOG_STREAM))
-    lines = page.get_by_label("Log of the agent").locator("li")
+    lines = page.get_by_label("Agent's log").locator("li")
     until(lambda: lines.count() == 2, "both lines")
     assert lines.nth(0).inner_text().splitlines()[1:] == [
         "source vesc failed",

@@ -21,7 +21,7 @@ export class AgentLog {
   private drawn = "";
 
   constructor(private readonly config: Config) {
-    this.node = el("section", { class: "panel agent-log", "aria-label": "Log of the agent" }, el("header", {}, el("h3", {}, "Log of the agent"), this.note.node), this.list);
+    this.node = el("section", { class: "panel agent-log", "aria-label": "Agent's log" }, el("header", {}, el("h3", {}, "Agent's log"), this.note.node), this.list);
   }
 
   /** Show this car's lines from now on. */
