@@ -46,7 +46,8 @@ def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
             "current_motor": [20 * math.sin(each) for each in at],
             "speed": [4614 * each / 10 for each in at],
             # The way of that speed: t² / 20 m, in counts.
-            "displacement": [float(int(each**2 / 20 * 461.4)) for each in at],
+            # The counter begins anew once, as after a restart of the VESC.
+            "displacement": [float(int(each**2 / 20 * 461.4) % 15_000) for each in at],
         }
         yield Batch(boot, second, times, columns)
 

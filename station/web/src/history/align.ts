@@ -13,6 +13,8 @@ export interface Line {
 
 // Fields that count the way, or hold a position; the first that a stream has is used.
 const COUNTERS = ["distance_traveled", "displacement"];
+// A count that changes faster has begun anew, after a restart of its VESC.
+const MOST_MPS = 100;
 const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
 
 /**
@@ -26,7 +28,10 @@ export function distance({ times_s, fields }: HistoryAnswer, speed: Linear | und
   if (counter && speed) {
     // Counts over counts of a revolution are revolutions; at 1 m/s a minute has as many as the gain, 1 / scale.
     const metres = Math.abs(speed.scale) * (60 / TACHOMETER_COUNTS);
-    return summed(rows, [counter], (i, before) => Math.abs(Number(counter[i]) - Number(counter[before])) * metres);
+    return summed(rows, [counter], (i, before) => {
+      const step = Math.abs(Number(counter[i]) - Number(counter[before])) * metres;
+      return step > MOST_MPS * (times_s[i]! - times_s[before]!) ? 0 : step;
+    });
   }
   for (const path of POSITIONS) {
     const [x, y] = [column(`${path}x`), column(`${path}y`)];
