@@ -119,14 +119,12 @@ def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(
     open_page: Callable[..., Page], served: str, car: Car
 ) -> None:
     page = open_page(f"{served}#/car/car-1")
-    line = {"level": "error", "logger": "iort_agent.sources", "text": "source vesc failed\nOSError: gone"}
+    line = {"level": "error", "logger": "iort_agent.sources", "text": "source vesc failed: OSError: gone"}
     show(page, car.send({**line, "left_out": 2}, stream=LOG_STREAM))
     lines = page.get_by_label("Agent's log").locator("li")
     until(lambda: lines.count() == 2, "both lines")
-    assert lines.nth(0).inner_text().splitlines()[1:] == [
-        "source vesc failed",
-        "2 lines before were left out",
-    ]
+    told = "source vesc failed: OSError: gone 2 lines before were left out"
+    assert lines.nth(0).inner_text().splitlines()[1:] == [told]
     assert "connection lost" in lines.nth(1).inner_text()
     # Their texts are no tiles.
     assert page.locator(f"[data-stream={LOG_STREAM}]").count() == 0

@@ -1,13 +1,18 @@
-"""Changes the settings of a running agent, and waits for its answer."""
+"""The settings of a running agent: reads what is typed, changes them, and waits for the agent's answer."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
+from iort_contract.limits import ContractError
+from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, check_setting
 from iort_contract.messages.shadow import Rejection
 from iort_contract.tables import ONLINE
 from iort_station.cloud import Cloud
+from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.fleet.shadow import Shadow, State, answered
 
@@ -24,6 +29,28 @@ class Changed(NamedTuple):
     rejected: Mapping[str, Rejection]
     online: bool
     answered: bool
+
+
+def parsed(name: str, text: str) -> Any:
+    """The value of a setting that somebody has typed; raises `UsageError` for one that no agent accepts."""
+    value: Any = text
+    if name.startswith(f"{FIELDS}."):
+        value = [field.strip() for field in text.split(",") if field.strip()]
+    elif not isinstance(SETTINGS.get(name), Choice):
+        with suppress(ValueError):  # refused below
+            value = json.loads(text)
+    try:
+        check_setting(name, value)
+    except ContractError as error:
+        raise UsageError(f"{error}; nothing is changed") from error
+    return value
+
+
+def written(value: Any) -> str:
+    """A setting's value as somebody types it."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return ",".join(map(str, value)) if isinstance(value, list) else json.dumps(value).strip('"')
 
 
 def change(cloud: Cloud, robot: str, wanted: Mapping[str, Any], seconds: float) -> Changed:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
-from iort_contract.limits import ContractError
 from iort_contract.messages.commands import MAX_LEASE_MS
 from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
-from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, Flag, Number, check_setting
+from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
@@ -63,24 +61,10 @@ def settings(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
 def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
     """Change the setting ``name`` of ``robot`` to ``value``; without a value, car.yaml's applies again."""
     robot, name = text(asked, "robot"), text(asked, "name")
-    value = _parsed(name, asked["value"]) if "value" in asked else None
+    value = fleet_settings.parsed(name, asked["value"]) if "value" in asked else None
     changed = fleet_settings.change(cloud, robot, {name: value}, _ANSWER_S)
     reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
     return {"settings": _entries(changed.state, reasons), "online": changed.online}
-
-
-def _parsed(name: str, written: str) -> Any:
-    value: Any = written
-    if name.startswith(f"{FIELDS}."):
-        value = [field.strip() for field in written.split(",") if field.strip()]
-    elif not isinstance(SETTINGS.get(name), Choice):
-        with suppress(ValueError):  # refused below
-            value = json.loads(written)
-    try:
-        check_setting(name, value)
-    except ContractError as error:
-        raise StationError(f"{error}; nothing is changed") from error
-    return value
 
 
 def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
@@ -112,8 +96,4 @@ def _kind(setting: Flag | Number | Choice | None) -> SettingKind:
 
 
 def _written(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:g}"
-    return ",".join(map(str, value)) if isinstance(value, list) else json.dumps(value).strip('"')
+    return "" if value is None else fleet_settings.written(value)

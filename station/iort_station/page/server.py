@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import gzip
-import hashlib
 import ipaddress
 import json
-import math
 import re
 import secrets
 import threading
@@ -23,7 +20,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
@@ -35,6 +32,7 @@ from iort_contract.page import HEADERS, KEY_HEADER, PUBNUB_ORIGIN, security_poli
 from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
+from iort_station.page.bodies import Body, as_json, packed, takes_gzip
 from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
@@ -50,15 +48,6 @@ MOST_ANSWERS = 16
 # A file of a long range takes a gigabyte of memory while it is written.
 MOST_DOWNLOADS = 2
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
-# A coding of Accept-Encoding and its weight.
-_CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
-
-
-class _Body(NamedTuple):
-    kind: str
-    plain: bytes
-    packed: bytes
-    etag: str
 
 
 class PageServer(BackgroundServer):
@@ -113,11 +102,11 @@ class PageServer(BackgroundServer):
         )
         # Only these can be requested: no path reaches the file system.
         self._files = {
-            f"/{name}": _body(TYPES[Path(name).suffix], content)
+            f"/{name}": packed(TYPES[Path(name).suffix], content)
             for name, content in built_files(built).items()
         }
         self._files["/"] = self._files["/index.html"]
-        self._files["/config.json"] = _json(told)
+        self._files["/config.json"] = as_json(told)
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
@@ -148,12 +137,12 @@ class PageServer(BackgroundServer):
         """Answer with a file, or with the result of one of ``answers``."""
         if not self._accepts(request.headers.get("Host", "")):
             refused = "this server answers to localhost, to addresses and to what --name says"
-            return self._response(request, _json({"error": refused}), 403)
+            return self._response(request, as_json({"error": refused}), 403)
         path = request.raw_path.partition("?")[0]
         if request.method == "POST" and path in self._actions:
             return await self._act(request, self._actions[path])
         if request.method not in {"GET", "HEAD"}:
-            return self._response(request, _body(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
+            return self._response(request, packed(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
         answer = self._answers.get(path)
         if answer is not None:
             parameters = dict(request.query)
@@ -163,7 +152,7 @@ class PageServer(BackgroundServer):
             return await self._download(request, self._downloads[path])
         file = self._files.get(path)
         if file is None:
-            return self._response(request, _body(TYPES[".txt"], b"404 Not Found\n"), 404)
+            return self._response(request, packed(TYPES[".txt"], b"404 Not Found\n"), 404)
         response = self._response(request, file, 200)
         # Weak, because the same content may be sent with or without gzip.
         response.etag = ETag(file.etag, is_weak=True)
@@ -224,18 +213,18 @@ class PageServer(BackgroundServer):
         )
         if not known or origin.lower() != request.headers["Host"].lower():
             refused = "an action needs this page's own origin and key: reload the page"
-            return self._response(request, _json({"error": refused}), 403)
+            return self._response(request, as_json({"error": refused}), 403)
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:
             return self._response(
-                request, _json({"error": "an action needs a body of application/json"}), 415
+                request, as_json({"error": "an action needs a body of application/json"}), 415
             )
         try:
             asked = json.loads(await request.text())
         except (ValueError, LookupError, RecursionError):  # also of an unknown charset
             asked = None
         if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
-            return self._response(request, _json({"error": "the body must be an object of texts"}), 400)
+            return self._response(request, as_json({"error": "the body must be an object of texts"}), 400)
         status, body = await self._off_the_loop(lambda: _answered(action, asked), self._free)
         return self._response(request, body, status)
 
@@ -254,9 +243,9 @@ class PageServer(BackgroundServer):
             return found[1].lower() in self._names
         return True
 
-    def _response(self, request: web.BaseRequest, body: _Body, status: int) -> web.Response:
+    def _response(self, request: web.BaseRequest, body: Body, status: int) -> web.Response:
         headers = {**self._headers, "Content-Type": body.kind}
-        if _takes_gzip(request.headers.get("Accept-Encoding", "")):
+        if takes_gzip(request.headers.get("Accept-Encoding", "")):
             return web.Response(
                 body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
             )
@@ -271,43 +260,15 @@ def on_loopback(host: str) -> bool:
         return False
 
 
-def _takes_gzip(accepted: str) -> bool:
-    """Whether an Accept-Encoding allows gzip: RFC 9110, 12.5.3. A weight of 0 refuses a coding."""
-    weights: dict[str, str] = dict(_CODING.findall(accepted.lower()))
-    weight = weights.get("gzip", weights.get("*", "0"))
-    return weight == "" or weight.strip("0.") != ""
+def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, Body]:
+    return _tried(lambda: (200, as_json(answer(parameters), level=1)))
 
 
-def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:
-    return _tried(lambda: (200, _json(answer(parameters), level=1)))
-
-
-def _tried(work: Callable[[], _T]) -> _T | tuple[int, _Body]:
+def _tried(work: Callable[[], _T]) -> _T | tuple[int, Body]:
     """The result, or the status and the body of its error."""
     try:
         return work()
     except (StationError, ContractError) as error:
-        return 400, _json({"error": str(error)})
+        return 400, as_json({"error": str(error)})
     except (BotoCoreError, ClientError) as error:
-        return 502, _json({"error": f"AWS refused a call: {error}"})
-
-
-def _json(value: Mapping[str, Any], level: int = 6) -> _Body:
-    try:
-        text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    except ValueError:
-        text = json.dumps(_finite(value), allow_nan=False, separators=(",", ":"))
-    return _body(TYPES[".json"], text.encode(), level)
-
-
-def _finite(value: Any) -> Any:
-    """The value, with null for each number that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {name: _finite(one) for name, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _body(kind: str, content: bytes, level: int = 6) -> _Body:
-    return _Body(kind, content, gzip.compress(content, level, mtime=0), hashlib.sha256(content).hexdigest())
+        return 502, as_json({"error": f"AWS refused a call: {error}"})

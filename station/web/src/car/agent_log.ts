@@ -57,8 +57,6 @@ export class AgentLog {
 }
 
 function row({ t_us, level, logger, text, leftOut }: Line): HTMLElement {
-  const [head = "", ...details] = text.split("\n");
-  const words = details.length === 0 ? [head] : [el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n")))];
-  const left = leftOut > 0 ? [el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
-  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", dayTime(t_us / 1e6)), ...words, ...left);
+  const left = leftOut > 0 ? [" ", el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
+  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", dayTime(t_us / 1e6)), text, ...left);
 }

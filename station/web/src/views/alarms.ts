@@ -4,6 +4,7 @@ import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contr
 import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { clockTime, dayTime, zone } from "../base/format";
+import { keep, kept } from "../base/kept";
 import { route } from "../base/route";
 import type { Alarms, CarState, Raised } from "../live/alarms";
 
@@ -11,7 +12,6 @@ import type { Alarms, CarState, Raised } from "../live/alarms";
 const BEFORE_S = 60;
 const CLOUD_BEFORE_S = 300;
 const AFTER_S = 60;
-const NAME_KEY = "iort.name";
 const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;
 
 export class AlarmsView {
@@ -32,8 +32,8 @@ export class AlarmsView {
     private readonly config: Config,
     private readonly alarms: Alarms,
   ) {
-    this.name.value = stored();
-    this.name.addEventListener("change", () => store(this.name.value));
+    this.name.value = kept("name") ?? "";
+    this.name.addEventListener("change", () => keep("name", this.name.value));
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is: it sees only what the cars send. Run ", el("code", {}, "iort dashboard"), " for the cloud's alarms.");
     const others = el(
       "details",
@@ -175,20 +175,4 @@ function marked(text: string): (HTMLElement | string)[] {
 
 function capital(text: string): string {
   return text.charAt(0).toUpperCase() + text.slice(1);
-}
-
-function stored(): string {
-  try {
-    return localStorage.getItem(NAME_KEY) ?? "";
-  } catch {
-    return "";
-  }
-}
-
-function store(name: string): void {
-  try {
-    localStorage.setItem(NAME_KEY, name);
-  } catch {
-    // The name lasts until the page is closed.
-  }
 }

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 
-from iort_contract.limits import ContractError
-from iort_contract.messages.settings import FIELDS, check_setting
 from iort_contract.messages.shadow import Rejection
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
@@ -74,17 +70,7 @@ def _change(text: str) -> tuple[str, Any]:
     name, equals, written = text.partition("=")
     if not name or not equals:
         raise UsageError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
-    value: Any = written
-    if name.startswith(f"{FIELDS}."):
-        value = [field for field in written.split(",") if field]
-    else:
-        with suppress(ValueError):  # a text
-            value = json.loads(written)
-    try:
-        check_setting(name, value)
-    except ContractError as error:
-        raise UsageError(f"{error}; nothing is changed") from error
-    return name, value
+    return name, settings.parsed(name, written)
 
 
 def _print(
@@ -104,12 +90,8 @@ def _print(
         out.print(f"{robot} has reported no settings yet")
     said = {name: "  (withdrawn)" if value is None else "  (changed)" for name, value in wanted.items()}
     said |= dict.fromkeys(rejected, "  (unchanged: the change is rejected)")
-    said |= {name: f"  (pending: {_shown(value)})" for name, value in pending.items()}
+    said |= {name: f"  (pending: {settings.written(value)})" for name, value in pending.items()}
     for name, value in {**dict.fromkeys(pending, "?"), **in_force}.items():
-        out.print(f"{name}={_shown(value)}{said.get(name, '')}")
+        out.print(f"{name}={settings.written(value)}{said.get(name, '')}")
     for one in rejected.values():
         errors.print(f"rejected: {one.reason}", style="red")
-
-
-def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else json.dumps(value).strip('"')

@@ -1,0 +1,55 @@
+"""Bodies of the page's answers, plain and packed."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from iort_station.page.page import TYPES
+
+# A coding of Accept-Encoding and its weight.
+_CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
+
+
+class Body(NamedTuple):
+    """A body, and packed by gzip. ``etag`` tells whether a browser has it already."""
+
+    kind: str
+    plain: bytes
+    packed: bytes
+    etag: str
+
+
+def as_json(value: Mapping[str, Any], level: int = 6) -> Body:
+    """A value as JSON."""
+    try:
+        text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    except ValueError:
+        text = json.dumps(_finite(value), allow_nan=False, separators=(",", ":"))
+    return packed(TYPES[".json"], text.encode(), level)
+
+
+def _finite(value: Any) -> Any:
+    """The value, with null for each number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {name: _finite(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def packed(kind: str, content: bytes, level: int = 6) -> Body:
+    """The body of a content; a lower ``level`` packs faster."""
+    return Body(kind, content, gzip.compress(content, level, mtime=0), hashlib.sha256(content).hexdigest())
+
+
+def takes_gzip(accepted: str) -> bool:
+    """Whether an Accept-Encoding allows gzip: RFC 9110, 12.5.3. A weight of 0 refuses a coding."""
+    weights: dict[str, str] = dict(_CODING.findall(accepted.lower()))
+    weight = weights.get("gzip", weights.get("*", "0"))
+    return weight == "" or weight.strip("0.") != ""
