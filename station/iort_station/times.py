@@ -21,6 +21,8 @@ _UNITS_US = {
     "d": 86_400_000_000,
     "w": 604_800_000_000,
 }
+# A century.
+_MOST_US = 36_525 * _UNITS_US["d"]
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|m|h|d|w)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
@@ -28,10 +30,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 def duration_us(text: str) -> int:
     """Parse a duration such as ``100ms``, ``1s``, ``10m``, ``1.5h`` or ``7d``; raises `UsageError`."""
     match = _DURATION.fullmatch(text.strip())
-    length_us = round(float(match[1]) * _UNITS_US[match[2]]) if match else 0
-    if length_us < 1:
+    length_us = float(match[1]) * _UNITS_US[match[2]] if match else 0.0
+    if not 0.5 < length_us < _MOST_US:
         raise UsageError(f"duration must be a number with us, ms, s, m, h, d or w, such as 10m, got {text!r}")
-    return length_us
+    return round(length_us)
 
 
 def time_us(value: Time, now_us: int) -> int:

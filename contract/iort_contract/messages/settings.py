@@ -78,18 +78,24 @@ SETTINGS: Mapping[str, Flag | Number | Choice] = {
 CHANGEABLE = (*SETTINGS, f"{FIELDS}.<stream>")
 
 
+def check_name(name: str) -> None:
+    """Raise `ContractError` for a setting that no agent knows."""
+    if name.startswith(f"{FIELDS}."):
+        check_stream(name[len(FIELDS) + 1 :])
+    elif name not in SETTINGS:
+        raise ContractError(f"{shown(name)} cannot be changed; must be one of {', '.join(CHANGEABLE)}")
+
+
 def check_setting(name: str, value: Any) -> None:
     """Raise `ContractError` for a name or value that no agent accepts.
 
     An agent also refuses a selection of fields that its stream does not have.
     """
-    if name.startswith(f"{FIELDS}."):
-        check_stream(name[len(FIELDS) + 1 :])
+    check_name(name)
+    if name not in SETTINGS:
         if not isinstance(value, list):
             raise ContractError(f"{name} must be {FIELD_LIST}, got {shown(value)}")
         for field in value:
             check_field(field)
-    elif name not in SETTINGS:
-        raise ContractError(f"{shown(name)} cannot be changed; must be one of {', '.join(CHANGEABLE)}")
     elif not SETTINGS[name].accepts(value):
         raise ContractError(f"{name} must be {SETTINGS[name].allowed}, got {shown(value)}")

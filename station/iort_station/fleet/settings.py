@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, check_setting
+from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, check_name, check_setting
 from iort_contract.messages.shadow import Rejection
 from iort_contract.tables import ONLINE
 from iort_station.cloud import Cloud
@@ -39,11 +39,17 @@ def parsed(name: str, text: str) -> Any:
     elif not isinstance(SETTINGS.get(name), Choice):
         with suppress(ValueError):  # refused below
             value = json.loads(text)
-    try:
+    with _nothing_changed():
         check_setting(name, value)
+    return value
+
+
+@contextmanager
+def _nothing_changed() -> Iterator[None]:
+    try:
+        yield
     except ContractError as error:
         raise UsageError(f"{error}; nothing is changed") from error
-    return value
 
 
 def written(value: Any) -> str:
@@ -57,11 +63,15 @@ def change(cloud: Cloud, robot: str, wanted: Mapping[str, Any], seconds: float) 
     """Desire settings by dotted name, and wait for the robot; None returns to the file's value.
 
     A change that the robot rejects is withdrawn: the last accepted value stays in force. The values must have
-    passed `check_setting`. Raises `StationError` for an unknown robot.
+    passed `check_setting`. Raises `StationError` for an unknown robot, and `UsageError` for an unknown
+    setting that is not desired either.
     """
     shadow = Shadow(cloud, robot)
     online = bool(registry.get(cloud, robot).get(ONLINE))
     before = shadow.read()
+    with _nothing_changed():
+        for name in wanted.keys() - before.desired.settings.keys():
+            check_name(name)
     in_time = _change_and_wait(shadow, before, wanted, seconds if online else min(seconds, _OFFLINE_S))
     state = shadow.read()
     rejected = {name: one for name, one in state.rejected().items() if name in wanted}

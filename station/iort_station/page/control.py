@@ -37,7 +37,7 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
     """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves."""
     try:
         message = json.loads(text(asked, "message"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise StationError(f"the message must be JSON: {error}") from error
     if not isinstance(message, dict):
         raise StationError("the message must be a JSON object with the fields of the ROS message")

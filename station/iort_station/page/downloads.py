@@ -13,14 +13,12 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Result, Selection
 from iort_station.errors import StationError
-from iort_station.page.answers import text, whole
+from iort_station.page.answers import MOST_VALUES, text, whole
 from iort_station.page.server import Download
 from iort_station.recordings import export, recordings, tabular
 from iort_station.recordings.recordings import Recording, Write
 from iort_station.times import iso_s
 
-# Half an hour of thirty fields at 500 Hz; their table takes 240 MB of memory.
-MOST_VALUES = 30_000_000
 MOST_BYTES = 1_000_000_000
 
 

@@ -67,6 +67,10 @@ def test_a_change_for_an_offline_robot_is_pending(iort, bundle):
     assert "live.rate_hz=?  (pending: 3)" in asked.stdout
     assert f"pending: {car.robot} is offline, and applies it when it is back" in asked.stderr
     assert json.loads(iort("config", car.robot, "--json").output)["pending"] == {"live.rate_hz": 3}
+    # It would take every setting of the section with it.
+    unknown = iort("config", car.robot, "--unset", "live", "--seconds", "0.1")
+    assert "'live' cannot be changed" in str(unknown.exception)
+    assert json.loads(iort("config", car.robot, "--json").output)["pending"] == {"live.rate_hz": 3}
 
 
 @pytest.mark.parametrize(

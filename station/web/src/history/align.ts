@@ -15,6 +15,8 @@ export interface Line {
 const COUNTERS = ["distance_traveled", "displacement"];
 // A count that changes faster has begun anew, after a restart of its VESC.
 const MOST_MPS = 100;
+// Shorter steps between positions count once they add up: they may be the noise of a car that stands.
+const LEAST_STEP_M = 0.1;
 const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
 
 /**
@@ -35,7 +37,15 @@ export function distance({ times_s, fields }: HistoryAnswer, speed: Linear | und
   }
   for (const path of POSITIONS) {
     const [x, y] = [column(`${path}x`), column(`${path}y`)];
-    if (x && y) return summed(rows, [x, y], (i, before) => Math.hypot(Number(x[i]) - Number(x[before]), Number(y[i]) - Number(y[before])));
+    if (!x || !y) continue;
+    let from = -1;
+    return summed(rows, [x, y], (i, before) => {
+      if (from < 0) from = before;
+      const step = Math.hypot(Number(x[i]) - Number(x[from]), Number(y[i]) - Number(y[from]));
+      if (step < LEAST_STEP_M) return 0;
+      from = i;
+      return step;
+    });
   }
   const erpm = column("speed");
   if (!erpm || !speed) return undefined;
