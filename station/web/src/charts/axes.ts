@@ -47,7 +47,8 @@ export function fit(host: HTMLElement, plot: uPlot, changed: (visible: boolean) 
 
 export function labels(splits: readonly number[]): string[] {
   const step = splits.length > 1 ? Math.abs(splits[1]! - splits[0]!) : 1;
-  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(step) - 1e-9)));
+  // As many as the step needs: 2.5 has one, 0.25 two.
+  const digits = [0, 1, 2].find((places) => Math.abs(step * 10 ** places - Math.round(step * 10 ** places)) < 1e-6) ?? 3;
   return splits.map((value) => {
     if (Math.abs(value) >= 10_000) return `${signed(value / 1000, Math.abs(step) % 1000 ? 1 : 0)}k`;
     return signed(value, Math.abs(value / step - Math.round(value / step)) > 0.01 ? digits + 1 : digits);
