@@ -75,6 +75,22 @@ class UploadEnvironment(Environment):
 
 
 @dataclass(frozen=True)
+class RefuseEnvironment(Environment):
+    """The function that refuses unknown questions."""
+
+    rejected_queue: str
+
+
+@dataclass(frozen=True)
+class QuestionEnvironment(RefuseEnvironment):
+    """A function that answers a robot's question; ``findings_table`` has the robots' parameters."""
+
+    robots_table: str
+    findings_table: str
+    files_bucket: str
+
+
+@dataclass(frozen=True)
 class AlertEnvironment(Environment):
     """The function that mails."""
 

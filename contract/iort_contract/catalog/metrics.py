@@ -39,12 +39,13 @@ FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
 PRESENCE_CHART = Chart("Robots: who comes and goes")
 ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
 FILES_CHART = Chart("Robots: files")
+ASKS_CHART = Chart("Robots: questions, and the time of an answer, p95 ms")
 # The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
 ROBOT_CHARTS: tuple[tuple[Chart, ...], ...] = (
     (REPORTS_CHART, BATCHES_CHART, GAPS_CHART, BACKLOG_CHART),
     (HOPS_CHART, ROUND_TRIPS_CHART),
     (BATTERY_CHART, TEMPERATURE_CHART, FAULTS_CHART),
-    (PRESENCE_CHART, ADMISSION_CHART, FILES_CHART),
+    (PRESENCE_CHART, ADMISSION_CHART, FILES_CHART, ASKS_CHART),
 )
 
 
@@ -202,6 +203,10 @@ METRICS = {
         Metric("FilesStored", "upload", FILES_CHART),
         Metric("FilesRefused", "upload", FILES_CHART),
         Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
+        Metric("QuestionsAnswered", "ask", ASKS_CHART),
+        Metric("QuestionsRefused", "ask", ASKS_CHART),
+        # From the rule's receipt to the answer's publish.
+        _delay("AnswerMs", "ask", ASKS_CHART, right=True),
     )
 }
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import (
@@ -20,6 +21,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import (
+    ASK,
     FILE,
     LAMBDA,
     LIVE,
@@ -134,6 +136,22 @@ RULES = {
             "answers requests for upload addresses",
             f"SELECT {_BYTES} FROM '{PING}/{{namespace}}/+/{FILE}'",
             Call("upload"),
+        ),
+        *(
+            Rule(
+                f"ask{question.name}",
+                f"answers with {question.meaning}",
+                f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/{question.name}'",
+                Call(question.name),
+            )
+            for question in QUESTIONS.values()
+        ),
+        Rule(
+            "refuse",
+            "refuses questions that no function answers",
+            f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/+' WHERE "
+            + " AND ".join(f"topic(4) <> '{name}'" for name in QUESTIONS),
+            Call("refuse"),
         ),
         Rule(
             "presence",
