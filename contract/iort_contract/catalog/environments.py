@@ -75,19 +75,13 @@ class UploadEnvironment(Environment):
 
 
 @dataclass(frozen=True)
-class RefuseEnvironment(Environment):
-    """The function that refuses unknown questions."""
-
-    rejected_queue: str
-
-
-@dataclass(frozen=True)
-class QuestionEnvironment(RefuseEnvironment):
-    """A function that answers a robot's question; ``findings_table`` has the robots' parameters."""
+class AnswerEnvironment(Environment):
+    """The function that answers robots' questions; ``findings_table`` has the robots' parameters."""
 
     robots_table: str
     findings_table: str
     files_bucket: str
+    rejected_queue: str
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""The questions that a robot may ask: each is a function of the cloud that answers on ``answer/...``.
+"""The questions that a robot may ask the function answer.
 
-To add one, add an entry, and ``functions/<name>.py`` with the answer.
+To add one, add an entry, and ``functions/shared/questions/<name>.py`` with its answer.
 """
 
 from __future__ import annotations
@@ -8,15 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from iort_contract.messages.ask import MAX_INLINE_BYTES
+from iort_contract.tables import ASKED_PREFIX
 
 
 @dataclass(frozen=True)
 class Question:
     """A question. A robot may ask it ``per_hour`` times in an hour of the clock.
 
-    The function has ``timeout_s`` and ``memory_mb``. A question or an answer above `MAX_INLINE_BYTES` is a
-    file in the bucket; a function whose limits are below has no rights on the bucket. A function that
-    ``calculates`` needs numpy.
+    It takes the function up to ``timeout_s`` and ``memory_mb``; the function has what its largest question
+    needs. A question or an answer above `MAX_INLINE_BYTES` is a file in the bucket.
     """
 
     name: str
@@ -26,22 +26,16 @@ class Question:
     memory_mb: int = 256
     max_question_bytes: int = 10 * 1024
     max_answer_bytes: int = MAX_INLINE_BYTES
-    calculates: bool = False
 
     @property
     def hour_attribute(self) -> str:
         """The attribute of the robot's row with the hour that is counted, as ``2026-11-22T17`` in UTC."""
-        return f"asked_{self.name}_hour"
+        return f"{ASKED_PREFIX}{self.name}_hour"
 
     @property
     def count_attribute(self) -> str:
         """The attribute of the robot's row with the questions of that hour."""
-        return f"asked_{self.name}_count"
-
-    @property
-    def by_file(self) -> bool:
-        """Whether a question or an answer may be a file."""
-        return max(self.max_question_bytes, self.max_answer_bytes) > MAX_INLINE_BYTES
+        return f"{ASKED_PREFIX}{self.name}_count"
 
 
 CALIBRATION = Question(

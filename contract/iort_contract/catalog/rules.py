@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import (
@@ -137,21 +136,11 @@ RULES = {
             f"SELECT {_BYTES} FROM '{PING}/{{namespace}}/+/{FILE}'",
             Call("upload"),
         ),
-        *(
-            Rule(
-                f"ask{question.name}",
-                f"answers with {question.meaning}",
-                f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/{question.name}'",
-                Call(question.name),
-            )
-            for question in QUESTIONS.values()
-        ),
         Rule(
-            "refuse",
-            "refuses questions that no function answers",
-            f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/+' WHERE "
-            + " AND ".join(f"topic(4) <> '{name}'" for name in QUESTIONS),
-            Call("refuse"),
+            "ask",
+            "answers the questions of robots",
+            f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/+'",
+            Call("answer"),
         ),
         Rule(
             "presence",
