@@ -48,7 +48,32 @@ _BATTERY = (
     ),
 )
 
-PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY,)}
+_LAPS = (
+    Parameter("lap_best_s", "s", "time of the best lap", worse="up"),
+    Parameter("lap_mean_s", "s", "mean time of the complete laps", worse="up"),
+    Parameter("lap_distance_m", "m", "mean length of the complete laps"),
+    Parameter("lap_energy_wh", "Wh", "mean energy of a lap, out of the battery", worse="up"),
+    Parameter("lap_energy_wh_per_km", "Wh/km", "mean energy of a lap for its length", worse="up"),
+)
+# The tables of laps: what each took, and when it passed each place.
+LAPS_TABLE, PLACES_TABLE = "laps", "lap_places"
+# How a car is driven, over half a second; `mining.style` says when each is.
+STYLES = {
+    "standing": "the car stands",
+    "hard braking": "the speed falls fast",
+    "hard accelerating": "the speed rises fast",
+    "corner at the limit": "a corner with nearly all the grip that the drive used",
+    "cornering": "a corner below that",
+    "steady fast": "a speed near the drive's highest, held",
+    "steady slow": "a lower speed, held",
+}
+STYLE_TABLE = "style"
+_STYLES = tuple(
+    Parameter(f"style_{style.replace(' ', '_')}_share", "1", f"share of time: {meaning}")
+    for style, meaning in STYLES.items()
+)
+
+PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY, *_LAPS, *_STYLES)}
 
 KINDS = {
     kind.name: kind
