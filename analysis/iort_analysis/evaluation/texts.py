@@ -35,8 +35,7 @@ def complete(finding: Finding, explained: Sequence[Finding]) -> str:
     if explained:
         sentences.append("This goes with it: " + "; ".join(other.text for other in explained))
     if alternatives := KINDS[finding.kind].alternatives:
-        other = " or ".join(KINDS[kind].meaning for kind in alternatives)
-        sentences.append(f"The data cannot tell this from another cause: {other}")
+        sentences.append(f"The data cannot tell this from {' or '.join(alternatives)}")
     return ". ".join(sentences)
 
 

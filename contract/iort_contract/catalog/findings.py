@@ -8,6 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from iort_contract.catalog.kinds import KINDS
+
+__all__ = ["KINDS", "PARAMETERS", "Parameter"]
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -33,23 +37,6 @@ class Parameter:
         return max(self.least, self.least_share * abs(baseline))
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of finding. ``meaning`` says what happened, ``action`` what a person does, in Markdown.
-
-    The operator gets a mail for a ``serious`` one. ``explains`` are the kinds that the same cause raises:
-    beside this one they are no findings of their own. ``alternatives`` are causes that the data cannot tell
-    from this one.
-    """
-
-    name: str
-    meaning: str
-    action: str
-    severity: Literal["info", "warning", "serious"] = "warning"
-    explains: tuple[str, ...] = ()
-    alternatives: tuple[str, ...] = ()
-
-
 # One group a miner of analysis/iort_analysis/mining.
 _BATTERY = (
     Parameter(
@@ -63,19 +50,3 @@ _BATTERY = (
 )
 
 PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY,)}
-
-KINDS = {
-    kind.name: kind
-    for kind in (
-        Kind(
-            "battery_worn",
-            "the battery's internal resistance has grown",
-            "charge it fully and compare with another battery; replace it if the resistance stays",
-        ),
-        Kind(
-            "analysis_failed",
-            "a drive could not be analysed",
-            "the text has the reason; the samples are kept, and `iort analyse` tries again",
-        ),
-    )
-}
