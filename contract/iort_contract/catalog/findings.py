@@ -14,7 +14,9 @@ class Parameter:
     """A number that is estimated from a drive, with its unit.
 
     ``worse`` is the direction of a change for the worse; ``kind`` names the finding about such a change,
-    empty if a change is no finding.
+    empty if a change is no finding. A change counts from ``least`` in the unit and from ``least_share`` of
+    the baseline on: less means nothing on a car, and healthy drives differ by a third of it. ``fields`` are
+    those of the VESC that it was estimated from.
     """
 
     name: str
@@ -22,19 +24,30 @@ class Parameter:
     meaning: str
     worse: Literal["up", "down", "either"] = "either"
     kind: str = ""
+    fields: tuple[str, ...] = ()
+    least: float = 0.0
+    least_share: float = 0.2
+
+    def least_change(self, baseline: float) -> float:
+        """The smallest change from a baseline that means something, in the unit."""
+        return max(self.least, self.least_share * abs(baseline))
 
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of finding. ``meaning`` says what happened, ``action`` what a person does, in Markdown.
 
-    The operator gets a mail for a ``serious`` one.
+    The operator gets a mail for a ``serious`` one. ``explains`` are the kinds that the same cause raises:
+    beside this one they are no findings of their own. ``alternatives`` are causes that the data cannot tell
+    from this one.
     """
 
     name: str
     meaning: str
     action: str
     severity: Literal["info", "warning", "serious"] = "warning"
+    explains: tuple[str, ...] = ()
+    alternatives: tuple[str, ...] = ()
 
 
 # One group a miner of analysis/iort_analysis/mining.
@@ -45,6 +58,7 @@ _BATTERY = (
         "internal resistance of the battery and its wires",
         worse="up",
         kind="battery_worn",
+        fields=("voltage_input", "current_input"),
     ),
 )
 
