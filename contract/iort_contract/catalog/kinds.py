@@ -44,14 +44,14 @@ KINDS = {
         Kind(
             "friction_added",
             "the car needs more current to roll",
-            "lift the car and turn the wheels by hand; clean and oil bearings and gears; check the pinion's mesh",
+            "lift the car and turn the wheels by hand; oil bearings and gears; check the pinion's mesh",
             alternatives=("a softer ground", "wheels out of line"),
         ),
         Kind(
             "tyre_flat",
             "the wheels turn more often for the same way",
-            "look for a flat or worn tyre, and a wheel that turns on its rim; after a change of tyres or gears "
-            "run `iort calibrate`",
+            "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
+            " run `iort calibrate`",
             explains=("friction_added", "payload_added", "brake_dragging"),
             alternatives=("smaller wheels or another gear than before",),
         ),
