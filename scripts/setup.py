@@ -92,7 +92,7 @@ def steps(*, layer: bool, checkov: bool, docs: bool, oldest: str | None) -> Iter
     # all of them here would take longest of all.
     packages = (
         f"{SYNC} .venv --no-binary pubnub --no-build-isolation requirements/dev.txt",
-        f"{EDITABLE} --editable station --python .venv",
+        f"{EDITABLE} --editable analysis --editable station --python .venv",
     )
     yield Step("python", "Python packages", ("requirements/dev.txt", "*/pyproject.toml"), packages)
     locked = "package-lock.json"

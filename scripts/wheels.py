@@ -1,4 +1,4 @@
-"""Builds the wheels of iort-contract, iort-agent and iort-station: `make wheels`."""
+"""Builds the wheels of iort-contract, iort-agent, iort-analysis and iort-station: `make wheels`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-DISTRIBUTIONS = ("contract", "device", "station")
+DISTRIBUTIONS = ("contract", "device", "analysis", "station")
 _PAGE = Path("station/iort_station/page/built/index.html")
 
 
 def build(out: Path) -> list[Path]:
-    """Build all three into a folder, without a network; the wheels' paths."""
+    """Build all of them into a folder, without a network; the wheels' paths."""
     if not (ROOT / _PAGE).is_file():
         raise FileNotFoundError(f"the live page is not built ({_PAGE} is missing): run `make setup`")
     return [_build(folder, out) for folder in DISTRIBUTIONS]

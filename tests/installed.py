@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 
 OURS = re.compile(r"iort-(contract|agent|station)")
 # Packages that a ROS workspace or a checkout may have on the path beside the installed ones.
-DECOYS = ("device", "contract", "station", "functions", "stacks", "local", "bench")
+DECOYS = ("device", "contract", "analysis", "station", "functions", "stacks", "local", "bench")
 
 
 class Installed:

@@ -1,4 +1,4 @@
-"""The code of every function as one asset: functions/ and the contract's package side by side."""
+"""The code of every function as one asset: functions/ beside the packages of contract and analysis."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from aws_cdk import aws_lambda as lambda_
 from stacks.settings import ROOT
 
 # Exactly the files that a function imports; see the wiring tests.
-FOLDERS = ("functions", "contract/iort_contract")
+FOLDERS = ("functions", "contract/iort_contract", "analysis/iort_analysis")
 _CACHES = ("__pycache__", ".mypy_cache", ".ruff_cache")
-_EXCLUDES = ["/*", "!/functions", "!/contract", "/contract/*", "!/contract/iort_contract", *_CACHES]
+_EXCLUDES = [
+    *("/*", "!/functions"),
+    *("!/contract", "/contract/*", "!/contract/iort_contract"),
+    *("!/analysis", "/analysis/*", "!/analysis/iort_analysis"),
+    *_CACHES,
+]
 
 
 def code() -> lambda_.Code:

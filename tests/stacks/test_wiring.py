@@ -54,6 +54,7 @@ HANDLERS = (
     "Later",
 )
 CONTRACT = sorted((ROOT / "contract" / "iort_contract").rglob("*"))
+ANALYSIS = sorted((ROOT / "analysis" / "iort_analysis").rglob("*"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
 
@@ -63,14 +64,18 @@ def functions(synthesized):
     return {name(k): v for k, v in synthesized.resources("AWS::Lambda::Function").items()}
 
 
-def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, functions):
+def test_the_asset_holds_exactly_the_functions_the_contract_and_the_analysis(synthesized, functions):
     assets = {synthesized.asset(function["Code"]) for function in functions.values()}
     (asset,) = assets
     packaged = {
         str(path.relative_to(asset)): path.read_bytes() for path in asset.rglob("*") if path.is_file()
     }
     # The packages stand side by side, as they are imported.
-    expected = dict.fromkeys(FUNCTIONS, ROOT) | dict.fromkeys(CONTRACT, ROOT / "contract")
+    expected = (
+        dict.fromkeys(FUNCTIONS, ROOT)
+        | dict.fromkeys(CONTRACT, ROOT / "contract")
+        | dict.fromkeys(ANALYSIS, ROOT / "analysis")
+    )
     assert packaged == {
         str(path.relative_to(home)): path.read_bytes()
         for path, home in expected.items()

@@ -11,7 +11,7 @@ It uses the contract, `iort_station.fleet` for the registry, and `iort_station.c
 
 from __future__ import annotations
 
-from iort_station.data.blocks import Block, values
+from iort_analysis.samples.blocks import Block, values
 from iort_station.data.queries import CLIENT, LAMBDA, Result, query, samples
 from iort_station.data.selection import Selection, select
 

@@ -1,51 +1,22 @@
-"""Stored batches, from the telemetry table to blocks of samples.
-
-`iort_contract` checks every batch and decodes it to lists. Columns of steps are decoded here too, with numpy
-and many batches at a time: the same checks, twice as fast.
-"""
+"""The stored batches of a stream, read from the telemetry table."""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain, groupby
-from typing import Any, TypeVar
+from itertools import chain
+from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from iort_contract.codec.columns import SCALES, check_sums, decimals_of, not_integers, plain_values
-from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, with_samples_between
-from iort_contract.limits import ContractError
-from iort_contract.messages.batch import Batch, Opened, batch_id, decode_opened, open_batch
-from iort_contract.tables import BATCH, NONFINITE, SAMPLES
+from iort_analysis.samples.batches import ATTRIBUTES, Item, start_us
+from iort_contract.dynamodb import SummaryTable, TelemetryTable, with_samples_between
+from iort_contract.tables import BATCH
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.blocks import EMPTY, Block, Column, column_of, join, joined, ordered
 from iort_station.data.selection import Selection
 
-# The attributes of a stored item that its samples need.
-ATTRIBUTES = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
-_SCALES = np.array(SCALES)
-Item = Mapping[str, Any]
-Wanted = Callable[[str], bool]
 # Receives the number of items in a page, and the start time of its last item in microseconds.
 PageProgress = Callable[[int, int], None]
 _T = TypeVar("_T")
-
-
-class RefusedItems:
-    """Counts stored items that are not batches, and keeps the first one's error."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.reason = ""
-
-    def add(self, error: Exception) -> None:
-        """Count one."""
-        self.count += 1
-        self.reason = self.reason or str(error)
 
 
 def telemetry_table(cloud: Cloud) -> TelemetryTable:
@@ -81,7 +52,7 @@ def stored(
         found = iter([sorted(chain.from_iterable(found), key=lambda item: str(item[BATCH]["S"]))])
     for items in ahead(found):
         if progress is not None and items:
-            progress(len(items), _start_us(items[-1]))
+            progress(len(items), start_us(items[-1]))
         yield items
 
 
@@ -93,134 +64,3 @@ def ahead(items: Iterable[_T]) -> Iterator[_T]:
         while (item := coming.result()) is not end:
             coming = reader.submit(next, iterator, end)
             yield item  # type: ignore[misc]  # it is not `end`
-
-
-def blocks(
-    pages: Iterable[Sequence[Item]],
-    refused: RefusedItems,
-    wanted: Wanted = lambda _name: True,
-    *,
-    messages: bool = True,
-) -> Iterator[Block]:
-    """The samples of pages of items, in order of time, with the fields that are ``wanted``.
-
-    Batches may overlap in time, after a clock was set back or with several publishers on a topic. Without
-    ``messages``, batches of ROS messages are skipped.
-    """
-    held = EMPTY
-    for items in pages:
-        page = _block(_opened(items, refused, messages=messages), refused, wanted)
-        if not len(page.times_us):
-            continue
-        both = ordered(join([held, page]))
-        # A later batch may still hold samples from its start on.
-        final = int(np.searchsorted(both.times_us, _start_us(items[-1]), side="left"))
-        held = both.take(slice(final, None))
-        if final:
-            yield both.take(slice(final))
-    if len(held.times_us):
-        yield held
-
-
-def _start_us(item: Item) -> int:
-    """The time at which a stored batch starts; 0 if its key is invalid."""
-    try:
-        return batch_id(item[BATCH]["S"]).t_us
-    except (ContractError, KeyError):
-        return 0
-
-
-def _opened(items: Iterable[Item], refused: RefusedItems, *, messages: bool) -> Iterator[Opened]:
-    for item in items:
-        try:
-            batch = open_batch(plain(item))
-        except ContractError as error:
-            refused.add(error)
-            continue
-        if messages or (batch.serialized is None and not batch.about):
-            yield batch
-
-
-def _block(batches: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Block:
-    parts: list[Block] = []
-    for (names, is_serialized), same in groupby(batches, key=_form):
-        run = list(same)
-        try:
-            if not is_serialized:
-                parts.append(decode_together(run, list(filter(wanted, names))))
-                continue
-        except ContractError:
-            # The lists tell which batch is invalid.
-            pass
-        parts += decode_each(run, refused, wanted)
-    return join(parts)
-
-
-def _form(batch: Opened) -> tuple[list[str], bool]:
-    return list(batch.written), batch.serialized is not None
-
-
-def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Iterator[Block]:
-    """The list back end: one batch at a time."""
-    batches: list[Batch] = []
-    for one in run:
-        try:
-            batches.append(decode_opened(one))
-        except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
-            refused.add(error)
-    for _, same in groupby(batches, key=lambda batch: list(batch.columns)):
-        group = list(same)
-        columns = {
-            name: column_of(list(chain.from_iterable(batch.columns[name] for batch in group)))
-            for name in group[0].columns
-            if wanted(name)
-        }
-        times = np.fromiter(chain.from_iterable(batch.times_us for batch in group), dtype=np.int64)
-        yield Block(times, columns)
-
-
-def decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
-    """The numpy back end: batches of the same fields; raises `ContractError` if any is invalid."""
-    counts = [len(batch.times_us) for batch in run]
-    times_us = chain.from_iterable(batch.times_us for batch in run)
-    times = np.fromiter(times_us, dtype=np.int64, count=sum(counts))
-    return Block(times, {name: _column(name, [b.written[name] for b in run], counts) for name in names})
-
-
-def _column(name: str, written: Sequence[Any], counts: Sequence[int]) -> Column:
-    """A field's values from its column in each batch of ``counts`` samples."""
-    decimals = [decimals_of(name, column, n) for column, n in zip(written, counts, strict=True)]
-    if None not in decimals:
-        return _from_steps(name, written)
-    parts: list[Column] = []
-    for is_plain, group in groupby(zip(decimals, written, strict=True), key=lambda pair: pair[0] is None):
-        some = [column for _, column in group]
-        if is_plain:
-            parts.append(column_of(list(chain.from_iterable(plain_values(name, c) for c in some))))
-        else:
-            parts.append(_from_steps(name, some))
-    return joined([(part, len(part)) for part in parts])
-
-
-def _from_steps(name: str, written: Sequence[list[Any]]) -> Column:
-    """Columns of decimals, first value and steps, as one column of values.
-
-    numpy sums all of them at once; then each column loses the sum of those before it. int64 sums are exact
-    modulo 2**64, and a valid column's sums stay within 53 bits.
-    """
-    try:
-        # An array takes integers and booleans only, and is faster than numpy at that.
-        steps = np.frombuffer(array("q", list(chain.from_iterable(written))), dtype=np.int64)
-    except (TypeError, OverflowError) as error:
-        raise not_integers(name) from error
-    lengths = np.fromiter(map(len, written), dtype=np.int64)
-    starts = np.cumsum(lengths) - lengths
-    decimals = steps[starts]
-    steps[starts] = 0
-    # A larger step leads out of 53 bits, and might lead back through 64.
-    check_sums(name, int(steps.min()) // 2, int(steps.max()) // 2)
-    sums: NDArray[np.int64] = np.cumsum(steps)
-    whole = np.delete(sums - np.repeat(sums[starts], lengths), starts)
-    check_sums(name, int(whole.min()), int(whole.max()))
-    values: Column = whole / np.repeat(_SCALES[decimals], lengths - 1)
-    return values

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.samples.blocks import Column, values
 from iort_contract import expression
 from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
 from iort_contract.expression import (
@@ -24,7 +25,6 @@ from iort_contract.expression import (
     Node,
     Some,
 )
-from iort_station.data.blocks import Column, values
 from iort_station.errors import StationError
 
 Columns: TypeAlias = Mapping[str, Column]

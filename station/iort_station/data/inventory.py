@@ -7,6 +7,8 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
 
+from iort_analysis.samples.batches import RefusedItems, blocks
+from iort_analysis.samples.blocks import Block, join, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -15,8 +17,7 @@ from iort_contract.messages.batch import batch_id
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.tables import BATCH, STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
-from iort_station.data.blocks import Block, join, values
+from iort_station.data.batches import stored, telemetry_table, topic_of
 from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.samples.batches import RefusedItems, blocks
+from iort_analysis.samples.blocks import Block, Column, join, resample
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
 from iort_contract.messages.message_type import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
-from iort_station.data.batches import PageProgress, RefusedItems, blocks, stored
-from iort_station.data.blocks import Block, Column, join, resample
+from iort_station.data.batches import PageProgress, stored
 from iort_station.data.conditions import derive, holds
 from iort_station.data.selection import Selection, select
 from iort_station.data.summary import seconds
@@ -90,8 +91,8 @@ def query(
     Times are microseconds since the epoch, datetimes, or texts such as ``-10m`` and ISO 8601; None is the
     beginning or the end of the stored samples. ``fields`` and ``where``, a condition in the language of
     `iort_contract.expression`, may name the derived fields ``speed_mps`` and ``power_w``. ``every`` (such as
-    ``"1s"``) averages samples, see `iort_station.data.blocks.resample`. ``summary`` reads the seconds that
-    Lambda 2 has written; a field then stands for its ``_min``, ``_mean``, ``_max`` and ``_last``.
+    ``"1s"``) averages samples, see `iort_analysis.samples.blocks.resample`. ``summary`` reads the seconds
+    that Lambda 2 has written; a field then stands for its ``_min``, ``_mean``, ``_max`` and ``_last``.
     ``on="lambda"`` selects the samples in the cloud. ``scan`` reads by Scan instead of Query.
 
     Raises `StationError` for an unknown robot, stream or field, naming the known ones; for an invalid time or

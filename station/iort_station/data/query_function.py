@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from iort_analysis.samples.batches import RefusedItems
+from iort_analysis.samples.blocks import Block, column_of, join, ordered
 from iort_contract.limits import ContractError
 from iort_contract.messages.query import (
     FIRST_US,
@@ -23,8 +25,7 @@ from iort_contract.messages.query import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress, RefusedItems
-from iort_station.data.blocks import Block, column_of, join, ordered
+from iort_station.data.batches import PageProgress
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
 

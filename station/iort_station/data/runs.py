@@ -15,6 +15,7 @@ from contextlib import suppress
 from itertools import islice
 from typing import NamedTuple
 
+from iort_analysis.samples.batches import ATTRIBUTES
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
 from iort_contract.dynamodb import Keys, plain, starting_between
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
@@ -24,7 +25,7 @@ from iort_contract.messages.page import Extent, Run, RunPart, RunsAnswer, RunSta
 from iort_contract.tables import BATCH, RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import ATTRIBUTES, telemetry_table, topic_of
+from iort_station.data.batches import telemetry_table, topic_of
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from iort_analysis.samples.batches import Item
+from iort_analysis.samples.blocks import Block, column_of, objects
 from iort_contract import expression
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import deserialize, seconds_between
@@ -21,8 +23,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_station.cloud import Cloud
-from iort_station.data.batches import Item, PageProgress, ahead, summary_table, topic_of
-from iort_station.data.blocks import Block, column_of, objects
+from iort_station.data.batches import PageProgress, ahead, summary_table, topic_of
 from iort_station.data.conditions import holds
 from iort_station.data.selection import Selection
 from iort_station.errors import unknown

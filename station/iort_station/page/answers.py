@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
@@ -18,7 +19,6 @@ from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.blocks import Column, values
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError

@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 
+from iort_analysis.samples.batches import RefusedItems
 from iort_contract.messages.message_type import MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress, RefusedItems
+from iort_station.data.batches import PageProgress
 from iort_station.data.selection import Selection
 from iort_station.fleet import files
 from iort_station.recordings import messages

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
+from iort_analysis.samples.blocks import Block, values
 from iort_contract.limits import MessageError, Value
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER
@@ -25,7 +26,6 @@ from iort_contract.ros1.definition import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.blocks import Block, values
 from iort_station.errors import StationError
 
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from iort_analysis.samples.batches import RefusedItems
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
@@ -13,7 +14,7 @@ from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data.batches import PageProgress, RefusedItems, stored
+from iort_station.data.batches import PageProgress, stored
 from iort_station.data.selection import Selection
 
 # Gives the content of an uploaded file by its key; None if the file is missing.

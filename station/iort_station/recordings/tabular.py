@@ -9,9 +9,9 @@ from typing import IO, Any
 
 import numpy as np
 
+from iort_analysis.samples.blocks import Column, values
 from iort_contract.codec.columns import EXACT
 from iort_station.data import Result
-from iort_station.data.blocks import Column, values
 from iort_station.texts import visible
 
 _CHUNK = 10_000

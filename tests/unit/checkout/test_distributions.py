@@ -1,4 +1,4 @@
-"""The three distributions declare every import and share one version."""
+"""The distributions declare every import and share one version."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = {
     "iort-contract": ROOT / "contract" / "iort_contract",
     "iort-agent": ROOT / "device" / "iort_agent",
+    "iort-analysis": ROOT / "analysis" / "iort_analysis",
     "iort-station": ROOT / "station" / "iort_station",
 }
 # They come with ROS and are in no registry.
@@ -58,8 +59,8 @@ def test_imports_in_functions_count_and_imports_for_types_do_not():
     assert set(imported(ast.parse(code))) == {"two", "four"}
 
 
-def test_agent_and_station_have_the_contracts_version_and_pin_it():
+def test_all_have_the_contracts_version_and_pin_it():
     (one,) = {version(name) for name in PACKAGES}
-    for name in ("iort-agent", "iort-station"):
+    for name in ("iort-agent", "iort-analysis", "iort-station"):
         (pin,) = (text for text in requires(name) or () if Requirement(text).name == "iort-contract")
         assert pin == f"iort-contract=={one}"

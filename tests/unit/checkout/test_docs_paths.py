@@ -23,6 +23,7 @@ MODULE = re.compile(
 HOME = {
     "iort_agent": ROOT / "device",
     "iort_contract": ROOT / "contract",
+    "iort_analysis": ROOT / "analysis",
     "iort_station": ROOT / "station",
 }
 

@@ -29,6 +29,7 @@ FOLDERS = (
     "local",
     "scripts",
     "stacks",
+    "analysis",
     "station",
     "tests",
 )
@@ -81,7 +82,7 @@ class Copy:
 
     def run(self, *command: str) -> str:
         """The output of a Python command with the copy's packages."""
-        path = [str(self.root / name) for name in ("", "contract", "device", "station")]
+        path = [str(self.root / name) for name in ("", "contract", "device", "analysis", "station")]
         environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join(path),

@@ -12,7 +12,7 @@ from setuptools import find_packages
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize("folder", ["contract", "device", "station"])
+@pytest.mark.parametrize("folder", ["contract", "device", "analysis", "station"])
 def test_every_package_of_a_distribution_is_installed(folder: str) -> None:
     home = ROOT / folder
     include = re.search(r"^include = (\[.*\])$", (home / "pyproject.toml").read_text(), re.MULTILINE)

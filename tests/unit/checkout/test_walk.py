@@ -26,7 +26,7 @@ from tests.unit.functions.summarizing import Stream
 from tests.unit.station.test_data import cloud_of
 
 ROOT = Path(__file__).resolve().parents[3]
-FOLDERS = ("contract", "device", "functions", "station")
+FOLDERS = ("contract", "device", "analysis", "functions", "station")
 SPEED = Message("a_msgs/Speed", {"a_msgs/Speed": "Header header\nfloat64 speed"})
 CONNECTION = {
     "callerid": "/maker",

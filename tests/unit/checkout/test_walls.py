@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = (
     "contract/iort_contract",
     "device/iort_agent",
+    "analysis/iort_analysis",
     "station/iort_station",
     *("functions", "stacks", "local", "bench", "verify", "scripts", "tests"),
 )
@@ -39,7 +40,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def lint(house: Path, *options: str) -> subprocess.CompletedProcess[str]:
     # The copy's packages come before the installed ones.
-    path = os.pathsep.join(str(house / folder) for folder in ("contract", "device", "station"))
+    path = os.pathsep.join(str(house / folder) for folder in ("contract", "device", "analysis", "station"))
     return subprocess.run(
         [Path(sys.executable).with_name("lint-imports"), "--no-cache", "--no-logo", *options],
         cwd=house,
@@ -70,7 +71,7 @@ def test_the_imports_keep_all_walls(house: Path) -> None:
         ("embedded-cloud", "local/demo.py", "stacks.settings"),
         ("agent", "device/iort_agent/lanes/live.py", "iort_agent.config"),
         ("agent", "device/iort_agent/common/schema.py", "iort_agent.spool.memory"),
-        ("station", "station/iort_station/data/blocks.py", "iort_station.cli.console"),
+        ("station", "station/iort_station/data/batches.py", "iort_station.cli.console"),
         ("contract", "contract/iort_contract/codec/columns.py", "iort_contract.messages.batch"),
         ("functions", "functions/live.py", "functions.alert"),
         ("circles", "device/iort_agent/sources/recording/player.py", "iort_agent.sources.recording.bag"),

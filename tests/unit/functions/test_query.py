@@ -10,10 +10,10 @@ import zlib
 import pytest
 
 from functions.query import answer
+from iort_analysis.samples.batches import RefusedItems
+from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station import data
-from iort_station.data.batches import RefusedItems
-from iort_station.data.blocks import values
 from iort_station.errors import StationError
 from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
-from iort_station.data.blocks import values
 from iort_station.errors import StationError
 from iort_station.page.answers import MAX_ROWS, answers, history
 from tests.unit.station.test_data import START, cloud_of, ride

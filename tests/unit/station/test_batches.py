@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.message_sizes import stored_bytes
+from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, decode_together
+from iort_analysis.samples.blocks import join
 from iort_contract.checks import wire_column
 from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
-from iort_station.data.batches import RefusedItems, blocks, decode_each, decode_together, stored
-from iort_station.data.blocks import join
+from iort_station.data.batches import stored
 from iort_station.data.selection import Selection
 from tests.examples import examples
 from tests.fakes import item_of_message

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.limits import Value
 from iort_contract.messages.message_type import MessageType
-from iort_station.data.blocks import Block, column_of
 from iort_station.recordings import recordings
 from iort_station.recordings.messages import Maker, made_of
 from tests.foxglove import flat, opened

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.topics import build_topic
-from iort_station.data.blocks import Block, column_of
 from iort_station.errors import StationError
 from iort_station.recordings.messages import Maker, made_of, types
 from tests.fakes import TELEMETRY, item_of

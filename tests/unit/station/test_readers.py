@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from iort_analysis.samples.batches import RefusedItems, blocks
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
@@ -20,7 +21,6 @@ from iort_contract.messages.commands import (
     encode_fleet,
 )
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
-from iort_station.data.batches import RefusedItems, blocks
 from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize
 

@@ -1,0 +1,1 @@
+"""Drives: found in the recordings, cleaned, and brought onto one clock."""

@@ -1,0 +1,45 @@
+"""A drive as the miners see it: clean samples of all streams on one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iort_analysis.samples.blocks import Block, Column
+from iort_contract.catalog.derived import Vehicle
+from iort_contract.messages.findings import DriveKey
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive of a robot.
+
+    ``streams`` are the clean samples of each stream on its own clock. ``samples`` are all numeric fields on
+    one clock, that of the ``vesc`` stream: a column ``<stream>.<field>`` each, float64 with NaN where nothing
+    is known. ``vesc`` and ``pose`` name the streams with a motor controller's fields and with a position;
+    None without one. ``vehicle`` has the robot's registered parameters; ``known`` has further numbers of the
+    car by their names, such as ``mass_kg`` and ``cells``, and may be empty.
+    """
+
+    key: DriveKey
+    end_us: int
+    streams: Mapping[str, Block]
+    samples: Block
+    vesc: str | None = None
+    pose: str | None = None
+    vehicle: Vehicle | None = None
+    known: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """The time of each of ``samples`` since the first one, in seconds."""
+        times = self.samples.times_us
+        return (times - times[:1]) / 1e6
+
+    def of(self, stream: str | None, name: str) -> Column | None:
+        """A field of a stream on the one clock; None if it is not there, or has no value."""
+        column = self.samples.columns.get(f"{stream}.{name}")
+        return None if column is None or bool(np.isnan(column).all()) else column

@@ -1,0 +1,64 @@
+"""What an analysis says of a drive: estimates with their intervals, events, and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
+
+from numpy.typing import NDArray
+
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.findings import DriveKey, Estimate
+
+# A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
+Table: TypeAlias = Mapping[str, NDArray[Any]]
+
+
+class Event(NamedTuple):
+    """Something that happened in a drive: ``kind`` is one of the catalogue's kinds of findings.
+
+    ``effect`` is its size, ``p`` the chance of it in a healthy car; None if no model gives one.
+    """
+
+    kind: str
+    start_us: int
+    end_us: int
+    stream: str
+    fields: tuple[str, ...]
+    text: str
+    effect: Estimate | None = None
+    p: float | None = None
+
+
+@dataclass(frozen=True)
+class Mined:
+    """What one miner found. ``estimates`` are by the names of the catalogue's parameters; ``missing`` gives
+    the reason for each that could not be computed."""
+
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    missing: Mapping[str, str] = field(default_factory=dict)
+    events: Sequence[Event] = ()
+    tables: Mapping[str, Table] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DriveResult:
+    """The result of one drive. ``repairs`` counts what was cleaned, by kind; ``mined`` is of all miners.
+
+    ``vesc`` is the name of the stream with the VESC's fields.
+    """
+
+    drive: DriveKey
+    end_us: int
+    samples: int
+    repairs: Mapping[str, int]
+    mined: Mined
+    vesc: str = VESC_STREAM
+
+
+class Measured(NamedTuple):
+    """The estimates of one drive, as they are kept for comparing with later ones."""
+
+    drive: DriveKey
+    estimates: Mapping[str, Estimate]

@@ -1,0 +1,1 @@
+"""Samples as arrays: blocks, and the decoding of stored batches into them."""
