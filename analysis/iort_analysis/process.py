@@ -1,19 +1,27 @@
-"""The process of one drive: clean, integrate, transform, and mine by every miner."""
+"""The process of one drive: clean, integrate, transform, and mine by every miner.
+
+A new miner is a file in `mining` and a line of `MINERS`.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining import MINERS, Miner
+from iort_analysis.mining import laps, style
 from iort_analysis.results import DriveResult, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.messages.findings import DriveKey
+
+Miner = Callable[[Drive], Mined]
+# By the name that a result gives as missing if the miner fails.
+MINERS: Mapping[str, Miner] = MappingProxyType({"laps": laps.mine, "style": style.mine})
 
 
 def analyse(
@@ -34,7 +42,7 @@ def analyse(
     for repair in drive.repairs:
         repairs[repair.kind] += repair.samples
     samples = sum(len(block.times_us) for block in drive.raw.values())
-    return DriveResult(key, drive.end_us, samples, dict(repairs), mined)
+    return DriveResult(key, drive.end_us, samples, dict(repairs), mined, drive.vesc or "")
 
 
 def merge(parts: Iterable[Mined]) -> Mined:

@@ -17,8 +17,8 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from iort_analysis.samples.positions import PositionFields, fixes, local_metres, position_fields
 from iort_station.data import Result
-from iort_station.data.positions import PositionFields, fixes, local_metres, position_fields
 from iort_station.errors import StationError, UsageError
 from iort_station.output import whole
 

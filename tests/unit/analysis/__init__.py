@@ -1,1 +1,1 @@
-"""Tests of the analysis: pure functions over arrays."""
+"""Tests of the analysis' package."""
