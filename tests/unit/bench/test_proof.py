@@ -1,4 +1,4 @@
-"""The proof of the analysis: its drives are the same each time, differ as cars do, and have what they name."""
+"""The proof of the analysis: its drives are the same each time, and differ as cars and drives do."""
 
 from __future__ import annotations
 
