@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from numpy.typing import NDArray
 
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.findings import DriveKey, Estimate
 
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
@@ -43,10 +44,21 @@ class Mined:
 
 @dataclass(frozen=True)
 class DriveResult:
-    """The result of one drive. ``repairs`` counts what was cleaned, by kind; ``mined`` is of all miners."""
+    """The result of one drive. ``repairs`` counts what was cleaned, by kind; ``mined`` is of all miners.
+
+    ``vesc`` is the name of the stream with the VESC's fields.
+    """
 
     drive: DriveKey
     end_us: int
     samples: int
     repairs: Mapping[str, int]
     mined: Mined
+    vesc: str = VESC_STREAM
+
+
+class Measured(NamedTuple):
+    """The estimates of one drive, as they are kept for comparing with later ones."""
+
+    drive: DriveKey
+    estimates: Mapping[str, Estimate]

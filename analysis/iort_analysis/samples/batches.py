@@ -9,7 +9,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,13 @@ class RefusedItems:
         self.reason = self.reason or str(error)
 
 
+class Part(NamedTuple):
+    """The samples of some batches, and the time at which the last of these batches starts."""
+
+    block: Block
+    start_us: int
+
+
 def blocks(
     pages: Iterable[Sequence[Item]],
     refused: RefusedItems,
@@ -50,17 +57,33 @@ def blocks(
 ) -> Iterator[Block]:
     """The samples of pages of items, in order of time, with the fields that are ``wanted``.
 
-    Batches may overlap in time, after a clock was set back or with several publishers on a topic. Without
-    ``messages``, batches of ROS messages are skipped.
+    Without ``messages``, batches of ROS messages are skipped.
     """
+    return in_order(part(items, refused, wanted, messages=messages) for items in pages if items)
+
+
+def part(
+    items: Sequence[Item],
+    refused: RefusedItems,
+    wanted: Wanted = lambda _name: True,
+    *,
+    messages: bool = True,
+) -> Part:
+    """The samples of a page of items, in the order of its batches."""
+    block = _block(_opened(items, refused, messages=messages), refused, wanted)
+    return Part(block, start_us(items[-1]))
+
+
+def in_order(parts: Iterable[Part]) -> Iterator[Block]:
+    """The samples in order of time. Batches may overlap in time, after a clock was set back or with several
+    publishers on a topic."""
     held = EMPTY
-    for items in pages:
-        page = _block(_opened(items, refused, messages=messages), refused, wanted)
-        if not len(page.times_us):
+    for block, last_us in parts:
+        if not len(block.times_us):
             continue
-        both = ordered(join([held, page]))
+        both = ordered(join([held, block]))
         # A later batch may still hold samples from its start on.
-        final = int(np.searchsorted(both.times_us, start_us(items[-1]), side="left"))
+        final = int(np.searchsorted(both.times_us, last_us, side="left"))
         held = both.take(slice(final, None))
         if final:
             yield both.take(slice(final))

@@ -8,13 +8,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from iort_contract.catalog.kinds import KINDS
+
+__all__ = ["KINDS", "PARAMETERS", "Parameter"]
+
 
 @dataclass(frozen=True)
 class Parameter:
     """A number that is estimated from a drive, with its unit.
 
     ``worse`` is the direction of a change for the worse; ``kind`` names the finding about such a change,
-    empty if a change is no finding.
+    empty if a change is no finding. A change counts from ``least`` in the unit and from ``least_share`` of
+    the baseline on: less means nothing on a car, and healthy drives differ by a third of it. ``fields`` are
+    those of the VESC that it was estimated from.
     """
 
     name: str
@@ -22,19 +28,13 @@ class Parameter:
     meaning: str
     worse: Literal["up", "down", "either"] = "either"
     kind: str = ""
+    fields: tuple[str, ...] = ()
+    least: float = 0.0
+    least_share: float = 0.2
 
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of finding. ``meaning`` says what happened, ``action`` what a person does, in Markdown.
-
-    The operator gets a mail for a ``serious`` one.
-    """
-
-    name: str
-    meaning: str
-    action: str
-    severity: Literal["info", "warning", "serious"] = "warning"
+    def least_change(self, baseline: float) -> float:
+        """The smallest change from a baseline that means something, in the unit."""
+        return max(self.least, self.least_share * abs(baseline))
 
 
 # One group a miner of analysis/iort_analysis/mining.
@@ -45,23 +45,8 @@ _BATTERY = (
         "internal resistance of the battery and its wires",
         worse="up",
         kind="battery_worn",
+        fields=("voltage_input", "current_input"),
     ),
 )
 
 PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY,)}
-
-KINDS = {
-    kind.name: kind
-    for kind in (
-        Kind(
-            "battery_worn",
-            "the battery's internal resistance has grown",
-            "charge it fully and compare with another battery; replace it if the resistance stays",
-        ),
-        Kind(
-            "analysis_failed",
-            "a drive could not be analysed",
-            "the text has the reason; the samples are kept, and `iort analyse` tries again",
-        ),
-    )
-}

@@ -57,6 +57,23 @@ def test_a_verb_loads_no_client_before_it_calls_the_cloud():
     assert not loaded("files", "get", "--help") & {"boto3", "botocore.session", "numpy", "pubnub"}
 
 
+def test_no_verb_that_reads_samples_loads_numpy_for_tab():
+    """TAB after a verb imports the verb, for its options."""
+    program = """
+import sys
+from iort_station.cli.lazy import Verb
+from iort_station.cli.verbs import VERBS
+for file in VERBS:
+    if file.rpartition(".")[2] in {"audit", "export", "plot", "query", "runs", "streams"}:
+        Verb(file, "").load()
+print(*sorted(sys.modules))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert not set(done.stdout.split()) & {"boto3", "botocore.session", "numpy", "pyarrow"}
+
+
 @pytest.mark.parametrize("file", VERBS)
 def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
     summary = VERBS[file]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -13,14 +13,14 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
-from iort_station.data.runs import runs as find
-from iort_station.operations import audit
-from iort_station.operations.audit import Missing
 from iort_station.times import between, iso, iso_s
+
+if TYPE_CHECKING:
+    from iort_station.operations.audit import Missing
 
 commands = typer.Typer()
 # The missing batches of a run and stream.
-Gaps = dict[tuple[str, str], list[Missing]]
+Gaps = dict[tuple[str, str], "list[Missing]"]
 
 
 @commands.command("runs", epilog=examples("runs car7", "runs car7 --last 7d --gaps"))
@@ -41,6 +41,9 @@ def runs(
     agent, up to its last report (every 30 s, and at a proper end). Lost is what the agent says it could not
     record.
     """
+    # numpy takes longer to load than TAB may take.
+    from iort_station.data.runs import runs as find  # noqa: PLC0415 - see above
+
     within, cloud = when.range(), context.obj.cloud()
     gaps: Gaps = {}
     with errors.status("reading") as status:
@@ -66,6 +69,8 @@ def runs(
 
 
 def _gaps(cloud: Cloud, robot: str, run: Run) -> Gaps:
+    from iort_station.operations import audit  # noqa: PLC0415 - as above
+
     return {
         (run["run"], stream): one.missing
         for stream, part in run["streams"].items()

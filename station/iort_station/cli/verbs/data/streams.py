@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.padding import Padding
@@ -11,8 +11,10 @@ from rich.table import Table
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
-from iort_station.data.overview import StreamOverview, overview
 from iort_station.times import between, iso_s
+
+if TYPE_CHECKING:
+    from iort_station.data.overview import StreamOverview
 
 commands = typer.Typer()
 
@@ -23,6 +25,9 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
 
     The command reads some batches of each run, never all samples. The fields are those of the newest batch.
     """
+    # numpy takes longer to load than TAB may take.
+    from iort_station.data.overview import overview  # noqa: PLC0415 - see above
+
     cloud = context.obj.cloud()
     with errors.status("reading"):
         found = overview(cloud, robot)

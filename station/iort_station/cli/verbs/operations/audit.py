@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -16,11 +16,11 @@ from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Range, Robot, When, ranged
 from iort_station.cli.words import examples
-from iort_station.data import inventory
 from iort_station.errors import UsageError
-from iort_station.operations import accounts, audit
-from iort_station.operations.audit import Audit
 from iort_station.times import duration_us, iso, iso_s, stamped
+
+if TYPE_CHECKING:
+    from iort_station.operations.audit import Audit
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -55,6 +55,10 @@ def audit_(
     agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
     and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
+    # numpy takes longer to load than TAB may take.
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
+    from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
+
     within, late_us = when.range(), duration_us(late)
     cloud = context.obj.cloud()
     try:

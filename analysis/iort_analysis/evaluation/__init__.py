@@ -1,0 +1,1 @@
+"""The evaluation: what differs from the robot's own earlier drives, or from the fleet's."""

@@ -1,0 +1,197 @@
+"""From the results of drives to findings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import groupby
+
+from iort_analysis.evaluation import texts
+from iort_analysis.evaluation.baselines import Baseline, baseline, fleet_baseline
+from iort_analysis.evaluation.discovery import false_discovery_rates
+from iort_analysis.evaluation.trends import US_PER_DAY, trend
+from iort_analysis.results import DriveResult, Event, Measured
+from iort_contract.catalog.findings import KINDS, PARAMETERS, Parameter
+from iort_contract.messages.findings import DriveKey, Estimate, Finding
+
+# A finding counts up to this rate of false discoveries among those of one evaluation.
+FALSE_DISCOVERY_RATE = 0.01
+# With fewer earlier drives of its own, a robot is compared with the fleet; and with fewer robots, not at all.
+MIN_DRIVES = MIN_ROBOTS = 3
+# A drive as unlikely as this takes no part in the baseline of the next one.
+_UNUSUAL = 1e-3
+# A trend needs so many drives, over so many days.
+_TREND_DRIVES, _TREND_DAYS = 8, 5
+
+
+def evaluate(
+    results: Sequence[DriveResult], history: Sequence[Measured], fleet: Sequence[Measured]
+) -> list[Finding]:
+    """The findings about one robot's drives, in order of time.
+
+    ``history`` are the robot's other drives, and ``fleet`` those of other robots; for each result only the
+    earlier ones count. The same arguments in any order give the same findings.
+    """
+    candidates: list[Finding] = []
+    results = sorted(results, key=lambda result: str(result.drive))
+    own = {measured.drive: measured for measured in history}
+    for result in results:
+        own.pop(result.drive, None)
+    others = sorted(fleet, key=lambda one: (one.drive.robot, str(one.drive)))
+    for result in results:
+        earlier = sorted(_before(own.values(), result.drive), key=lambda one: str(one.drive))
+        changes = _Comparison(result, earlier, _before(others, result.drive))
+        candidates += changes.findings
+        if result is results[-1]:
+            candidates += _trends(result, earlier)
+        candidates += [_of_event(result, event) for event in result.mined.events]
+        usual = {name: e for name, e in result.mined.estimates.items() if name not in changes.unusual}
+        own[result.drive] = Measured(result.drive, usual)
+    return _explained(_discovered(candidates))
+
+
+class _Comparison:
+    """The estimates of a drive that changed for the worse, and the names of those that are unusual."""
+
+    def __init__(self, result: DriveResult, earlier: Sequence[Measured], fleet: Sequence[Measured]) -> None:
+        self.findings: list[Finding] = []
+        self.unusual: set[str] = set()
+        for name, estimate in sorted(result.mined.estimates.items()):
+            parameter = PARAMETERS[name]
+            expected = _expected(parameter, earlier, fleet)
+            if expected is not None:
+                self._compare(result, parameter, estimate, *expected)
+
+    def _compare(
+        self, result: DriveResult, parameter: Parameter, found: Estimate, expected: Baseline, whose: str
+    ) -> None:
+        effect, p_up, p_down = expected.change(found)
+        p = {"up": p_up, "down": p_down, "either": 2 * min(p_up, p_down)}[parameter.worse]
+        if min(p_up, p_down) < _UNUSUAL:
+            self.unusual.add(parameter.name)
+        if parameter.kind:
+            finding = _of_parameter(result, parameter, texts.changed(parameter, found, expected, whose))
+            self.findings.append(replace(finding, effect=effect, baseline=expected.interval(found.unit), p=p))
+
+
+def _expected(
+    parameter: Parameter, earlier: Sequence[Measured], fleet: Sequence[Measured]
+) -> tuple[Baseline, str] | None:
+    """The baseline of a parameter and whose it is; None if too few drives have it."""
+    own = [one.estimates[parameter.name] for one in earlier if parameter.name in one.estimates]
+    if len(own) >= MIN_DRIVES:
+        return baseline(own, _spread(parameter, own)), "its own"
+    having = (one for one in fleet if parameter.name in one.estimates)
+    robots = [
+        [one.estimates[parameter.name] for one in drives]
+        for _, drives in groupby(having, key=lambda one: one.drive.robot)
+    ]
+    if len(robots) >= MIN_ROBOTS:
+        return fleet_baseline(
+            robots, _spread(parameter, [e for drives in robots for e in drives])
+        ), "the fleet's"
+    return None
+
+
+def _spread(parameter: Parameter, estimates: Sequence[Estimate]) -> float:
+    """What a healthy car's drives differ by, by the catalogue."""
+    middle = sorted(estimate.value for estimate in estimates)[len(estimates) // 2]
+    return parameter.least_change(middle) / 3
+
+
+def _trends(result: DriveResult, earlier: Sequence[Measured]) -> Iterable[Finding]:
+    """The parameters that grew worse over the last drives, up to this one."""
+    drives = [*earlier, Measured(result.drive, result.mined.estimates)]
+    for name, newest in sorted(result.mined.estimates.items()):
+        parameter = PARAMETERS[name]
+        having = [one for one in drives if name in one.estimates]
+        days = (having[-1].drive.start_us - having[0].drive.start_us) / US_PER_DAY
+        if not parameter.kind or len(having) < _TREND_DRIVES or days < _TREND_DAYS:
+            continue
+        found = trend(
+            [one.drive.start_us for one in having],
+            [one.estimates[name].value for one in having],
+            newest.unit,
+        )
+        p = {"up": found.p_up, "down": found.p_down, "either": 2 * min(found.p_up, found.p_down)}
+        slope, low, high, _ = found.per_day
+        effect = Estimate(slope * found.days, low * found.days, high * found.days, newest.unit)
+        finding = _of_parameter(result, parameter, texts.trending(parameter, newest, effect, found.days))
+        at = having[0].estimates[name]
+        yield replace(
+            finding, subject=f"{name}_trend", effect=effect, baseline=at, p=min(1.0, p[parameter.worse])
+        )
+
+
+def _of_parameter(result: DriveResult, parameter: Parameter, text: str) -> Finding:
+    return Finding(
+        drive=result.drive,
+        kind=parameter.kind,
+        severity=KINDS[parameter.kind].severity,
+        subject=parameter.name,
+        from_us=result.drive.start_us,
+        to_us=result.end_us,
+        stream=result.vesc,
+        fields=parameter.fields,
+        text=text,
+    )
+
+
+def _of_event(result: DriveResult, event: Event) -> Finding:
+    return Finding(
+        drive=result.drive,
+        kind=event.kind,
+        severity=KINDS[event.kind].severity,
+        subject=event.kind,
+        from_us=event.start_us,
+        to_us=event.end_us,
+        stream=event.stream,
+        fields=event.fields,
+        text=event.text,
+        effect=event.effect,
+        p=event.p,
+    )
+
+
+def _discovered(candidates: Sequence[Finding]) -> list[Finding]:
+    """Those that are neither chance nor weak. A candidate without a chance was judged by its miner."""
+    tested = [finding for finding in candidates if finding.p is not None]
+    rates = false_discovery_rates([finding.p for finding in tested if finding.p is not None])
+    found = [
+        replace(finding, q=rate)
+        for finding, rate in zip(tested, rates, strict=True)
+        if rate <= FALSE_DISCOVERY_RATE and not _weak(finding)
+    ]
+    return found + [finding for finding in candidates if finding.p is None]
+
+
+def _weak(finding: Finding) -> bool:
+    parameter = PARAMETERS.get(finding.subject.removesuffix("_trend"))
+    if parameter is None or finding.effect is None or finding.baseline is None:
+        return False
+    return abs(finding.effect.value) < parameter.least_change(finding.baseline.value)
+
+
+def _explained(findings: Iterable[Finding]) -> list[Finding]:
+    """One finding a cause: those that another finding of the drive explains are told in its text."""
+    kept: list[Finding] = []
+    by_drive = sorted(findings, key=lambda finding: finding.id)
+    for _, group in groupby(by_drive, key=lambda finding: str(finding.drive)):
+        drive = list(group)
+        kinds = {finding.kind for finding in drive}
+        explained = {kind for found in kinds for kind in KINDS[found].explains}
+        beside = [finding for finding in drive if finding.kind in explained]
+        kept += [
+            replace(finding, text=texts.complete(finding, [one for one in beside if _explains(finding, one)]))
+            for finding in drive
+            if finding.kind not in explained
+        ]
+    return kept
+
+
+def _explains(finding: Finding, other: Finding) -> bool:
+    return other.kind in KINDS[finding.kind].explains
+
+
+def _before(measured: Iterable[Measured], drive: DriveKey) -> list[Measured]:
+    return [one for one in measured if one.drive.start_us < drive.start_us]

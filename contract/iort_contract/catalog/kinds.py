@@ -1,0 +1,118 @@
+"""The kinds of findings: what each means, and what a person does about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of finding. ``meaning`` says what happened, ``action`` what a person does, in Markdown.
+
+    The operator gets a mail for a ``serious`` one. ``explains`` are the kinds that the same cause raises:
+    beside this one they are no findings of their own. ``alternatives`` are other causes, in words, that the
+    data cannot tell from this one.
+    """
+
+    name: str
+    meaning: str
+    action: str
+    severity: Literal["info", "warning", "serious"] = "warning"
+    explains: tuple[str, ...] = ()
+    alternatives: tuple[str, ...] = ()
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind(
+            "battery_worn",
+            "the battery's internal resistance has grown",
+            "charge it fully and compare with another battery; look for a warm plug or a loose wire; replace "
+            "the battery if the resistance stays",
+            alternatives=("a bad contact between battery and controller", "a much colder battery"),
+        ),
+        Kind(
+            "cell_dropout",
+            "the battery's voltage drops for moments under load",
+            "stop driving with this battery; measure its cells at rest and under load; check the plug",
+            severity="serious",
+            explains=("battery_worn", "pattern_unusual"),
+            alternatives=("a loose battery plug",),
+        ),
+        Kind(
+            "friction_added",
+            "the car needs more current to roll",
+            "lift the car and turn the wheels by hand; oil bearings and gears; check the pinion's mesh",
+            alternatives=("a softer ground", "wheels out of line"),
+        ),
+        Kind(
+            "tyre_flat",
+            "the wheels turn more often for the same way",
+            "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
+            " run `iort calibrate`",
+            explains=("friction_added", "payload_added", "brake_dragging"),
+            alternatives=("smaller wheels or another gear than before",),
+        ),
+        Kind(
+            "brake_dragging",
+            "the car is held for seconds after it braked",
+            "lift the car, brake, and turn the wheels by hand; free the brake, and check its cable or servo",
+            explains=("friction_added", "payload_added"),
+        ),
+        Kind(
+            "pinion_loose",
+            "the motor turns faster than the car moves, under torque",
+            "tighten the pinion's screw, and look at the gears' teeth; look whether the tyres spin instead",
+            severity="serious",
+            explains=("payload_added", "tyre_flat", "friction_added", "pattern_unusual", "brake_dragging"),
+            alternatives=("tyres that spin",),
+        ),
+        Kind(
+            "payload_added",
+            "the car accelerates less for the same current",
+            "weigh the car; after a change on purpose nothing is to be done",
+            severity="info",
+            explains=("friction_added",),
+            alternatives=("a weaker motor",),
+        ),
+        Kind(
+            "motor_resistance_grown",
+            "the motor's phases have more resistance",
+            "check the three phase wires and their plugs for a bad joint; compare again with a cold motor",
+            alternatives=("a hotter motor than usual",),
+        ),
+        Kind(
+            "cooling_lost",
+            "the controller or the motor cools less than before",
+            "check the fan, the air's way and the heat sink's screws; watch the temperature",
+        ),
+        Kind(
+            "sensor_stuck",
+            "a field kept exactly the same value while the car moved",
+            "check the sensor and its wires; the samples in between are left out of the analysis",
+        ),
+        Kind(
+            "sensor_drift",
+            "a field went away from what the other fields say",
+            "compare the field with a meter; calibrate or replace the sensor",
+        ),
+        Kind(
+            "can_intermittent",
+            "samples of the motor controller are missing again and again",
+            "check the cable and plugs between computer and controller, and the CAN bus' terminators",
+        ),
+        Kind(
+            "pattern_unusual",
+            "a stretch of the drive is like no other one",
+            "look at the evidence in the history",
+            severity="info",
+        ),
+        Kind(
+            "analysis_failed",
+            "a drive could not be analysed",
+            "the text has the reason; the samples are kept, and `iort analyse` tries again",
+        ),
+    )
+}
