@@ -22,6 +22,7 @@ import iort_agent.errors
 import iort_station.errors
 from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
+from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
@@ -41,6 +42,7 @@ __all__ = [
     "derived",
     "errors",
     "example",
+    "faults",
     "fields",
     "headline",
     "manual",
@@ -61,6 +63,7 @@ FILES = tuple(
         "docs/decisions/index.md",
         "docs/explanation/benchmark.md",
         "docs/how-to/alarms.md",
+        "docs/how-to/simulated-car.md",
         "docs/reference/car-yaml.md",
         "docs/reference/clients.md",
         "docs/reference/deployment.md",
@@ -95,6 +98,18 @@ def fields() -> None:
         versions = ", ".join(map(str, field.ros))
         rows.append((f"`{field.name}`", unit, field.meaning, field.group, versions))
     _table(("field", "unit", "meaning", "group", "ROS"), rows, right=False)
+
+
+def faults() -> None:
+    """The faults of a simulated car, with their strengths."""
+    rows = []
+    for name, kind in sim_faults.KINDS.items():
+        strengths = {", ".join(f"{one:g}" for one in of): field for field, of in kind.by_field.items()}
+        if len(strengths) < 2:
+            strengths = {", ".join(f"{one:g}" for one in kind.strengths): ", ".join(kind.by_field)}
+        told = "; ".join(f"{of} ({field})" if field else of for of, field in strengths.items())
+        rows.append((f"`{name}`", kind.meaning, told, kind.unit))
+    _table(("fault", "what it does", "weak, middle, strong", "unit"), rows, right=False)
 
 
 def derived() -> None:

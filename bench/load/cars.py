@@ -18,7 +18,9 @@ from typing import Any
 import urllib3
 
 from bench.load import camera
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel
 from iort_contract.limits import Value
@@ -41,6 +43,7 @@ class SimulatedCar:
         self.name, self.senses = name, senses
         self.fault_code = 0
         self._vehicle = Vehicle(VehicleConfig(), seed)
+        self._measured = Sensors(self._vehicle, seed)
         self._gain = VehicleConfig().speed_to_erpm_gain
         self._boot = secrets.token_hex(4)
         self._seqs: dict[str, int] = {}
@@ -53,7 +56,7 @@ class SimulatedCar:
         """Drive on for ``dt`` seconds, at most `_MOST_STEPS`; return one live update for each stream."""
         for _ in range(min(_MOST_STEPS, round(dt / _STEP_S))):
             self._vehicle.step(_STEP_S)
-        sample = {**self._vehicle.sample(), "fault_code": self.fault_code}
+        sample = {**self._measured.vesc(), "fault_code": self.fault_code}
         updates = [self._update(VESC_STREAM, sample)]
         if self.senses:
             updates += self._sense(float(sample["speed"] or 0) / self._gain, dt)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle
 from iort_contract.limits import Value
 
 RATE_HZ = 50
@@ -15,8 +17,8 @@ def simulated_drive(count: int, *, rate_hz: float = RATE_HZ, after_s: float = 0.
     vehicle = Vehicle(VehicleConfig(), seed=1)
     for _ in range(round(after_s / _STEP_S)):
         vehicle.step(_STEP_S)
-    samples = []
+    samples, measured = [], Sensors(vehicle, seed=1)
     for _ in range(count):
         vehicle.step(min(_STEP_S, 1 / rate_hz))
-        samples.append(vehicle.sample())
+        samples.append(measured.vesc())
     return samples

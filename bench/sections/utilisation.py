@@ -25,7 +25,9 @@ from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target, temporary_function
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
@@ -223,7 +225,7 @@ def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:
 def _live_event(target: Target, i: int) -> dict[str, Any]:
     """Return an event as the live rule sends it to Lambda 1."""
     now_us = time.time_ns() // 1000
-    sample = Vehicle(VehicleConfig(), seed=1).sample()
+    sample = Sensors(Vehicle(VehicleConfig(), seed=1), seed=1).vesc()
     message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
     topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
     return rule_event(message, topic, now_us // 1000)

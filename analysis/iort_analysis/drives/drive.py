@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,26 @@ from numpy.typing import NDArray
 from iort_analysis.samples.blocks import Block, Column
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.messages.findings import DriveKey
+
+# The kinds of repair: a pause between samples, a sample at a time that was there already, a sensor that
+# reports its own failure, a value that stands still while the car moves, and a single value far from its
+# neighbours.
+GAP, SAME_TIME, SENSOR_FAULT, FROZEN, OUTLIER = "gap", "same_time", "sensor_fault", "frozen", "outlier"
+
+
+class Repair(NamedTuple):
+    """What the cleaning did to a field from ``start_us`` to ``end_us``, inclusive.
+
+    ``samples`` counts the changed ones, or in a pause those that are missing. ``field`` is empty where a
+    whole stream is meant. Outliers of a field are one repair.
+    """
+
+    kind: str
+    stream: str
+    field: str
+    start_us: int
+    end_us: int
+    samples: int
 
 
 @dataclass(frozen=True)
@@ -21,7 +42,8 @@ class Drive:
     one clock, that of the ``vesc`` stream: a column ``<stream>.<field>`` each, float64 with NaN where nothing
     is known. ``vesc`` and ``pose`` name the streams with a motor controller's fields and with a position;
     None without one. ``vehicle`` has the robot's registered parameters; ``known`` has further numbers of the
-    car by their names, such as ``mass_kg`` and ``cells``, and may be empty.
+    car by their names, such as ``mass_kg`` and ``cells``, and may be empty. ``raw`` are the samples as
+    recorded, and ``repairs`` what the cleaning changed in them: a frozen sensor is to be seen there.
     """
 
     key: DriveKey
@@ -32,6 +54,8 @@ class Drive:
     pose: str | None = None
     vehicle: Vehicle | None = None
     known: Mapping[str, float] = field(default_factory=dict)
+    raw: Mapping[str, Block] = field(default_factory=dict)
+    repairs: Sequence[Repair] = ()
 
     @property
     def seconds(self) -> NDArray[np.float64]:

@@ -10,7 +10,16 @@ from typing import Literal
 
 from iort_contract.catalog.kinds import KINDS
 
-__all__ = ["KINDS", "PARAMETERS", "Parameter"]
+__all__ = [
+    "GROUPS",
+    "KINDS",
+    "LAPS_TABLE",
+    "PARAMETERS",
+    "PLACES_TABLE",
+    "STYLES",
+    "STYLE_TABLE",
+    "Parameter",
+]
 
 
 @dataclass(frozen=True)
@@ -49,4 +58,31 @@ _BATTERY = (
     ),
 )
 
-PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY,)}
+_LAPS = (
+    Parameter("lap_best_s", "s", "time of the best lap", worse="up"),
+    Parameter("lap_mean_s", "s", "mean time of the complete laps", worse="up"),
+    Parameter("lap_distance_m", "m", "mean length of the complete laps"),
+    Parameter("lap_energy_wh", "Wh", "mean energy of a lap, out of the battery", worse="up"),
+    Parameter("lap_energy_wh_per_km", "Wh/km", "mean energy of a lap for its length", worse="up"),
+)
+# The tables of laps: what each took, and when it passed each place.
+LAPS_TABLE, PLACES_TABLE = "laps", "lap_places"
+# How a car is driven, over half a second; `mining.style` says when each is.
+STYLES = {
+    "standing": "the car stands",
+    "hard braking": "the speed falls fast",
+    "hard accelerating": "the speed rises fast",
+    "corner at the limit": "a corner with nearly all the grip that the drive used",
+    "cornering": "a corner below that",
+    "steady fast": "a speed near the drive's highest, held",
+    "steady slow": "a lower speed, held",
+}
+STYLE_TABLE = "style"
+_STYLES = tuple(
+    Parameter(f"style_{style.replace(' ', '_')}_share", "1", f"share of time: {meaning}")
+    for style, meaning in STYLES.items()
+)
+
+# The groups in the order in which a person reads them.
+GROUPS = {"Battery": _BATTERY, "Laps": _LAPS, "Driving style": _STYLES}
+PARAMETERS = {parameter.name: parameter for group in GROUPS.values() for parameter in group}

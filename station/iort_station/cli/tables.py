@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
+from iort_analysis.samples.positions import in_degrees
 from iort_station.data import Result
-from iort_station.data.positions import in_degrees
 from iort_station.recordings.tabular import texts_of_time
 from iort_station.texts import visible
 

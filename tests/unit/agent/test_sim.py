@@ -15,8 +15,10 @@ from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.sim.circuit import HALL, Circuit, wrapped
 from iort_agent.sources.sim.driver import Pose
 from iort_agent.sources.sim.graph import DRIVE_TYPE, SimGraph
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.source import PoseConfig, SimConfig
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.vehicle import Vehicle
 from iort_contract.catalog.streams import CATALOG, POSE_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from tests.agent_fakes import ManualClock
@@ -156,7 +158,9 @@ def test_the_figures_hang_together(seed: int) -> None:
     assert sum(hard) / len(hard) < sum(light) / len(light) - 0.15
     for row in rows[::37]:
         volts = row["speed"] / config.pole_pairs / config.motor_kv
-        volts += row["current_motor"] * config.motor_resistance_ohm
+        volts += (
+            math.sqrt(3) * row["current_motor"] * (config.motor_resistance_ohm + config.fet_resistance_ohm)
+        )
         assert row["duty_cycle"] == pytest.approx(volts / row["voltage_input"], abs=0.02)
     assert 20 < column("temperature_pcb")[0] < column("temperature_pcb")[-1] < 80
 
@@ -189,6 +193,7 @@ class Commanded:
         self.graph = SimGraph(clock)
         self.rig = Rig(cmd={"drive": {**drive, "motion": motion}}, graph=self.graph, clock=clock)
         self.vehicle = Vehicle(VehicleConfig(), 1)
+        self.measured = Sensors(self.vehicle, 1)
 
     def drive(self, seconds: float) -> list[tuple[float, Pose]]:
         """The speed and pose of each step."""
@@ -198,7 +203,7 @@ class Commanded:
             if i % 5 == 0:
                 self.rig.downlink.tick()
             self.vehicle.step(0.02, self.graph.wish())
-            found.append((self.vehicle.sample()["speed"] / 4614, self.vehicle.pose))
+            found.append((self.measured.vesc()["speed"] / 4614, self.vehicle.pose))
         return found
 
 
@@ -225,7 +230,7 @@ def test_a_command_reverses_stops_and_holds() -> None:
     car.rig.send({"drive": {"speed": -1.0}}, name="drive", lease_ms=5000)
     speeds = [speed for speed, _ in car.drive(3)]
     assert speeds[-1] == pytest.approx(-1.0, abs=0.03)
-    sample = car.vehicle.sample()
+    sample = car.measured.vesc()
     assert sample["duty_cycle"] < 0
     assert sample["displacement"] < sample["distance_traveled"]
     car.rig.send({}, name="drive", lease_ms=5000)

@@ -32,15 +32,17 @@ class Wish(NamedTuple):
 
 
 class Driver:
-    """Drives laps, each a little off the centre line and a little below the limit."""
+    """Drives laps, each a little off the centre line and a little below ``pace``, a share of the limit."""
 
-    def __init__(self, circuit: Circuit, grip: Grip, wheelbase_m: float, chance: random.Random) -> None:
+    def __init__(
+        self, circuit: Circuit, grip: Grip, wheelbase_m: float, chance: random.Random, *, pace: float = 1.0
+    ) -> None:
         self._circuit, self._wheelbase_m, self._chance = circuit, wheelbase_m, chance
         self._lateral_mps2 = grip.lateral_mps2
         self._speeds_mps = circuit.speeds_mps(grip)
         self._place: int | None = 0
         self._left_m = self._goal_left_m = 0.0
-        self._pace = 1.0
+        self._most_pace = self._pace = pace
 
     def start(self) -> Pose:
         """The beginning of a lap."""
@@ -67,7 +69,7 @@ class Driver:
         return Wish(min(target, math.sqrt(self._lateral_mps2 / max(turns_per_m, 1e-9))), steering)
 
     def _begin_lap(self) -> None:
-        self._pace = self._chance.uniform(0.93, 1.0)
+        self._pace = self._most_pace * self._chance.uniform(0.93, 1.0)
         self._goal_left_m = self._chance.uniform(-0.25, 0.25) * self._circuit.narrowest_m
 
     def _steering(self, pose: Pose, here: int, speed_mps: float) -> float:

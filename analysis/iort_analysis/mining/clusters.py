@@ -1,0 +1,87 @@
+"""Clusters of points: k-means with the number of clusters by silhouette."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+# The silhouette needs every distance, so it is of this many points at most.
+_MOST_COMPARED = 600
+_ROUNDS = 60
+_STARTS = 3
+
+
+class Clusters(NamedTuple):
+    """The cluster of every point, and how well apart they are: from -1 to 1."""
+
+    labels: NDArray[np.intp]
+    silhouette: float
+
+
+def scaled(features: Floats) -> Floats:
+    """Columns by their median and their spread from the 10th to the 90th percentile; outliers are cut off."""
+    low, middle, high = np.percentile(features, [10, 50, 90], axis=0)
+    spread = high - low
+    wide: Floats = (features - middle) / np.where(spread > 0, spread, 1.0)
+    return np.clip(wide, -3, 3)
+
+
+def cluster(points: Floats, most: int, seed: int = 0) -> Clusters:
+    """The clusters of points, 2 to ``most``, that are best apart. The same points give the same clusters."""
+    chance = np.random.default_rng(seed)
+    sample = chance.choice(len(points), min(_MOST_COMPARED, len(points)), replace=False)
+    apart = np.linalg.norm(points[sample, None] - points[sample], axis=2)
+    best = Clusters(np.zeros(len(points), dtype=np.intp), -1.0)
+    for k in range(2, min(most, len(points)) + 1):
+        labels = min((_k_means(points, k, chance) for _ in range(_STARTS)), key=lambda found: found[1])[0]
+        silhouette = _silhouette(apart, labels[sample])
+        if silhouette > best.silhouette:
+            best = Clusters(labels, silhouette)
+    return best
+
+
+def _k_means(points: Floats, k: int, chance: np.random.Generator) -> tuple[NDArray[np.intp], float]:
+    """Lloyd's rounds from far-apart points (k-means++): labels, and the sum of squared distances."""
+    centres = points[chance.integers(len(points))][None]
+    while len(centres) < k:
+        nearest = _squares(points, centres).min(axis=1)
+        total = nearest.sum()
+        if total == 0:
+            break
+        centres = np.vstack([centres, points[chance.choice(len(points), p=nearest / total)]])
+    labels = np.zeros(len(points), dtype=np.intp)
+    for _ in range(_ROUNDS):
+        squares = _squares(points, centres)
+        found = squares.argmin(axis=1)
+        if (found == labels).all():
+            break
+        labels = found
+        filled = np.unique(labels)
+        centres = np.array([points[labels == each].mean(axis=0) for each in filled])
+        labels = np.searchsorted(filled, labels)
+    return labels, float(_squares(points, centres).min(axis=1).sum())
+
+
+def _squares(points: Floats, centres: Floats) -> Floats:
+    squares: Floats = (points**2).sum(axis=1)[:, None] - 2 * points @ centres.T + (centres**2).sum(axis=1)
+    return np.maximum(squares, 0.0)
+
+
+def _silhouette(apart: Floats, labels: NDArray[np.intp]) -> float:
+    """The mean of (b - a) / max(a, b): a is the mean distance in the own cluster, b to the nearest other."""
+    filled, counts = np.unique(labels, return_counts=True)
+    if len(filled) < 2:
+        return -1.0
+    sums = np.stack([apart[:, labels == each].sum(axis=1) for each in filled], axis=1)
+    own = np.searchsorted(filled, labels)
+    rows = np.arange(len(labels))
+    alone = counts[own] == 1
+    a = sums[rows, own] / np.maximum(counts[own] - 1, 1)
+    means = sums / counts
+    means[rows, own] = np.inf
+    b = means.min(axis=1)
+    widest = np.maximum(np.maximum(a, b), 1e-12)
+    return float(np.where(alone, 0.0, (b - a) / widest).mean())

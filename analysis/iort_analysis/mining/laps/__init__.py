@@ -1,0 +1,88 @@
+"""Laps, by a gate across the positions, else by the pattern of the drive: time, distance, energy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from iort_analysis.drives.drive import Drive
+from iort_analysis.mining.intervals import mean_of
+from iort_analysis.mining.laps.laps import Laps, best, find_laps
+from iort_analysis.mining.laps.path import Floats
+from iort_analysis.results import Mined, Table
+from iort_contract.catalog.findings import LAPS_TABLE, PARAMETERS, PLACES_TABLE
+from iort_contract.messages.findings import Estimate
+
+_NAMES = ("lap_best_s", "lap_mean_s", "lap_distance_m", "lap_energy_wh", "lap_energy_wh_per_km")
+# The half width of a 90 % interval, in standard deviations.
+_Z = 1.645
+
+
+def mine(drive: Drive) -> Mined:
+    """The laps of a drive."""
+    found = find_laps(drive)
+    if isinstance(found, str):
+        return Mined(missing=dict.fromkeys(_NAMES, f"no laps: {found}"))
+    estimates = dict(_estimates(found))
+    missing = {
+        name: "needs the car's parameters"
+        if name == "lap_distance_m"
+        else "needs voltage and current of the battery"
+        for name in _NAMES
+        if name not in estimates
+    }
+    return Mined(
+        estimates, missing, tables={LAPS_TABLE: _laps_table(found), PLACES_TABLE: _places_table(found)}
+    )
+
+
+def _estimates(laps: Laps) -> Iterator[tuple[str, Estimate]]:
+    times = laps.time_s[laps.complete]
+    either_s = _Z * math.sqrt(2) * laps.jitter_s
+    least = float(times.min())
+    yield "lap_best_s", Estimate(least, least - either_s, least + either_s, "s")
+    for name, values in (
+        ("lap_mean_s", laps.time_s),
+        ("lap_distance_m", laps.distance_m),
+        ("lap_energy_wh", laps.energy_wh),
+        ("lap_energy_wh_per_km", _per_km(laps)),
+    ):
+        known = values[laps.complete]
+        known = known[np.isfinite(known)]
+        if len(known) >= 2:
+            yield name, Estimate(*mean_of(known), PARAMETERS[name].unit)
+
+
+def _per_km(laps: Laps) -> Floats:
+    return laps.energy_wh / laps.distance_m * 1000
+
+
+def _laps_table(laps: Laps) -> Table:
+    n = len(laps.time_s)
+    return {
+        "lap": np.arange(1, n + 1),
+        "start_us": laps.start_us,
+        "time_s": laps.time_s,
+        "distance_m": laps.distance_m,
+        "energy_wh": laps.energy_wh,
+        "energy_wh_per_km": _per_km(laps),
+        "mean_speed_mps": laps.distance_m / laps.time_s,
+        "top_speed_mps": laps.places.speed_mps.max(axis=1),
+        "complete": laps.complete,
+        "best": np.arange(n) == best(laps),
+        "method": np.full(n, laps.method, dtype=object),
+        "confidence": np.full(n, laps.confidence),
+    }
+
+
+def _places_table(laps: Laps) -> Table:
+    """When each lap passed each place: the difference of two laps is their delta-time."""
+    n, places = laps.places.since_s.shape
+    return {
+        "lap": np.repeat(np.arange(1, n + 1), places),
+        "place_m": np.tile(laps.places.place_m, n),
+        "since_s": np.round(laps.places.since_s.ravel(), 4),
+        "speed_mps": np.round(laps.places.speed_mps.ravel(), 3),
+    }

@@ -1,0 +1,103 @@
+"""The process of one drive: clean, integrate, transform, and mine by every miner.
+
+A new miner is a file in `mining` and a line of `MINERS`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from iort_analysis.drives.building import build
+from iort_analysis.drives.drive import Drive
+from iort_analysis.mining import laps, style
+from iort_analysis.results import DriveResult, Mined
+from iort_analysis.samples.blocks import Block
+from iort_contract.catalog.derived import Vehicle
+from iort_contract.messages.findings import DriveKey, Estimate
+
+Miner = Callable[[Drive], Mined]
+# By the name that a result gives as missing if the miner fails.
+MINERS: Mapping[str, Miner] = MappingProxyType({"laps": laps.mine, "style": style.mine})
+
+
+def analyse(
+    key: DriveKey,
+    streams: Mapping[str, Block],
+    vehicle: Vehicle | None = None,
+    known: Mapping[str, float] | None = None,
+    *,
+    miners: Mapping[str, Miner] = MINERS,
+) -> DriveResult:
+    """Analyse a drive from the samples of its streams, as recorded.
+
+    It never fails because of them: what cannot be computed is in the result's ``missing``, with the reason.
+    """
+    drive = build(key, streams, vehicle, known)
+    mined = merge([Mined(missing=_unusable(drive)), *(_mined(name, m, drive) for name, m in miners.items())])
+    repairs = Counter[str]()
+    for repair in drive.repairs:
+        repairs[repair.kind] += repair.samples
+    samples = sum(len(block.times_us) for block in drive.raw.values())
+    return DriveResult(key, drive.end_us, samples, dict(repairs), mined, drive.vesc or "")
+
+
+def merge(parts: Iterable[Mined]) -> Mined:
+    """What all miners found, as one. A name that one of them has found is not missing."""
+    parts = list(parts)
+    estimates = {name: estimate for part in parts for name, estimate in part.estimates.items()}
+    missing = {name: reason for part in parts for name, reason in part.missing.items()}
+    return Mined(
+        estimates=estimates,
+        missing={name: reason for name, reason in missing.items() if name not in estimates},
+        events=sorted((event for part in parts for event in part.events), key=lambda event: event.start_us),
+        tables={name: table for part in parts for name, table in part.tables.items()},
+    )
+
+
+def _mined(name: str, miner: Miner, drive: Drive) -> Mined:
+    """What a miner found; one that fails does not stop the others."""
+    try:
+        with np.errstate(all="ignore"):
+            return _finite(miner(drive))
+    except Exception as error:  # noqa: BLE001 - whatever a miner meets in a drive, the others go on
+        return Mined(missing={name: f"the miner failed: {type(error).__name__}: {error}"})
+
+
+def _finite(mined: Mined) -> Mined:
+    """The same with plain numbers; an estimate that is not finite is missing."""
+    estimates, missing = {}, dict(mined.missing)
+    for name, one in mined.estimates.items():
+        value, low, high = float(one.value), float(one.low), float(one.high)
+        if np.isfinite([value, low, high]).all():
+            estimates[name] = Estimate(value, low, high, one.unit)
+        else:
+            missing[name] = "the estimate is not finite"
+    return replace(mined, estimates=estimates, missing=missing)
+
+
+def _unusable(drive: Drive) -> dict[str, str]:
+    """The streams and fields that no miner can use, with the reason."""
+    missing = {}
+    if not drive.raw:
+        missing["samples"] = "the drive has no samples"
+    elif drive.vesc is None:
+        missing["vesc"] = "no stream has speed, voltage_input and current_motor"
+    for stream, block in drive.raw.items():
+        clean = drive.streams[stream].columns
+        for name, column in block.columns.items():
+            if name not in clean:
+                if bool(np.array([value is None for value in column.tolist()]).all()):
+                    missing[f"{stream}.{name}"] = "the field is null in every sample"
+            elif bool(np.isnan(clean[name]).all()):
+                recorded = column.dtype.kind == "f" and not bool(np.isnan(column).all())
+                missing[f"{stream}.{name}"] = (
+                    "the sensor is not fitted or not read"
+                    if recorded
+                    else "the field is null in every sample"
+                )
+    return missing

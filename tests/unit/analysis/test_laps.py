@@ -1,0 +1,153 @@
+"""Laps of the simulated car, against its true positions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from iort_analysis.errors import AnalysisError
+from iort_analysis.mining import laps
+from iort_analysis.mining.laps.compare import compare
+from iort_analysis.mining.laps.laps import Laps, find_laps
+from iort_analysis.samples.blocks import Block
+from tests.unit.analysis.drives import START_US, Driven, crossed_s, driven, sampled
+
+_EARTH_M = 6_371_008.8
+
+
+@cache
+def ride() -> Driven:
+    return driven(150)
+
+
+def found(drive) -> Laps:
+    by = find_laps(drive)
+    assert isinstance(by, Laps), by
+    return by
+
+
+def without_pose(drive):
+    return replace(drive, pose=None, streams={"vesc": drive.streams["vesc"]})
+
+
+def test_laps_by_a_gate_are_the_true_ones_to_a_hundredth_of_a_second():
+    laps_found = found(ride().drive)
+    truth = crossed_s(ride(), *laps_found.gate)
+    assert laps_found.method == "gate"
+    assert laps_found.confidence == 1
+    assert len(laps_found.time_s) == len(truth) - 1 >= 11
+    assert laps_found.time_s == pytest.approx(np.diff(truth), abs=0.01)
+    assert (laps_found.start_us - START_US) / 1e6 == pytest.approx(truth[:-1], abs=0.01)
+    way = np.append(0, np.cumsum(np.hypot(np.diff(ride().x_m), np.diff(ride().y_m))))
+    assert laps_found.distance_m == pytest.approx(np.diff(np.interp(truth, ride().seconds, way)), rel=0.01)
+
+
+def test_the_intervals_of_the_best_and_the_mean_lap_hold_the_truth():
+    mined = laps.mine(ride().drive)
+    truth = np.diff(crossed_s(ride(), *found(ride().drive).gate))
+    best, mean = mined.estimates["lap_best_s"], mined.estimates["lap_mean_s"]
+    # The interval of the best lap is the noise of its time; three times its half width is five sigma.
+    assert best.value == pytest.approx(truth.min(), abs=3 * (best.high - best.low) / 2)
+    assert best.high - best.low < 0.03
+    assert mean.low < truth.mean() < mean.high
+    table = mined.tables["laps"]
+    assert table["lap"][table["best"]] == [1 + truth.argmin()]
+    assert mined.missing == {}
+
+
+def test_the_energy_of_the_laps_is_that_of_the_counters():
+    drive, by = ride().drive, found(ride().drive)
+    seconds = (by.start_us - START_US) / 1e6
+    used = drive.samples.columns["vesc.energy_drawn"] - drive.samples.columns["vesc.energy_regen"]
+    counted = np.diff(np.interp([seconds[0], seconds[-1] + by.time_s[-1]], drive.seconds, used))[0] / 1e4
+    assert by.energy_wh.sum() == pytest.approx(counted, rel=0.01)
+
+
+def test_laps_by_the_pattern_of_the_drive_say_so_and_are_nearly_as_long():
+    gate, pattern = found(ride().drive), found(without_pose(ride().drive))
+    assert pattern.method == "pattern"
+    assert 0.5 < pattern.confidence < 1
+    assert len(gate.time_s) - 2 <= len(pattern.time_s) <= len(gate.time_s)
+    assert np.median(pattern.time_s) == pytest.approx(np.median(gate.time_s), rel=0.02)
+    assert np.median(pattern.distance_m) == pytest.approx(np.median(gate.distance_m), rel=0.02)
+    # Bounds are worse known than by a gate, and the interval says so.
+    assert pattern.jitter_s > 10 * gate.jitter_s
+
+
+def test_laps_by_latitude_and_longitude_are_the_same():
+    drive = ride().drive
+    pose = drive.streams["pose"]
+    gps = {
+        "latitude": 48.1 + np.degrees(pose.columns["y"] / _EARTH_M),
+        "longitude": 11.6 + np.degrees(pose.columns["x"] / _EARTH_M / math.cos(math.radians(48.1))),
+    }
+    by_gps = found(
+        replace(drive, pose=None, streams={"vesc": drive.streams["vesc"], "fix": Block(pose.times_us, gps)})
+    )
+    # Another gate cuts the same way into other laps, of the same length.
+    assert by_gps.distance_m.mean() == pytest.approx(found(drive).distance_m.mean(), rel=0.01)
+    assert by_gps.time_s.mean() == pytest.approx(found(drive).time_s.mean(), rel=0.01)
+
+
+def test_the_delta_time_of_two_laps_is_the_true_one_at_every_place():
+    by = found(ride().drive)
+    table = laps.mine(ride().drive).tables["lap_places"]
+    delta = compare(table, 3, 7)
+    assert delta["delta_s"][0] == 0
+    assert delta["delta_s"][-1] == pytest.approx(by.time_s[6] - by.time_s[2], abs=0.001)
+    # Half way round, at the reference lap's place there.
+    reference = int(np.argmin(np.abs(by.time_s - np.median(by.time_s))))
+    starts = (by.start_us - START_US) / 1e6
+    middle = len(delta["place_m"]) // 2
+    place_s = starts[reference] + by.places.since_s[reference, middle]
+    x, y = (np.interp([place_s, place_s + 0.1], ride().seconds, v) for v in (ride().x_m, ride().y_m))
+    passed = crossed_s(ride(), x[0], y[0], math.atan2(*np.diff(y), *np.diff(x)), 1.5)
+    third, seventh = ((passed - starts[i])[passed > starts[i]][0] for i in (2, 6))
+    assert delta["delta_s"][middle] == pytest.approx(seventh - third, abs=0.03)
+    with pytest.raises(AnalysisError, match=r"lap must be from 1 to \d+, got 99"):
+        compare(table, 3, 99)
+
+
+def wandering(seed: int) -> Driven:
+    """A car that drives anywhere in a hall, at changing speeds."""
+    chance, n = np.random.default_rng(seed), 6000
+    heading = np.cumsum(np.cumsum(chance.normal(0, 0.004, n)) * 0.2)
+    speed = 2 + np.convolve(chance.normal(0, 4, n), np.ones(100) / 100, "same")
+    x, y = (np.cumsum(speed * each(heading)) / 50 for each in (np.cos, np.sin))
+    # The walls of the hall reflect it.
+    x, y = (20 * np.abs(v / 20 % 2 - 1) for v in (x, y))
+    vesc = [
+        {"speed": v * 4614, "current_motor": 3 * v, "voltage_input": 12.0, "current_input": v} for v in speed
+    ]
+    poses = [{"x": a, "y": b} for a, b in zip(x[::2], y[::2], strict=True)]
+    return Driven(sampled(vesc, poses, START_US + 20_000 * np.arange(n)), np.arange(n) / 50, x, y)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_drive_without_laps_says_so(seed):
+    drive = wandering(seed).drive
+    for each in (drive, without_pose(drive)):
+        mined = laps.mine(each)
+        assert mined.estimates == {}
+        assert mined.missing["lap_best_s"].startswith("no laps: ")
+
+
+def test_a_drive_without_position_and_motor_says_what_it_lacks():
+    drive = ride().drive
+    bare = replace(drive, pose=None, vesc=None, streams={})
+    assert find_laps(bare) == "no stream has a position, and none has a motor's speed"
+
+
+def test_a_lap_elsewhere_is_not_complete():
+    drive = ride().drive
+    pose = drive.streams["pose"]
+    by = found(drive)
+    fourth = (pose.times_us > by.start_us[3] + 4_000_000) & (pose.times_us < by.start_us[3] + 7_000_000)
+    # Three seconds on another way, 8 m aside.
+    moved = Block(pose.times_us, {**pose.columns, "y": pose.columns["y"] + 8 * fourth})
+    aside = found(replace(drive, streams={**drive.streams, "pose": moved}))
+    assert np.flatnonzero(~aside.complete).tolist() == [3]

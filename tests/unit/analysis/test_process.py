@@ -1,0 +1,77 @@
+"""Every miner runs by itself, and a drive in any state gives a result that says what is missing."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from iort_analysis.drives.drive import Drive
+from iort_analysis.process import analyse
+from iort_analysis.results import Event, Mined
+from iort_analysis.samples.blocks import EMPTY, Block, objects
+from iort_contract.messages.findings import Estimate
+from tests.unit.analysis.simulated import KEY, START_US, VEHICLE, changed, streams
+
+MASS = Estimate(3.7, 3.5, 3.9, "kg")
+
+
+def test_a_miner_that_fails_does_not_stop_the_others() -> None:
+    def fails(drive: Drive) -> Mined:
+        return Mined(estimates={"mass": MASS._replace(value=drive.known["nobody knows"])})
+
+    def finds(drive: Drive) -> Mined:
+        at_us = drive.key.start_us
+        return Mined(estimates={"mass": MASS}, events=[Event("odd", at_us, at_us, "vesc", (), "text")])
+
+    def gives_up(_drive: Drive) -> Mined:
+        return Mined(missing={"mass": "no hill", "drag": "too slow"})
+
+    result = analyse(KEY, streams(), VEHICLE, miners={"a": fails, "b": finds, "c": gives_up})
+
+    assert result.mined.estimates == {"mass": MASS}
+    assert [event.kind for event in result.mined.events] == ["odd"]
+    # What one miner found is not missing because another did not.
+    assert result.mined.missing == {
+        "a": "the miner failed: KeyError: 'nobody knows'",
+        "drag": "too slow",
+    }
+    assert (result.samples, result.end_us) == (9000, START_US + 119_980_000)
+
+
+def test_a_drive_in_any_state_has_a_result() -> None:
+    times = START_US + np.arange(3) * 20_000
+    texts = objects(["a", "b", None])
+    cases = {
+        "nothing": ({}, {"samples"}),
+        "empty": ({"vesc": EMPTY}, {"samples"}),
+        "few": ({"vesc": streams()["vesc"].take(slice(2))}, set()),
+        "one": ({"vesc": streams()["vesc"].take(slice(1))}, set()),
+        "null": (changed("current_motor", slice(None), np.nan), {"vesc.current_motor"}),
+        "nulls": ({"log": Block(times, {"text": objects([None] * 3)})}, {"vesc", "log.text"}),
+        "other": ({"log": Block(times, {"text": texts, "level": np.ones(3)})}, {"vesc"}),
+        "flags": ({"bumper": Block(times, {"hit": np.array([True, False, True])})}, {"vesc"}),
+    }
+    for name, (given, missing) in cases.items():
+        result = analyse(KEY, given, VEHICLE)
+
+        assert {key for key in result.mined.missing if "." in key or key in {"samples", "vesc"}} == missing, (
+            name
+        )
+
+
+def test_an_hour_takes_a_fraction_of_a_second() -> None:
+    """180,000 samples; the miners have the rest of the two seconds."""
+    hour = {
+        name: Block(
+            np.concatenate([block.times_us + i * 600_000_000 for i in range(6)]),
+            {field: np.tile(column, 6) for field, column in block.columns.items()},
+        )
+        for name, block in streams(600).items()
+    }
+    before = time.process_time()
+    result = analyse(KEY, hour, VEHICLE, miners={})
+    took_s = time.process_time() - before
+
+    assert result.samples == 270_000
+    assert took_s < 1
