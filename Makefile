@@ -84,7 +84,7 @@ docs-serve: ## serve the documentation site on this machine, and follow what you
 	@$(PYTHON) scripts/setup.py --docs
 	@$(MKDOCS) serve --dev-addr localhost:$(or $(PORT),8000)
 
-layer: ## build Lambda 1's layer for AWS
+layer: ## build the functions' layers for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda
 
 # Its warning is about mkdocs 2, which requirements/docs.txt excludes.
@@ -112,6 +112,8 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		requirements/dev.in -o requirements/dev.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		-c requirements/dev.txt requirements/layer.in -o requirements/layer.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		-c requirements/dev.txt requirements/analysis-layer.in -o requirements/analysis-layer.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		-c requirements/dev.txt requirements/build.in -o requirements/build.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \

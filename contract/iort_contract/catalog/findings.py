@@ -47,14 +47,34 @@ class Parameter:
 
 
 # One group a miner of analysis/iort_analysis/mining.
+_BATTERY_FIELDS = ("voltage_input", "current_input")
 _BATTERY = (
     Parameter(
         "battery_resistance_ohm",
         "ohm",
-        "internal resistance of the battery and its wires",
+        "resistance of the battery and its wires at once",
         worse="up",
         kind="battery_worn",
-        fields=("voltage_input", "current_input"),
+        fields=_BATTERY_FIELDS,
+    ),
+    Parameter(
+        "battery_slow_resistance_ohm",
+        "ohm",
+        "what the battery's resistance grows by within minutes of load",
+        worse="up",
+        fields=_BATTERY_FIELDS,
+    ),
+    Parameter(
+        "battery_open_voltage_v",
+        "V",
+        "open-circuit voltage at the drive's end, as after a long rest",
+        fields=_BATTERY_FIELDS,
+    ),
+    Parameter(
+        "battery_voltage_per_ah",
+        "V/Ah",
+        "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
+        fields=_BATTERY_FIELDS,
     ),
 )
 
