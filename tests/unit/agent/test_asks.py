@@ -8,7 +8,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -19,6 +19,7 @@ from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.downlink import Downlink
 from iort_agent.control.questions import Questions
 from iort_agent.errors import ConfigError, UploadError
+from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.ask import (
     MAX_INLINE_BYTES,
@@ -85,7 +86,9 @@ class Rig:
             graph=graph,
             offset=offset,
             answer=lambda *_: None,
-            questions=Questions(link, self.bucket, download=self.bucket.download, offset=offset),  # type: ignore[arg-type]
+            questions=Questions(
+                link, cast("Uploader", self.bucket), download=self.bucket.download, offset=offset
+            ),
         )
         self.uplink.start()
         self.downlink.start()
