@@ -94,7 +94,7 @@ def insights(asked: Mapping[str, str]) -> InsightsAnswer:
     drives = [drive(i, robot=robot) for i in range(6)]
     failed = drive(6, failed="the Lambda function ran out of memory", robot=robot)
     assert set(drives[0]["estimates"]) < PARAMETERS.keys()
-    return {"findings": findings, "drives": [*drives, failed], "groups": groups, "running": False}
+    return {"findings": findings, "drives": [*drives, failed], "groups": groups}
 
 
 def laps(asked: Mapping[str, str]) -> LapsAnswer:

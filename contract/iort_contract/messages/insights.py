@@ -65,13 +65,11 @@ class DriveEntry(Extent):
 
 class InsightsAnswer(TypedDict):
     """Answers ``insights``: the findings and the drives of a robot or of the fleet, the newest first.
-    ``groups`` has the parameters in the order in which a person reads them. ``running`` tells whether an
-    analysis runs now."""
+    ``groups`` has the parameters in the order in which a person reads them."""
 
     findings: list[FindingEntry]
     drives: list[DriveEntry]
     groups: dict[str, dict[str, ParameterEntry]]
-    running: bool
 
 
 class Lap(Extent):

@@ -24,7 +24,7 @@ from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.fleet import registry, tags
 from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
-from iort_station.page import laps
+from iort_station.page import insights, laps
 from iort_station.page.parameters import text, whole
 
 # No chart is wider, in points.
@@ -59,6 +59,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         ),
         "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
         "rejected": lambda _asked: alarms.rejected(cloud),
+        "insights": lambda asked: insights.insights(cloud, asked),
         **laps.answers(cloud),
     }
 

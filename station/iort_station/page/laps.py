@@ -12,13 +12,13 @@ from iort_analysis.mining.laps.compare import compare
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
 from iort_contract.catalog.findings import LAPS_TABLE, PLACES_TABLE
-from iort_contract.messages.findings import Estimate
-from iort_contract.messages.insights import DeltaAnswer, EstimateEntry, LapsAnswer
+from iort_contract.messages.insights import DeltaAnswer, LapsAnswer
 from iort_contract.messages.page import Answer
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data.laps import laps_within
 from iort_station.errors import StationError
+from iort_station.page.insights import estimate
 from iort_station.page.parameters import text, whole
 
 # An hour of a VESC at 100 Hz and of its pose.
@@ -46,14 +46,9 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     }
 
 
-def entry(estimate: Estimate) -> EstimateEntry:
-    """An estimate as the page has it."""
-    return {"value": estimate.value, "low": estimate.low, "high": estimate.high, "unit": estimate.unit}
-
-
 def _laps(mined: Mined) -> LapsAnswer:
     table = mined.tables.get(LAPS_TABLE)
-    estimates = {name: entry(estimate) for name, estimate in mined.estimates.items()}
+    estimates = {name: estimate(one) for name, one in mined.estimates.items()}
     if table is None:
         reason = next(iter(mined.missing.values()), "no laps")
         return {"laps": [], "method": "", "confidence": 0.0, "reason": reason, "estimates": estimates}

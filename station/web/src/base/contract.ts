@@ -367,12 +367,11 @@ export interface DriveEntry {
   readonly missing: Readonly<Record<string, string>>;
 }
 
-/** Answers ``insights``: the findings and the drives of a robot or of the fleet, the newest first. ``groups`` has the parameters in the order in which a person reads them. ``running`` tells whether an analysis runs now. */
+/** Answers ``insights``: the findings and the drives of a robot or of the fleet, the newest first. ``groups`` has the parameters in the order in which a person reads them. */
 export interface InsightsAnswer {
   readonly findings: readonly FindingEntry[];
   readonly drives: readonly DriveEntry[];
   readonly groups: Readonly<Record<string, Readonly<Record<string, ParameterEntry>>>>;
-  readonly running: boolean;
 }
 
 /** A lap; null for what is not known. ``complete`` is false if it does not fit the others. */

@@ -21,7 +21,7 @@ export class LapsPanel {
   readonly node: HTMLElement;
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly body = el("tbody");
-  private readonly table = el("div", { class: "log", hidden: "" });
+  private readonly table = el("div", { class: "laps-table", hidden: "" });
   private readonly compare = el("a", { class: "tool" });
   private readonly charts = el("div", { class: "charts" });
   private drawn: RangeChart[] = [];

@@ -24,7 +24,7 @@ export class Parameters {
       const lacking = Object.keys(parameters).flatMap((name) => (sound[0]?.missing[name] ? [[parameters[name]!.meaning, sound[0].missing[name]] as const] : []));
       if (known.length === 0 && lacking.length === 0) continue;
       const cards = el("div", { class: "parameters" });
-      this.node.append(el("section", { "aria-label": group }, el("h3", { class: "group-name" }, group), cards, ...(lacking.length > 0 ? [missing(lacking)] : [])));
+      this.node.append(el("section", { "aria-label": `${group} over the drives` }, el("h3", { class: "group-name" }, group), cards, ...(lacking.length > 0 ? [missing(lacking)] : [])));
       for (const [name, parameter] of known) this.card(cards, name, parameter, sound, findings);
     }
   }

@@ -72,11 +72,11 @@ export class InsightsView {
   private async present(query: Query<"insights">): Promise<void> {
     const { robot, loading } = this;
     const answer = this.answer!;
-    const { findings, drives, groups, running } = answer;
+    const { findings, drives, groups } = answer;
     const newest = drives[0];
     const of = robot ?? "the fleet";
     const state = newest ? `The newest analysed drive began ${dayTime(newest.from_us / 1e6)} ${zone(newest.from_us / 1e6)}.` : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
-    this.note.set(`${running ? "An analysis is running. " : ""}${state}`);
+    this.note.set(state);
     const list = findingsList(findings, robot === undefined);
     const nothing = el("p", { class: "unserved" }, newest ? `Nothing about ${of} differs from its earlier drives by more than chance.` : "There are no findings without analysed drives.");
     this.found.replaceChildren(list.childElementCount > 0 ? list : nothing);
