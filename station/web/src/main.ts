@@ -8,7 +8,7 @@ import { Alarms } from "./live/alarms";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
-import { observer } from "./observer";
+import { observer } from "./live/observer";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
