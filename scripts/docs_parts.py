@@ -24,7 +24,7 @@ from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.derived import DERIVED
-from iort_contract.catalog.questions import QUESTIONS
+from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_contract.messages.ask import REASONS
@@ -38,6 +38,7 @@ from scripts.page_contract import formula, page_contract
 __all__ = [
     "agent_manual",
     "alarms",
+    "car_limits",
     "car_yaml",
     "cost",
     "decisions",
@@ -67,6 +68,7 @@ FILES = tuple(
         "docs/decisions/index.md",
         "docs/explanation/benchmark.md",
         "docs/how-to/alarms.md",
+        "docs/how-to/ask.md",
         "docs/how-to/simulated-car.md",
         "docs/reference/car-yaml.md",
         "docs/reference/clients.md",
@@ -147,6 +149,21 @@ def questions() -> None:
     ]
     head = ("question", "answer", "a robot and hour", "s at most", "question, KiB", "answer, KiB")
     _table(head, rows, right=False)
+
+
+def car_limits() -> None:
+    """The limits of a car in the question raceline, from the catalogue."""
+    rows = [
+        (
+            f"`{one.name}`",
+            one.unit,
+            one.meaning,
+            f"{one.default:g}",
+            ", ".join(f"`{p}`" for p in one.calibrated),
+        )
+        for one in CAR_LIMITS.values()
+    ]
+    _table(("limit", "unit", "meaning", "default", "from the calibration"), rows, right=False)
 
 
 def _kib(size: int) -> str:
