@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from botocore.exceptions import ClientError
 
-from iort_analysis.samples.batches import Part, Wanted
+from iort_analysis.samples.batches import Item, Part, Wanted
+from iort_analysis.samples.blocks import join
+from iort_analysis.samples.seconds import Batches, batches_of
 from iort_contract.archive import (
     ArchivedHour,
     ArchiveTable,
@@ -22,8 +25,9 @@ from iort_contract.archive import (
     parse_hour,
     refused_key,
 )
-from iort_contract.dynamodb import Item, Keys
-from iort_contract.tables import BATCH
+from iort_contract.dynamodb import Keys, plain
+from iort_contract.messages.batch import batch_id, run_ends
+from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, SAMPLES
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -72,7 +76,7 @@ class Archive:
         for _ in range(2):
             try:
                 return use(HourFile(self._cloud, row))
-            except ClientError as error:
+            except ClientError as error:  # noqa: PERF203 - it is tried twice
                 if error.response["Error"]["Code"] not in _GONE:
                     raise
                 problem = error
@@ -88,6 +92,16 @@ def is_expiring(row: ArchivedHour) -> bool:
     return row.first_expires_s < time.time() + _BEFORE_EXPIRY_S
 
 
+def within(items: Iterable[Item], keys: Keys) -> list[Item]:
+    """The items with these keys."""
+    return [item for item in items if keys.first["S"] <= key_of(item) <= keys.last["S"]]
+
+
+def key_of(item: Item) -> str:
+    """The key of an item."""
+    return str(item[BATCH]["S"])
+
+
 class HourFile:
     """An hour of the archive, to be read."""
 
@@ -99,6 +113,24 @@ class HourFile:
         """The samples of the batches with these keys, in the order of the batches."""
         return list(self._file.pages(self._hour, wanted, messages=messages, keys=keys))
 
+    def batches(self, wanted: Wanted, keys: Keys) -> list[Batches]:
+        """The batches with these keys."""
+        if self._row.batches and self._file.has_messages(self._hour):
+            # Values that were not finite are counted as messages are decoded.
+            return [batches_of(within(self.items(), keys), wanted)]
+        heads = within(self.headers(), keys)
+        counts = [int(item[SAMPLES]["N"]) for item in heads]
+        plained = [plain(item) for item in heads]
+        return [
+            Batches(
+                [batch_id(item[BATCH]) for item in plained],
+                [int(item.get(NONFINITE, 0)) for item in plained],
+                [run_ends(item[PREVIOUS]) if PREVIOUS in item else None for item in plained],
+                np.cumsum([0, *counts]),
+                join([one.block for one in self.parts(wanted, messages=True, keys=keys)]),
+            )
+        ]
+
     def headers(self) -> list[Item]:
         """The batches without their samples, as stored items."""
         return list(self._file.headers(self._hour)) if self._row.batches else []
@@ -106,7 +138,7 @@ class HourFile:
     def ids(self) -> list[str]:
         """The ids of everything that was stored, in order."""
         batches = [key for key, _ in self._file.hashes(self._hour)] if self._row.batches else []
-        return sorted([*batches, *(item[BATCH]["S"] for item in self._refused())])
+        return sorted([*batches, *map(key_of, self._refused())])
 
     def items(self) -> list[Item]:
         """Everything that was stored, in order; what is not a batch byte for byte."""
@@ -114,7 +146,7 @@ class HourFile:
         from iort_analysis.archive.items import items  # noqa: PLC0415 - see above
 
         batches = items(self._file, self._row.topic, self._hour) if self._row.batches else ()
-        return sorted([*batches, *self._refused()], key=lambda item: str(item[BATCH]["S"]))
+        return sorted([*batches, *self._refused()], key=key_of)
 
     @cached_property
     def _file(self) -> ArchiveFile:
@@ -122,7 +154,8 @@ class HourFile:
 
         if self._row.size_bytes <= _AT_ONCE_BYTES:
             return ArchiveFile(self._get(self._row.key))
-        return ArchiveFile(io.BufferedReader(_Ranges(self._client, self._bucket, self._row.key), _LEAST_BYTES))
+        ranges = _Ranges(self._client, self._bucket, self._row.key)
+        return ArchiveFile(io.BufferedReader(ranges, _LEAST_BYTES))
 
     def _refused(self) -> list[Item]:
         if not self._row.refused:

@@ -1,36 +1,38 @@
 """A stream's recorded batches: in the telemetry table, in the archive, or in both.
 
-The table has every batch until it expires. The archive has every finished hour; an hour is rewritten if batches
-arrive late. So until the first batch of an hour is about to expire the table is enough, and later the archive's
-hour and what the table has beside it are everything. Callers do not see the difference: the batches come in the
-order of their ids.
+The table has every batch until it expires. The archive has every finished hour; an hour is rewritten if
+batches arrive late. So until the first batch of an hour is about to expire the table is enough. Later the
+archive's hour and what the table has beside it are everything. Callers do not see the difference: the batches
+come in the order of their ids.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Generic, Literal, TypeAlias, TypeVar
+from typing import Final, Generic, Literal, TypeAlias, TypeVar
 
 from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
 from iort_analysis.samples.blocks import Block, join
+from iort_analysis.samples.seconds import Batches, batches_of
 from iort_contract.archive import ArchivedHour, Hour, parse_hour
 from iort_contract.dynamodb import Keys, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.archive import Archive, HourFile, is_expiring
-from iort_station.data.batches import PageProgress, ahead, telemetry_table, topic_of
+from iort_station.data.archive import Archive, HourFile, is_expiring, key_of, within
+from iort_station.data.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
 
 # Where batches are read: where each is, in the table alone, or in the archive alone.
-AUTO, TABLE, ARCHIVE = "auto", "table", "archive"
 Source: TypeAlias = Literal["auto", "table", "archive"]
+AUTO: Final = "auto"
+TABLE: Final = "table"
+ARCHIVE: Final = "archive"
 HEADER = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
 # Hours that are read while the caller uses one, and their samples: 30 fields of half a million take 120 MB.
 _HOURS_AHEAD, _SAMPLES_AHEAD = 8, 500_000
@@ -42,6 +44,16 @@ class Origin:
     """Where a reading found its batches: the hours that it took from the archive."""
 
     hours: list[Hour] = field(default_factory=list)
+
+    def within(self, start_us: int | None, end_us: int | None) -> Origin:
+        """Only the hours that are partly in a range; the hour before it may have been looked into."""
+        return Origin(
+            [
+                hour
+                for hour in self.hours
+                if (start_us is None or hour.end_us > start_us) and (end_us is None or hour.start_us < end_us)
+            ]
+        )
 
 
 class Recorded:
@@ -66,8 +78,8 @@ class Recorded:
         scan: bool = False,
         progress: PageProgress | None = None,
     ) -> Iterator[Part]:
-        """The samples of the batches with these keys, with the fields that are ``wanted``, in the order of the
-        batches. Without ``messages``, batches of ROS messages are skipped."""
+        """The samples of the batches with these keys, with the fields that are ``wanted``, in the order of
+        the batches. Without ``messages``, batches of ROS messages are skipped."""
 
         def of_hour(hour: HourFile) -> list[Part]:
             return hour.parts(wanted, messages=messages, keys=keys)
@@ -84,17 +96,29 @@ class Recorded:
         """Pages of the stored items with these keys. Those from the archive decode to the same batches and
         messages as the stored ones."""
         for found in self._found(keys, HourFile.items, attributes, progress=progress):
-            yield _within(found.content, keys) if isinstance(found, _Archived) else found
+            yield within(found.content, keys) if isinstance(found, _Archived) else found
 
     def headers(self, keys: Keys) -> Iterator[Item]:
         """The stored items with these keys, without their samples."""
         for found in self._found(keys, HourFile.headers, HEADER):
-            yield from _within(found.content, keys) if isinstance(found, _Archived) else found
+            yield from within(found.content, keys) if isinstance(found, _Archived) else found
+
+    def batches(self, keys: Keys, wanted: Wanted = lambda _name: True) -> Iterator[Batches]:
+        """The batches with these keys; what is not one is left out."""
+
+        def of_hour(hour: HourFile) -> list[Batches]:
+            return hour.batches(wanted, keys)
+
+        for found in self._found(keys, of_hour, (*ATTRIBUTES, PREVIOUS)):
+            if isinstance(found, _Archived):
+                yield from found.content
+            else:
+                yield batches_of(found, wanted)
 
     def after(self, t_us: int | None) -> BatchId | None:
         """The first batch from a time on; None is the oldest of all."""
         found = self._next(starting_between(t_us, None), newest=False)
-        ids = (one for row in self._expiring(t_us, found and found.t_us) for one in self._ids(row))
+        ids = (one for row in self._rows(t_us, found and found.t_us) for one in self._ids(row))
         archived = next((one for one in ids if t_us is None or one.t_us >= t_us), None)
         return min((one for one in (found, archived) if one is not None), default=None)
 
@@ -102,19 +126,23 @@ class Recorded:
         """The last batch before a time; None is the newest of all."""
         last_us = None if t_us is None else t_us - 1
         found = self._next(starting_between(None, last_us), newest=True)
-        rows = self._expiring(found and found.t_us, last_us, newest_first=True)
+        rows = self._rows(found and found.t_us, last_us, newest_first=True)
         ids = (one for row in rows for one in reversed(self._ids(row)))
         archived = next((one for one in ids if last_us is None or one.t_us <= last_us), None)
         return max((one for one in (found, archived) if one is not None), default=None)
 
     def block(self, batch: BatchId, wanted: Wanted = lambda _name: True) -> Block:
         """The samples of one batch; empty if it is not there, or is invalid."""
-        keys = Keys({"S": str(batch)}, {"S": str(batch)}, empty=False)
-        return join([found.block for found in self.parts(keys, RefusedItems(), wanted)])
+        return join([found.block for found in self.parts(only(batch), RefusedItems(), wanted)])
 
-    def left_out(self, keys: Keys) -> list[Hour]:
-        """The hours with these keys of which the table may lack batches."""
-        return [parse_hour(row.hour) for row in self._archive.rows(*_times(keys)) if is_expiring(row)]
+    def archived(self, keys: Keys) -> list[Hour]:
+        """The hours that are read from the archive for these keys."""
+        return [parse_hour(row.hour) for row in self._rows(*_times(keys))]
+
+    @property
+    def reads_table(self) -> bool:
+        """Whether the table is read, too."""
+        return self._source != ARCHIVE
 
     def _found(
         self,
@@ -130,14 +158,14 @@ class Recorded:
             return
         pool = ThreadPoolExecutor(_HOURS_AHEAD)
         try:
-            listed = pool.submit(lambda: list(self._rows(keys)))
+            listed = pool.submit(lambda: list(self._rows(*_times(keys))))
             # Meanwhile the first page is read, which is nearly always needed.
-            table = _Pages(self._pages(keys, attributes, scan=scan))
+            table = Pages(self._pages(keys, attributes, scan=scan), key_of)
             for row, content in self._ahead(pool, listed.result(), read):
                 hour = parse_hour(row.hour)
-                for items in table.until(hour.start_us):
+                for items in table.until(_first_key(hour.start_us)):
                     yield _told(items, progress)
-                beside = [item for items in table.until(hour.end_us) for item in items]
+                beside = [item for items in table.until(_first_key(hour.end_us)) for item in items]
                 found = self._with(beside, row, content, keys)
                 if isinstance(found, _Archived) and not found.content:
                     continue
@@ -150,23 +178,25 @@ class Recorded:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _rows(self, keys: Keys) -> Iterator[ArchivedHour]:
-        """The hours to read from the archive."""
+    def _rows(
+        self, first_us: int | None, last_us: int | None, *, newest_first: bool = False
+    ) -> Iterator[ArchivedHour]:
+        """The hours to read from the archive, of batches that start between two times."""
         if self._source == TABLE:
             return
-        for row in self._archive.rows(*_times(keys)):
+        for row in self._archive.rows(first_us, last_us, newest_first=newest_first):
             if self._source == ARCHIVE or is_expiring(row):
                 yield row
 
     def _pages(self, keys: Keys, attributes: Sequence[str], *, scan: bool) -> Iterator[Sequence[Item]]:
         """The table's pages."""
-        if self._source == ARCHIVE:
+        if not self.reads_table:
             return
         pages = self._table.pages(self._topic, keys, attributes=attributes, scan=scan)
         found: Iterator[Sequence[Item]] = (page.items for page in pages if page.items)
         if scan:
             # A scan has no order.
-            found = iter([sorted(chain.from_iterable(found), key=_key)])
+            found = iter([sorted(chain.from_iterable(found), key=key_of)])
         yield from ahead(found)
 
     def _ahead(
@@ -189,20 +219,11 @@ class Recorded:
         """What an hour holds in the archive and ``beside`` it in the table."""
         if beside:
             archived = set(self._archive.read(row, HourFile.ids))
-            beside = [item for item in beside if _key(item) not in archived]
+            beside = [item for item in beside if key_of(item) not in archived]
         if not beside and not row.refused:
             return _Archived(content)
         # Rare and slow: batches that came late, or items that are not batches.
-        return _within(sorted([*self._archive.read(row, HourFile.items), *beside], key=_key), keys)
-
-    def _expiring(
-        self, first_us: int | None, last_us: int | None, *, newest_first: bool = False
-    ) -> Iterator[ArchivedHour]:
-        if self._source == TABLE:
-            return
-        for row in self._archive.rows(first_us, last_us, newest_first=newest_first):
-            if self._source == ARCHIVE or is_expiring(row):
-                yield row
+        return within(sorted([*self._archive.read(row, HourFile.items), *beside], key=key_of), keys)
 
     def _ids(self, row: ArchivedHour) -> list[BatchId]:
         """The batches of an hour."""
@@ -212,13 +233,11 @@ class Recorded:
 
     def _next(self, keys: Keys, *, newest: bool) -> BatchId | None:
         """The table's first or last batch with one of these keys."""
-        if self._source == ARCHIVE:
+        if not self.reads_table:
             return None
-        pages = self._table.pages(
-            self._topic, keys, attributes=(BATCH,), page_items=1, newest_first=newest
-        )
+        pages = self._table.pages(self._topic, keys, attributes=(BATCH,), page_items=1, newest_first=newest)
         # What is not a batch has no time.
-        return next((one for page in pages for one in _batch_ids(map(_key, page.items))), None)
+        return next((one for page in pages for one in _batch_ids(map(key_of, page.items))), None)
 
 
 @dataclass(frozen=True)
@@ -228,37 +247,15 @@ class _Archived(Generic[_T]):
     content: _T
 
 
-class _Pages:
-    """Pages of items, to be taken up to some time."""
-
-    def __init__(self, pages: Iterator[Sequence[Item]]) -> None:
-        self._pages = pages
-        self._rest = next(pages, ())
-
-    def until(self, t_us: int | None) -> Iterator[Sequence[Item]]:
-        """The items before a time; None is all."""
-        while self._rest:
-            end = len(self._rest) if t_us is None else bisect_left(self._rest, _first_key(t_us), key=_key)
-            if end:
-                yield self._rest[:end]
-            if end < len(self._rest):
-                self._rest = self._rest[end:]
-                return
-            self._rest = next(self._pages, ())
+def only(batch: BatchId) -> Keys:
+    """The key of one batch."""
+    return Keys({"S": str(batch)}, {"S": str(batch)}, empty=False)
 
 
 def _told(items: Sequence[Item], progress: PageProgress | None) -> Sequence[Item]:
     if progress is not None:
         progress(len(items), start_us(items[-1]))
     return items
-
-
-def _within(items: Sequence[Item], keys: Keys) -> Sequence[Item]:
-    return [item for item in items if keys.first["S"] <= _key(item) <= keys.last["S"]]
-
-
-def _key(item: Item) -> str:
-    return str(item[BATCH]["S"])
 
 
 def _first_key(t_us: int) -> str:

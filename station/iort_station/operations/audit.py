@@ -19,6 +19,7 @@ from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decod
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.recorded import Recorded
 
 # A batch is late if it took this much longer to arrive than the run's fastest one. It spans a second, and
 # arrives within milliseconds if nothing delays it.
@@ -233,12 +234,9 @@ def headers(
     cloud: Cloud, robot: str, stream: str, first_us: int | None = None, last_us: int | None = None
 ) -> Iterator[dict[str, Any]]:
     """The stored batches that start between two times, both inclusive, without their samples."""
-    keys = starting_between(first_us, last_us)
-    attributes = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
-    for page in telemetry_table(cloud).pages(topic_of(cloud, robot, stream), keys, attributes=attributes):
-        for item in page.items:
-            # Strings and numbers only, so no deserializer is needed.
-            yield {name: next(iter(value.values())) for name, value in item.items()}
+    for item in Recorded(cloud, robot, stream).headers(starting_between(first_us, last_us)):
+        # Strings and numbers only, so no deserializer is needed.
+        yield {name: next(iter(value.values())) for name, value in item.items()}
 
 
 def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:

@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from iort_analysis.samples.batches import RefusedItems
-from iort_contract.dynamodb import plain
+from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data.batches import PageProgress, stored
+from iort_station.data.batches import PageProgress
+from iort_station.data.recorded import Recorded
 from iort_station.data.selection import Selection
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
@@ -47,7 +48,9 @@ class Export:
 
     def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
-        for items in stored(self._cloud, self._selection, progress=progress):
+        asked = self._selection
+        keys = with_samples_between(asked.start_us, asked.end_us)
+        for items in Recorded(self._cloud, asked.robot, asked.stream).items(keys, progress=progress):
             for item in items:
                 yield from self._of(plain(item))
 
