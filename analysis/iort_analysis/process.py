@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -17,7 +18,7 @@ from iort_analysis.mining import laps, style
 from iort_analysis.results import DriveResult, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.findings import DriveKey, Estimate
 
 Miner = Callable[[Drive], Mined]
 # By the name that a result gives as missing if the miner fails.
@@ -62,9 +63,21 @@ def _mined(name: str, miner: Miner, drive: Drive) -> Mined:
     """What a miner found; one that fails does not stop the others."""
     try:
         with np.errstate(all="ignore"):
-            return miner(drive)
+            return _finite(miner(drive))
     except Exception as error:  # noqa: BLE001 - whatever a miner meets in a drive, the others go on
         return Mined(missing={name: f"the miner failed: {type(error).__name__}: {error}"})
+
+
+def _finite(mined: Mined) -> Mined:
+    """The same with plain numbers; an estimate that is not finite is missing."""
+    estimates, missing = {}, dict(mined.missing)
+    for name, one in mined.estimates.items():
+        value, low, high = float(one.value), float(one.low), float(one.high)
+        if np.isfinite([value, low, high]).all():
+            estimates[name] = Estimate(value, low, high, one.unit)
+        else:
+            missing[name] = "the estimate is not finite"
+    return replace(mined, estimates=estimates, missing=missing)
 
 
 def _unusable(drive: Drive) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 from numpy.typing import NDArray
 
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.findings import DriveKey, Estimate, decode_estimate, encode_estimate
 
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
 Table: TypeAlias = Mapping[str, NDArray[Any]]
@@ -56,9 +56,55 @@ class DriveResult:
     mined: Mined
     vesc: str = VESC_STREAM
 
+    @property
+    def measured(self) -> Measured:
+        """The estimates alone."""
+        return Measured(self.drive, self.mined.estimates)
+
 
 class Measured(NamedTuple):
     """The estimates of one drive, as they are kept for comparing with later ones."""
 
     drive: DriveKey
     estimates: Mapping[str, Estimate]
+
+
+def encode_result(result: DriveResult) -> dict[str, Any]:
+    """The result as an object for JSON, without its tables."""
+    return {
+        "drive": vars(result.drive),
+        "end_us": result.end_us,
+        "samples": result.samples,
+        "repairs": dict(result.repairs),
+        "vesc": result.vesc,
+        "estimates": {name: encode_estimate(one) for name, one in result.mined.estimates.items()},
+        "missing": dict(result.mined.missing),
+        "events": [_encode_event(event) for event in result.mined.events],
+    }
+
+
+def decode_result(content: Mapping[str, Any]) -> DriveResult:
+    """Decode what `encode_result` wrote; raises KeyError or `iort_contract.limits.ContractError`."""
+    mined = Mined(
+        estimates={name: decode_estimate(one) for name, one in content["estimates"].items()},
+        missing=content["missing"],
+        events=[_decode_event(event) for event in content["events"]],
+    )
+    return DriveResult(
+        drive=DriveKey(**content["drive"]),
+        end_us=content["end_us"],
+        samples=content["samples"],
+        repairs=content["repairs"],
+        mined=mined,
+        vesc=content["vesc"],
+    )
+
+
+def _encode_event(event: Event) -> dict[str, Any]:
+    effect = None if event.effect is None else encode_estimate(event.effect)
+    return {**event._asdict(), "effect": effect}
+
+
+def _decode_event(content: Mapping[str, Any]) -> Event:
+    effect = None if content["effect"] is None else decode_estimate(content["effect"])
+    return Event(**{**content, "fields": tuple(content["fields"]), "effect": effect})

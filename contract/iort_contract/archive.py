@@ -21,8 +21,8 @@ from iort_contract.topics import Topic
 ARCHIVE_PREFIX = "archive/"
 # The manifest's sort key: the hour, such as 2026-11-22T07.
 HOUR = "hour"
-# The partition of the manifest's rows of hours that are not archived yet. Their sort key is the hour, `#`, and
-# the topic; they have the newest receipt of a batch.
+# The manifest's partition of the hours that are not archived yet. The sort key is the hour, `#` and the
+# topic; a row has the newest receipt of a batch.
 PENDING = "pending"
 NEWEST_MS = "newest_ms"
 HOUR_US = 3_600_000_000
@@ -96,10 +96,10 @@ def _day(topic: Topic, hour: Hour) -> str:
 class ArchivedHour:
     """A row of the manifest: what an hour's object holds.
 
-    The object ``key`` is the hour's or, once compacted, its day's; the file itself says which of its row groups
-    are the hour's. ``content`` is `content_hash`, ``sha256`` and ``size_bytes`` are the object's.
-    ``first_expires_s`` is when the first of the hour's items leaves the telemetry table. An hour of refused
-    items only has an empty ``key``.
+    The object ``key`` is the hour's or, once compacted, its day's; the file itself says which row groups are
+    the hour's. ``content`` is `content_hash`, ``sha256`` and ``size_bytes`` are the object's. In
+    ``first_expires_s`` the first of the hour's items leaves the telemetry table. An hour with refused items
+    only has an empty ``key``.
     """
 
     topic: str
@@ -126,7 +126,8 @@ def archived_hour(item: Mapping[str, Any]) -> ArchivedHour:
     """Decode a row of the manifest, as DynamoDB sends it; raises `ContractError`."""
     row = plain(item)
     kinds = ArchivedHour.__annotations__
-    return ArchivedHour(**{name: (text if kinds[name] == "str" else integer)(row, name) for name in kinds})
+    values: Any = {name: (text if kinds[name] == "str" else integer)(row, name) for name in kinds}
+    return ArchivedHour(**values)
 
 
 class ArchiveTable(TopicTable):

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.findings import DriveKey
 from iort_contract.topics import check_namespace, check_robot
 
 # Query results too large for an answer, in the files' bucket for a day.
 RESULTS_PREFIX = "results/"
+# What the analysis keeps there: the results of drives, and for a week the drives of each of its runs.
+ANALYSIS_PREFIX = "analysis/"
+PLANS_PREFIX = f"{ANALYSIS_PREFIX}plans/"
 
 
 def pubnub_parameter(namespace: str = DEFAULT_NAMESPACE) -> str:
@@ -28,3 +32,18 @@ def claim_name(namespace: str = DEFAULT_NAMESPACE) -> str:
 def channel(robot: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     """The PubNub channel of a robot; ``<namespace>.*`` subscribes to the whole fleet."""
     return f"{check_namespace(namespace)}.{check_robot(robot)}"
+
+
+def drive_prefix(drive: DriveKey) -> str:
+    """What the keys of a drive's results begin with: ``result.json``, and a Parquet file a table."""
+    return f"{ANALYSIS_PREFIX}robot={check_robot(drive.robot)}/drive={drive}/"
+
+
+def plan_key(job: str, robot: str) -> str:
+    """The key of a robot's drives in a run of the analysis."""
+    return f"{PLANS_PREFIX}{job}/drives/{check_robot(robot)}.json"
+
+
+def findings_key(job: str) -> str:
+    """The key of the findings of a run of the analysis."""
+    return f"{PLANS_PREFIX}{job}/findings.json"

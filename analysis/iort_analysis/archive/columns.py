@@ -106,7 +106,9 @@ def joined_kind(one: str, other: str) -> str:
 def to_arrow(column: Column, kind: str) -> Any:
     """A column as an array of its kind's type."""
     if kind == MIXED:
-        return pa.array([None if (v := wire(value)) is None else _COMPACT.encode(v) for value in column.tolist()])
+        return pa.array(
+            [None if (v := wire(value)) is None else _COMPACT.encode(v) for value in column.tolist()]
+        )
     return pa.array(column, type=TYPES[kind], from_pandas=True)
 
 
@@ -119,10 +121,17 @@ def cast(array: Any, kind: str, into: str) -> Any:
     return to_arrow(objects(array.to_pylist()), into)
 
 
+def to_values(array: Any, *, is_json: bool) -> list[Value]:
+    """A field's array as values of the wire."""
+    if is_json:
+        return [None if text is None else json.loads(text) for text in array.to_pylist()]
+    return list(map(wire, array.to_pylist()))
+
+
 def to_numpy(array: Any, *, is_json: bool) -> Column:
     """A field's array as a column of a `Block`, of the type that the stored batches' columns have."""
     if is_json:
-        return column_of([None if text is None else json.loads(text) for text in array.to_pylist()])
+        return column_of(to_values(array, is_json=True))
     if array.null_count == len(array):
         return np.full(len(array), np.nan)
     if pa.types.is_floating(array.type):
@@ -144,9 +153,7 @@ def repeated(values: Sequence[Any], counts: Any, kind: Any) -> Any:
 
 
 def runs(array: Any) -> tuple[list[Any], Any]:
-    """The values of a column of `repeated`, once each, and the first row of each and the end: (values, rows)."""
+    """The values of a column of `repeated`, once each; and the first row of each, and the end."""
     indices = np.asarray(array.indices if pa.types.is_dictionary(array.type) else array)
     starts = np.flatnonzero(np.append(True, indices[1:] != indices[:-1])) if len(indices) else indices[:0]
     return array.take(pa.array(starts)).to_pylist(), np.append(starts, len(indices))
-
-

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from iort_analysis.archive import columns as names
-from iort_analysis.archive.columns import MIXED, named, runs, wire
+from iort_analysis.archive.columns import MIXED, named, runs, to_values
 from iort_analysis.archive.reading import ArchiveFile, head_of
 from iort_contract.archive import Hour
 from iort_contract.codec.columns import CODEC, SERIALIZED_CODEC, packed_samples
@@ -23,8 +23,8 @@ from iort_contract.tables import BATCH, SAMPLES, TOPIC
 def items(file: ArchiveFile, topic: str, hour: Hour | None = None) -> Iterator[Item]:
     """The batches of a file as stored items.
 
-    They decode to the batches and the ROS messages that the stored ones decoded to, but are perhaps compressed
-    differently; each has the hash of the stored one as the contract's `HASH`.
+    They decode to the same batches and ROS messages as the stored ones, but may be compressed in another way;
+    each has the hash of the stored one as the contract's `HASH`.
     """
     for group in file.groups(hour):
         table = file.table(group)
@@ -62,13 +62,13 @@ class _Columns:
             return CODEC, packed_samples(dt, fields, about.encode())
         kind = self._table[names.TYPE][start].as_py()
         raw = self._table[names.MESSAGE].slice(start, end - start).to_pylist()
-        return SERIALIZED_CODEC, packed_samples(dt, fields, pack(Messages(kind, layout, raw)), SERIALIZED_CODEC)
+        return SERIALIZED_CODEC, packed_samples(
+            dt, fields, pack(Messages(kind, layout, raw)), SERIALIZED_CODEC
+        )
 
     def _values(self, name: str, start: int, end: int) -> Sequence[Value]:
         if name not in self._kinds:
             others = self._table[names.OTHER].slice(start, end - start).to_pylist()
             return [json.loads(text or "{}").get(name) for text in others]
-        values = self._table[named(name)].slice(start, end - start).to_pylist()
-        if self._kinds[name] == MIXED:
-            return [None if text is None else json.loads(text) for text in values]
-        return list(map(wire, values))
+        array = self._table[named(name)].slice(start, end - start)
+        return to_values(array, is_json=self._kinds[name] == MIXED)

@@ -79,7 +79,7 @@ def _opened(items: Iterable[Item], refuse: Refuse) -> Iterator[list[_Entry]]:
                 if opened.serialized is not None:
                     messages = unpack(opened.serialized, len(opened.times_us))
                 yield _Entry(item, opened._replace(serialized=None), messages)
-            except ContractError as error:
+            except ContractError as error:  # noqa: PERF203 - each is refused by itself
                 refuse(item, str(error))
 
     for _, same in groupby(each(), key=lambda one: (list(one.opened.written), one.messages is None)):
@@ -106,7 +106,7 @@ def _decoded(run: list[_Entry], refuse: Refuse) -> tuple[list[_Entry], Block]:
     for one in run:
         try:
             decoded, block = _alone(one)
-        except ContractError as error:
+        except ContractError as error:  # noqa: PERF203 - as above
             refuse(one.item, str(error))
         else:
             valid.append(_without_values(decoded))
@@ -135,8 +135,7 @@ def _alone(one: _Entry) -> tuple[_Entry, Block]:
 
 
 def _exact(block: Block, values_of: Callable[[str], Sequence[Value]]) -> Block:
-    """The block with integers of more than 53 bits as Python's: a float64 that holds one does not tell it from
-    a float."""
+    """The block with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
     for name, column in block.columns.items():
         if column.dtype.kind == "f" and bool((np.abs(column) >= EXACT).any()):
             values = values_of(name)
@@ -147,9 +146,7 @@ def _exact(block: Block, values_of: Callable[[str], Sequence[Value]]) -> Block:
 
 def _values(run: list[_Entry], name: str) -> list[Value]:
     return [
-        value
-        for one in run
-        for value in unpacked(name, one.opened.written[name], len(one.opened.times_us))
+        value for one in run for value in unpacked(name, one.opened.written[name], len(one.opened.times_us))
     ]
 
 
@@ -163,7 +160,7 @@ def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
         names.MESSAGE: pa.array(messages, type=OWN[names.MESSAGE]),
         names.OTHER: pa.nulls(len(block.times_us), OWN[names.OTHER]),
     }
-    of_batches = {
+    of_batches: dict[str, list[Any]] = {
         names.BATCH_ID: [_id(one) for one in entries],
         names.RECEIVED: [_received_ms(one.item) for one in entries],
         names.NOT_FINITE: [one.opened.nonfinite if NONFINITE in one.item else None for one in entries],
@@ -198,5 +195,3 @@ def _received_ms(item: Item) -> int | None:
 def _fields(one: _Entry) -> str:
     written = ",".join(one.opened.written)
     return written if one.messages is None else f"{','.join(one.viewed)}|{written}"
-
-

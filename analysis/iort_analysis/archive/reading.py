@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from iort_analysis.archive import columns as names
 from iort_analysis.archive.columns import MIXED, column_name, named, runs, to_numpy
-from iort_analysis.samples.batches import Wanted
+from iort_analysis.samples.batches import Part, Wanted
 from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.archive import Hour
 from iort_contract.dynamodb import Item
@@ -59,13 +59,12 @@ class ArchiveFile:
         last_us: int | None = None,
         messages: bool = True,
         but: frozenset[str] = frozenset(),
-    ) -> Iterator[tuple[Block, int]]:
-        """The samples in the order of their batches, with the fields that are ``wanted``: blocks, each with the
-        time at which its last batch starts. `iort_analysis.samples.batches.in_order` brings them into the order
-        of time.
+    ) -> Iterator[Part]:
+        """The samples in the order of their batches, with the fields that are ``wanted``; `in_order` brings
+        them into the order of time.
 
-        A block without any sample between two times is left out. Without ``messages``, batches of ROS messages
-        are. So are batches whose ids are in ``but``.
+        Row groups without any sample between two times are left out, and the batches whose ids are in
+        ``but``; without ``messages`` those of ROS messages, too.
         """
         for group in self.groups(hour):
             if self._overlaps(group, first_us, last_us):
@@ -93,7 +92,7 @@ class ArchiveFile:
         fields = {column_name(name): named(name) for name in self.kinds}
         return table.rename_columns([fields.get(name, name) for name in table.column_names])
 
-    def _block(self, group: int, wanted: Wanted, *, messages: bool, but: frozenset[str]) -> tuple[Block, int]:
+    def _block(self, group: int, wanted: Wanted, *, messages: bool, but: frozenset[str]) -> Part:
         chosen = {name: column_name(name) for name in self.kinds if wanted(name)}
         own = (names.TIME, names.BATCH_ID, names.FIELDS, names.ABOUT, names.LAYOUT, names.OTHER)
         table = self._read(group, (*own, *chosen.values()))
@@ -106,14 +105,15 @@ class ArchiveFile:
         if not all(kept):
             table = table.filter(pa.array(np.repeat(kept, np.diff(rows))))
         times = table[names.TIME].cast(pa.int64()).to_numpy()
-        present = {name for text in runs(table[names.FIELDS])[0] for name in text.replace("|", ",").split(",")}
+        present = {
+            name for text in runs(table[names.FIELDS])[0] for name in text.replace("|", ",").split(",")
+        }
         block = Block(times, {})
         for name, column in chosen.items():
             if name in present:
-                array = table[column].combine_chunks()
-                block.columns[name] = to_numpy(array, is_json=self.kinds[name] == MIXED)
+                block.columns[name] = to_numpy(table[column], is_json=self.kinds[name] == MIXED)
         self._add_others(block, table[names.OTHER], present, wanted)
-        return block, last_us
+        return Part(block, last_us)
 
     def _add_others(self, block: Block, others: Any, present: set[str], wanted: Wanted) -> None:
         """Add the fields that have no column."""
@@ -134,13 +134,17 @@ class ArchiveFile:
         spans = []
         for group in range(self._file.num_row_groups):
             statistics = self._file.metadata.row_group(group).column(0).statistics
-            spans.append(tuple(pa.scalar(t, pa.timestamp("us", tz="UTC")).value for t in (statistics.min, statistics.max)))
+            spans.append(
+                tuple(
+                    pa.scalar(t, pa.timestamp("us", tz="UTC")).value for t in (statistics.min, statistics.max)
+                )
+            )
         return spans
 
     def _read(self, group: int, columns: Sequence[str]) -> Any:
         table = self._file.read_row_group(group, columns=list(columns), use_threads=False)
         # Parquet takes a name with dots for a path, and reads what else begins like it.
-        return table.select(list(columns)).combine_chunks()
+        return table.select(list(columns)).combine_chunks().to_batches()[0]
 
 
 def head_of(table: Any, row: int) -> Item:

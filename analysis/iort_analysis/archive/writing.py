@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,7 +11,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from iort_analysis.archive import columns as names
-from iort_analysis.archive.columns import MIXED, NOTHING, OWN, TYPES, cast, column_name, joined_kind, named, wire
+from iort_analysis.archive.columns import (
+    MIXED,
+    NOTHING,
+    OWN,
+    TYPES,
+    cast,
+    column_name,
+    joined_kind,
+    named,
+    to_values,
+)
 from iort_analysis.archive.pieces import pieces
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
 from iort_contract.archive import Hour, content_hash, item_hash
@@ -25,8 +34,8 @@ _LEVEL = 6
 
 
 class Written(NamedTuple):
-    """What a file got. ``content`` is the contract's `content_hash` of all items; ``refused`` counts those that
-    are not in the file, by the reason. ``first_expires_s`` is 0 if no item expires."""
+    """What a file got. ``content`` is the contract's `content_hash` of all items. ``refused`` counts the
+    items that are not in the file, by the reason. ``first_expires_s`` is 0 if no item expires."""
 
     batches: int
     samples: int
@@ -46,8 +55,8 @@ def write_hour(
 ) -> Written:
     """Write the batches of an hour, in the order of their ids.
 
-    Items that are no batches are written to ``refused``, as DynamoDB's JSON, a line each. ``scratch`` is a file
-    that may be read and written. Nothing is written ``into`` if there is no batch.
+    Items that are no batches are written to ``refused``, as DynamoDB's JSON, a line each. ``scratch`` is a
+    file for reading and writing. Nothing is written ``into`` if there is no batch.
     """
     hashes: list[tuple[str, str]] = []
     reasons: Counter[str] = Counter()
@@ -70,13 +79,15 @@ def write_hour(
     for piece in pieces(each(), refuse):
         batches += piece.batches
         samples += len(piece.table)
-        kinds.update({name: joined_kind(kind, kinds.get(name, NOTHING)) for name, kind in piece.kinds.items()})
+        kinds.update(
+            {name: joined_kind(kind, kinds.get(name, NOTHING)) for name, kind in piece.kinds.items()}
+        )
         places.append(piece.kinds)
         with pa.ipc.new_stream(scratch, piece.table.schema) as stream:
             stream.write_table(piece.table)
     if places:
         scratch.seek(0)
-        tables = ((pa.ipc.open_stream(scratch).read_all(), local) for local in places)
+        tables = ((_read(scratch), local) for local in places)
         _write(into, kinds, tables, {str(hour): (0, len(places))}, describe)
     ordered = content_hash(sorted(hashes))
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
@@ -109,15 +120,21 @@ def _write(
     options = {"compression": "zstd", "compression_level": _LEVEL}
     with pq.ParquetWriter(into, schema, **options) as writer:
         for table, local in tables:
-            arrays = {name: table[name].combine_chunks() for name in OWN}
-            arrays[names.OTHER] = _with_others(arrays[names.OTHER], table, local.keys() - of_columns.keys())
+            arrays = {name: table[name] for name in OWN}
+            arrays[names.OTHER] = _with_others(
+                table, {name: kind for name, kind in local.items() if name not in of_columns}
+            )
             for name, kind in of_columns.items():
                 array = pa.nulls(len(table), TYPES[kind])
                 if name in local:
-                    array = cast(table[named(name)].combine_chunks(), local[name], kind)
+                    array = cast(table[named(name)], local[name], kind)
                 arrays[column_name(name)] = array
             rows = pa.table([arrays[name] for name in schema.names], schema=schema)
             writer.write_table(rows, row_group_size=max(1, len(rows)))
+
+
+def _read(scratch: BinaryIO) -> Any:
+    return pa.ipc.open_stream(scratch).read_all().combine_chunks().to_batches()[0]
 
 
 def _schema(kinds: Mapping[str, str], places: Mapping[str, tuple[int, int]], describe: Describe) -> Any:
@@ -128,19 +145,21 @@ def _schema(kinds: Mapping[str, str], places: Mapping[str, tuple[int, int]], des
         metadata = {names.FIELD: name.encode(), names.UNIT: unit.encode(), names.MEANING: meaning.encode()}
         if kind == MIXED:
             metadata[names.ENCODING] = names.JSON
-        fields.append(pa.field(column_name(name), TYPES[kind], metadata={k: v for k, v in metadata.items() if v}))
+        fields.append(
+            pa.field(column_name(name), TYPES[kind], metadata={k: v for k, v in metadata.items() if v})
+        )
     time, *own = (pa.field(name, kind) for name, kind in OWN.items())
     return pa.schema([time, *fields, *own], metadata={HOURS: json.dumps(places), KINDS: json.dumps(kinds)})
 
 
-def _with_others(others: Any, table: Any, more: Iterable[str]) -> Any:
-    """The column of fields without a column, with more such fields."""
-    columns = {name: table[named(name)].to_pylist() for name in sorted(more)}
-    if not columns:
+def _with_others(table: Any, more: Mapping[str, str]) -> Any:
+    """The column of fields without a column, with more such fields of these kinds."""
+    others = table[names.OTHER]
+    if not more:
         return others
     rows = [json.loads(text or "{}") for text in others.to_pylist()]
-    for name, values in columns.items():
-        for row, value in zip(rows, values, strict=True):
+    for name, kind in more.items():
+        for row, value in zip(rows, to_values(table[named(name)], is_json=kind == MIXED), strict=True):
             if value is not None:
-                row[name] = wire(value)
+                row[name] = value
     return pa.array([json.dumps(row) if row else None for row in rows], type=OWN[names.OTHER])

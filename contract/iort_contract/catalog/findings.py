@@ -11,6 +11,7 @@ from typing import Literal
 from iort_contract.catalog.kinds import KINDS
 
 __all__ = [
+    "GROUPS",
     "KINDS",
     "LAPS_TABLE",
     "PARAMETERS",
@@ -82,4 +83,6 @@ _STYLES = tuple(
     for style, meaning in STYLES.items()
 )
 
-PARAMETERS = {parameter.name: parameter for parameter in (*_BATTERY, *_LAPS, *_STYLES)}
+# The groups in the order in which a person reads them.
+GROUPS = {"Battery": _BATTERY, "Laps": _LAPS, "Driving style": _STYLES}
+PARAMETERS = {parameter.name: parameter for group in GROUPS.values() for parameter in group}

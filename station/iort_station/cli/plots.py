@@ -6,7 +6,7 @@ dashes differ too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -129,6 +129,20 @@ def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
         panel.set_xlabel(_labelled(runs, field))
         panel.set_ylabel("samples (%)")
     return _finished(figure, runs, "line: median")
+
+
+def delta_time(found: Mapping[str, Any], one: int, other: int) -> Figure:
+    """Draw how far a lap is behind another one at each place, and both speeds."""
+    figure, (delta, speed) = _panels(2, height=2.2, shared=True)
+    delta.axhline(0, color="#808080", linewidth=0.8)
+    delta.plot(found["place_m"], found["delta_s"], **_style(0))
+    delta.set_ylabel(f"lap {other} behind\nlap {one} (s)")
+    for i, (name, lap) in enumerate((("one_mps", one), ("other_mps", other))):
+        speed.plot(found["place_m"], found[name], label=f"lap {lap}", linewidth=1.1, **_style(i + 1))
+    speed.set_ylabel("speed (m/s)")
+    speed.set_xlabel("distance (m)")
+    speed.legend(frameon=False, ncols=2)
+    return figure
 
 
 def check_ending(path: Path) -> None:

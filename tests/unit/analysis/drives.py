@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle as SimulatedCar
-from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.drives.drive import Drive
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
@@ -49,14 +50,15 @@ def sampled(
 def driven(seconds: float, seed: int = 1, **given: Any) -> Driven:
     """The simulated car's laps of its hall."""
     car = SimulatedCar(VehicleConfig(), seed)
+    measured = Sensors(car, seed)
     vesc, poses, truth = [], [], []
     n = round(seconds * 50)
     for i in range(n):
         car.step(_STEP_US / 1e6)
-        vesc.append(car.sample())
+        vesc.append(measured.vesc())
         truth.append(car.pose)
         if i % 2 == 0:
-            poses.append(car.measured_pose())
+            poses.append(measured.pose())
     times_us = START_US + _STEP_US * np.arange(n)
     drive = sampled(vesc, poses, times_us, **given)
     x, y, _ = np.array(truth).T

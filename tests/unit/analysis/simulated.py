@@ -6,7 +6,9 @@ from functools import cache
 
 import numpy as np
 
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.sensors import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.messages.findings import DriveKey
@@ -20,12 +22,13 @@ VEHICLE = F1TENTH
 def streams(seconds: int = 120, seed: int = 1) -> dict[str, Block]:
     """The car's VESC at 50 Hz, and its pose at 25 Hz; do not change the arrays, they are shared."""
     car = Vehicle(VehicleConfig(), seed)
+    measured = Sensors(car, seed)
     vesc, poses = [], []
     for i in range(seconds * HZ):
         car.step(1 / HZ)
-        vesc.append(car.sample())
+        vesc.append(measured.vesc())
         if i % 2 == 0:
-            poses.append(car.measured_pose())
+            poses.append(measured.pose())
     times = START_US + np.arange(len(vesc), dtype=np.int64) * (1_000_000 // HZ)
     return {
         "vesc": Block(times, _columns(vesc)),

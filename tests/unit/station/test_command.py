@@ -64,7 +64,7 @@ import sys
 from iort_station.cli.lazy import Verb
 from iort_station.cli.verbs import VERBS
 for file in VERBS:
-    if file.rpartition(".")[2] in {"audit", "export", "plot", "query", "runs", "streams"}:
+    if file.rpartition(".")[2] in {"audit", "export", "laps", "plot", "query", "runs", "streams"}:
         Verb(file, "").load()
 print(*sorted(sys.modules))
 """

@@ -51,10 +51,10 @@ def find_laps(drive: Drive) -> Laps | str:
         return _by_pattern(drive, path)
     crossed = find_gate(path)
     if crossed is None:
-        return f"{drive.pose}: the car never came back to a place in the same direction"
+        return "the car never came back to a place in the same direction"
     if crossed.complete.sum() < _LEAST_LAPS or crossed.confidence < _LEAST_CONFIDENCE:
         back, laps = len(crossed.complete), int(crossed.complete.sum())
-        return f"{drive.pose}: the car came back to a place {back} times, {laps} of them by the same way"
+        return f"the car came back to a place {back} times, {laps} of them by the same way"
     return _by_gate(drive, path, crossed)
 
 

@@ -54,15 +54,16 @@ class Path:
 
 def path_of(drive: Drive) -> Path | str:
     """The way of a drive by its stream of positions; a text says why there is none."""
-    block = drive.streams.get(drive.pose or "")
-    fields = None if block is None else position_fields(block.columns)
-    if block is None or fields is None:
+    placed = {name: fields for name, b in drive.streams.items() if (fields := position_fields(b.columns))}
+    stream = drive.pose if drive.pose in placed else min(placed, default=None)
+    if stream is None:
         return "no stream has a position"
+    block, fields = drive.streams[stream], placed[stream]
     if fields.degrees:
         latitude, longitude = fixes(block.columns, fields)
         known = np.flatnonzero(~np.isnan(latitude))
         if not len(known):
-            return f"no position in {drive.pose} has a fix"
+            return f"no position in {stream} has a fix"
         x, y = local_metres(latitude, longitude, (float(latitude[known[0]]), float(longitude[known[0]])))
     else:
         x, y = (block.columns[name].astype(np.float64) for name in fields.names)
@@ -71,7 +72,7 @@ def path_of(drive: Drive) -> Path | str:
     later = np.append(True, times[1:] > times[:-1])[: len(known)]
     known, times = known[later], times[later]
     if len(known) < _LEAST_POSITIONS:
-        return f"{drive.pose} has {len(known)} positions, at least {_LEAST_POSITIONS} are needed"
+        return f"{stream} has {len(known)} positions, at least {_LEAST_POSITIONS} are needed"
     x, y = x[known], y[known]
     noise_m = float(np.hypot(_noise(x), _noise(y))) / math.sqrt(2)
     spans = [np.diff(np.percentile(each, [1, 99]))[0] for each in (x, y)]

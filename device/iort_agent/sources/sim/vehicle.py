@@ -56,7 +56,7 @@ class Vehicle:
         self._driver, self.pose = driver, driver.start()
         self.speed_mps = self.wheel_mps = 0.0
         self._steering_rad = 0.0
-        self._slips = False
+        self.slips = False
         self.motor_a = 0.0
         self.vd_v = self.vq_v = 0.0
         self.counts = self.counts_abs = 0.0
@@ -145,7 +145,7 @@ class Vehicle:
         friction_n = c.drivetrain_friction_n + damage.friction_n + damage.drag_n
         before = self.speed_mps
         drag_n = 0.5 * AIR_KG_PER_M3 * c.drag_area_m2 * before**2
-        if self._slips:
+        if self.slips:
             self._slide(force, friction_n, drag_n, dt)
             return
         resisting_n = friction_n + self._rolling_n + drag_n
@@ -160,7 +160,7 @@ class Vehicle:
         tyre_n = force - way * friction_n - c.rotating_mass_kg * acceleration
         slip = tyre_n / (c.slip_stiffness * self.mass_kg * G_MPS2)
         self.wheel_mps = after * (1 + slip) / damage.radius
-        self._slips = after != 0 and (abs(tyre_n) > self._traction_n() or abs(force) > damage.pinion_holds_n)
+        self.slips = after != 0 and (abs(tyre_n) > self._traction_n() or abs(force) > damage.pinion_holds_n)
 
     def _slide(self, force: float, friction_n: float, drag_n: float, dt: float) -> None:
         """The motor turns in a pinion that slips, or with wheels that spin, until they hold again."""
@@ -191,7 +191,7 @@ class Vehicle:
         self.speed_mps = after if before * after >= 0 else 0.0
         self.wheel_mps = turning / damage.radius
         slip = held_n / (c.slip_stiffness * self.mass_kg * G_MPS2) * abs(self.speed_mps)
-        self._slips = self.speed_mps != 0 and (turning - self.speed_mps) * faster > slip
+        self.slips = self.speed_mps != 0 and (turning - self.speed_mps) * faster > slip
 
     def _traction_n(self) -> float:
         """The force that the tyres hold along the car, beside what the corner needs."""

@@ -1,0 +1,110 @@
+"""Finds the drives in a stream's batches: runs of the agent, cut where the car stood for long.
+
+It looks at one batch in many: a stand of a minute cannot hide between two looks that are closer together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+from iort_contract.messages.batch import BatchId
+
+# A stand, or a pause in the recording, of this length ends a drive.
+STAND_US = 60_000_000
+# A drive keeps this much of the stands around it: there the battery rests, and sensors show their zero.
+_AROUND_US = 10_000_000
+# How far apart looks are while the car moves, and while it stands.
+_LOOK_MOVING_US, _LOOK_STANDING_US = 15_000_000, 3_000_000
+
+
+class Heard(NamedTuple):
+    """A batch of the stream that tells of motion; ``moves`` decodes it."""
+
+    id: BatchId
+    moves: Callable[[], bool]
+
+
+class Found(NamedTuple):
+    """A drive: its first and last batch start at these times, in one run."""
+
+    start_us: int
+    last_us: int
+    run: str
+
+
+def find(batches: Iterable[Heard]) -> Iterator[Found]:
+    """The drives in batches in order of time.
+
+    A drive begins with the run or some seconds before the car moves, and ends alike. Runs that recorded at
+    the same time are apart.
+    """
+    runs: dict[str, _Run] = {}
+    for batch in batches:
+        for boot, run in list(runs.items()):
+            if batch.id.t_us - run.newest_us > STAND_US:
+                yield from run.ended()
+                del runs[boot]
+        run = runs.setdefault(batch.id.boot, _Run(batch.id))
+        yield from run.hear(batch)
+    for run in runs.values():
+        yield from run.ended()
+
+
+class _Run:
+    """One run of the agent, as far as it has been heard."""
+
+    def __init__(self, first: BatchId) -> None:
+        self._boot = first.boot
+        self._earliest_us = self.newest_us = first.t_us
+        self._looked_us: int | None = None
+        self._moving = False
+        self._start_us: int | None = None
+        self._moved_us = first.t_us
+        # Since the last look.
+        self._unseen: list[Heard] = []
+
+    def hear(self, batch: Heard) -> Iterator[Found]:
+        """Take the next batch; yields the drive that a stand has just ended."""
+        self.newest_us = batch.id.t_us
+        apart = _LOOK_MOVING_US if self._moving else _LOOK_STANDING_US
+        if self._looked_us is not None and batch.id.t_us - self._looked_us < apart:
+            self._unseen.append(batch)
+            return
+        yield from self._look(batch)
+
+    def ended(self) -> Iterator[Found]:
+        """The drive at the run's end, if there is one."""
+        if self._unseen:
+            yield from self._look(self._unseen.pop())
+        if self._start_us is not None:
+            yield self._drive()
+
+    def _look(self, batch: Heard) -> Iterator[Found]:
+        moves, unseen = batch.moves(), self._unseen
+        self._looked_us, self._unseen = batch.id.t_us, []
+        if moves:
+            moved_us = batch.id.t_us
+            if not self._moving:
+                moved_us = next((one.id.t_us for one in unseen if one.moves()), moved_us)
+            if self._start_us is not None and moved_us - self._moved_us > STAND_US:
+                yield self._drive()
+                self._start_us = None
+            if self._start_us is None:
+                self._start_us = max(self._earliest_us, moved_us - _AROUND_US)
+            self._moved_us = batch.id.t_us
+        elif self._moving:
+            last = next((one.id.t_us for one in reversed(unseen) if one.moves()), None)
+            self._moved_us = self._moved_us if last is None else last
+        self._moving = moves
+        if self._start_us is not None and batch.id.t_us - self._moved_us > STAND_US:
+            yield self._drive()
+            self._start_us = None
+
+    def _drive(self) -> Found:
+        assert self._start_us is not None
+        last_us = min(self.newest_us, self._moved_us + _AROUND_US)
+        found = Found(self._start_us, last_us, self._boot)
+        # What belongs to this drive is not the beginning of the next one.
+        self._earliest_us = last_us + 1
+        return found

@@ -1,0 +1,102 @@
+"""The table of findings in DynamoDB: findings, and a row of each analysed drive, by robot and time.
+
+The content of a row is JSON, so that numbers come back as they were.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Iterator, Mapping
+
+from iort_contract.checks import json_object
+from iort_contract.messages.analysis import AnalysedDrive, decode_analysed, encode_analysed
+from iort_contract.messages.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
+
+_FIRST, _LAST = "0", "9~"
+
+
+class FindingsTable:
+    """Reads and writes the table; ``client`` is a boto3 DynamoDB client or a fake of it."""
+
+    def __init__(self, client: Any, name: str) -> None:
+        self._client, self._name = client, name
+
+    def findings(
+        self, robot: str, start_us: int | None = None, end_us: int | None = None
+    ) -> Iterator[Finding]:
+        """A robot's findings about drives that begin in a range, the newest first."""
+        first = _FIRST if start_us is None else f"{start_us:016d}"
+        last = _LAST if end_us is None else f"{end_us - 1:016d}~"
+        yield from map(decode_finding, self._content(robot, first, last, newest_first=True))
+
+    def of_drive(self, drive: DriveKey) -> list[Finding]:
+        """The findings about one drive."""
+        return [decode_finding(one) for one in self._content(drive.robot, f"{drive}-", f"{drive}-~")]
+
+    def drives(
+        self,
+        robot: str,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        *,
+        most: int | None = None,
+    ) -> Iterator[AnalysedDrive]:
+        """A robot's analysed drives that begin in a range, the newest first; at most so many."""
+        first = f"{PARAMETERS_PREFIX}{'' if start_us is None else f'{start_us:016d}'}"
+        last = f"{PARAMETERS_PREFIX}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
+        found = map(decode_analysed, self._content(robot, first, last, newest_first=True, page_items=most))
+        for number, one in enumerate(found, 1):
+            yield one
+            if number == most:
+                return
+
+    def put_finding(self, finding: Finding) -> None:
+        """Write a finding; one of the same id is replaced."""
+        self._put(finding.drive.robot, finding.id, encode_finding(finding))
+
+    def put_drive(self, analysed: AnalysedDrive) -> None:
+        """Write the row of an analysed drive; an earlier one of the drive is replaced."""
+        key = f"{PARAMETERS_PREFIX}{analysed.drive}"
+        self._put(analysed.drive.robot, key, encode_analysed(analysed))
+
+    def remove(self, finding: Finding) -> None:
+        """Remove a finding that a later analysis of its drive no longer has."""
+        key = {ROBOT: {"S": finding.drive.robot}, FINDING: {"S": finding.id}}
+        self._client.delete_item(TableName=self._name, Key=key)
+
+    def _put(self, robot: str, key: str, content: Mapping[str, Any]) -> None:
+        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+        item = {ROBOT: {"S": robot}, FINDING: {"S": key}, CONTENT: {"S": text}}
+        self._client.put_item(TableName=self._name, Item=item)
+
+    def _content(
+        self,
+        robot: str,
+        first: str,
+        last: str,
+        *,
+        newest_first: bool = False,
+        page_items: int | None = None,
+    ) -> Iterator[Mapping[str, Any]]:
+        request: dict[str, Any] = {
+            "TableName": self._name,
+            "ConsistentRead": True,
+            "KeyConditionExpression": "#robot = :robot AND #key BETWEEN :first AND :last",
+            "ExpressionAttributeNames": {"#robot": ROBOT, "#key": FINDING},
+            "ExpressionAttributeValues": {
+                ":robot": {"S": robot},
+                ":first": {"S": first},
+                ":last": {"S": last},
+            },
+            "ScanIndexForward": not newest_first,
+        }
+        if page_items is not None:
+            request["Limit"] = page_items
+        while True:
+            answer = self._client.query(**request)
+            for item in answer["Items"]:
+                yield json_object(item[CONTENT]["S"], f"the row {item[FINDING]['S']}")
+            if "LastEvaluatedKey" not in answer:
+                return
+            request["ExclusiveStartKey"] = answer["LastEvaluatedKey"]

@@ -1,0 +1,146 @@
+"""A run of the analysis: what is asked for, and the drives that its plan finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Mapping
+
+from iort_contract.checks import integer, shown, text
+from iort_contract.limits import ContractError
+from iort_contract.messages.findings import DriveKey, Estimate, decode_estimate, encode_estimate
+from iort_contract.topics import check_robot, check_stream
+
+# The longest range of one run.
+MAX_RANGE_US = 366 * 86_400 * 1_000_000
+
+
+@dataclass(frozen=True)
+class AnalysisRequest:
+    """The drives of ``robots`` that begin from ``start_us`` to ``end_us`` (exclusive).
+
+    No robots means all. With ``again`` also those that have been analysed.
+    """
+
+    robots: tuple[str, ...]
+    start_us: int
+    end_us: int
+    again: bool = False
+
+
+@dataclass(frozen=True)
+class PlannedDrive:
+    """A drive to analyse: its samples lie from its start to ``end_us``, inclusive.
+
+    ``motion`` names the stream that tells where it stood; empty if none does.
+    """
+
+    drive: DriveKey
+    end_us: int
+    streams: tuple[str, ...]
+    motion: str = ""
+
+
+@dataclass(frozen=True)
+class AnalysedDrive:
+    """The row of an analysed drive: what later drives are compared with.
+
+    ``job`` is the run of the analysis that made it. ``missing`` gives reasons by the names of what could not
+    be computed.
+    """
+
+    drive: DriveKey
+    end_us: int
+    job: str
+    samples: int
+    estimates: Mapping[str, Estimate]
+    missing: Mapping[str, str]
+    repairs: Mapping[str, int]
+
+
+def encode_request(request: AnalysisRequest) -> dict[str, Any]:
+    """The request as the state machine's input."""
+    return {
+        "robots": list(request.robots),
+        "start_us": request.start_us,
+        "end_us": request.end_us,
+        "again": request.again,
+    }
+
+
+def decode_request(content: Mapping[str, Any], now_us: int) -> AnalysisRequest:
+    """Decode a request; raises `ContractError`.
+
+    The schedule gives ``last_s`` instead of times, which counts back from now.
+    """
+    robots = content.get("robots", [])
+    if not isinstance(robots, list):
+        raise ContractError(f"robots must be a list of names, got {shown(robots)}")
+    if "last_s" in content:
+        start_us, end_us = now_us - integer(content, "last_s") * 1_000_000, now_us
+    else:
+        start_us, end_us = integer(content, "start_us"), integer(content, "end_us")
+    if not 0 < end_us - start_us <= MAX_RANGE_US:
+        raise ContractError(
+            f"the range must be longer than 0 and at most {MAX_RANGE_US // 86_400_000_000} days, "
+            f"got {(end_us - start_us) / 1e6:g} s"
+        )
+    again = content.get("again", False)
+    if not isinstance(again, bool):
+        raise ContractError(f"again must be true or false, got {shown(again)}")
+    return AnalysisRequest(tuple(map(check_robot, robots)), max(0, start_us), end_us, again)
+
+
+def encode_planned(planned: PlannedDrive) -> dict[str, Any]:
+    """The drive as an object for JSON."""
+    return {
+        **vars(planned.drive),
+        "end_us": planned.end_us,
+        "streams": list(planned.streams),
+        "motion": planned.motion,
+    }
+
+
+def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
+    """Decode a drive to analyse; raises `ContractError`."""
+    streams = content.get("streams")
+    if not isinstance(streams, list):
+        raise ContractError(f"streams must be a list of names, got {shown(streams)}")
+    return PlannedDrive(
+        _drive(content),
+        integer(content, "end_us"),
+        tuple(map(check_stream, streams)),
+        text(content, "motion"),
+    )
+
+
+def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
+    """The row's content as an object for JSON."""
+    return {
+        **vars(analysed),
+        "drive": vars(analysed.drive),
+        "estimates": {name: encode_estimate(one) for name, one in analysed.estimates.items()},
+    }
+
+
+def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
+    """Decode a row's content; raises `ContractError`."""
+    return AnalysedDrive(
+        drive=_drive(_object(content, "drive")),
+        end_us=integer(content, "end_us"),
+        job=text(content, "job"),
+        samples=integer(content, "samples"),
+        estimates={name: decode_estimate(one) for name, one in _object(content, "estimates").items()},
+        missing={name: str(reason) for name, reason in _object(content, "missing").items()},
+        repairs={name: integer(_object(content, "repairs"), name) for name in _object(content, "repairs")},
+    )
+
+
+def _drive(content: Mapping[str, Any]) -> DriveKey:
+    return DriveKey(check_robot(text(content, "robot")), integer(content, "start_us"), text(content, "run"))
+
+
+def _object(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    value = content.get(name)
+    if not isinstance(value, Mapping):
+        raise ContractError(f"{name} must be an object, got {shown(value)}")
+    return value
