@@ -111,7 +111,7 @@ class HourFile:
 
     def parts(self, wanted: Wanted, *, messages: bool, keys: Keys) -> list[Part]:
         """The samples of the batches with these keys, in the order of the batches."""
-        return list(self._file.pages(self._hour, wanted, messages=messages, keys=keys))
+        return list(self._file.pages(self._hour, wanted, keys=keys, messages=messages))
 
     def batches(self, wanted: Wanted, keys: Keys) -> list[Batches]:
         """The batches with these keys."""
