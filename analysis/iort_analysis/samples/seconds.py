@@ -145,7 +145,7 @@ def _seconds(batches: Batches, first: int, end: int, derive: Derive) -> Iterator
     for name, column in columns.items():
         made = _statistics(column, starts) if column.dtype.kind == "f" else _odd_statistics(column, starts)
         found |= {f"{name}_{statistic}": each for statistic, each in made.items()}
-    yield Block(seconds * _SECOND_US, counts | {name: found[name] for name in sorted(found)})
+    yield Block(seconds * _SECOND_US, counts | found)
 
 
 def absent_values(name: str, column: Column) -> NDArray[np.bool_]:

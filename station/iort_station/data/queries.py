@@ -22,12 +22,12 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
 from iort_station.data.batches import PageProgress
 from iort_station.data.conditions import derive, holds
-from iort_station.data.recorded import AUTO, Origin, Recorded, Source
+from iort_station.data.recorded import AUTO, TABLE, Origin, Recorded, Source
 from iort_station.data.selection import Selection, select
-from iort_station.data.summary import seconds
+from iort_station.data.summary import in_column_order, seconds
 from iort_station.data.units import unit
 from iort_station.errors import StationError
-from iort_station.times import Time, duration_us
+from iort_station.times import Time, duration_us, iso_s
 
 # Where samples are selected: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
@@ -109,6 +109,7 @@ def query(
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; query the summary without --on lambda")
+        _check_in_table(cloud, selection, source)
         found = query_function.samples(
             cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress
         )
@@ -140,6 +141,8 @@ def query(
             yield block
 
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
+    if summary and fields is None:
+        block = in_column_order(block)
     if not len(block.times_us):
         inventory.check_there(cloud, robot, stream)
     return Result(
@@ -204,6 +207,19 @@ def samples(
             yield chosen
     if some and not named <= there:
         raise inventory.unknown_fields(cloud, selection, there)
+
+
+def _check_in_table(cloud: Cloud, selection: Selection, source: Source) -> None:
+    """Raise `StationError` if the query function, which reads the table only, would leave something out."""
+    if source == TABLE:
+        return
+    recorded = Recorded(cloud, selection.robot, selection.stream, source=source)
+    hours = recorded.archived(with_samples_between(selection.start_us, selection.end_us))
+    if told := Origin(hours).within(selection.start_us, selection.end_us).told():
+        raise StationError(
+            f"the query function reads the table only, from which {told['hours']:,} hours of this range have "
+            f"expired, or soon will: leave out --on lambda, or start at {iso_s(told['to_us'])}"
+        )
 
 
 def has_fraction(block: Block) -> bool:

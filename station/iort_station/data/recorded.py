@@ -23,6 +23,7 @@ from iort_contract.archive import ArchivedHour, Hour, parse_hour
 from iort_contract.dynamodb import Keys, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
+from iort_contract.messages.page import Archived
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.archive import Archive, HourFile, is_expiring, key_of, within
@@ -44,6 +45,13 @@ class Origin:
     """Where a reading found its batches: the hours that it took from the archive."""
 
     hours: list[Hour] = field(default_factory=list)
+
+    def told(self) -> Archived | None:
+        """What came from the archive; None if nothing did."""
+        if not self.hours:
+            return None
+        first, last = min(self.hours), max(self.hours)
+        return {"from_us": first.start_us, "to_us": last.end_us, "hours": len(set(self.hours))}
 
     def within(self, start_us: int | None, end_us: int | None) -> Origin:
         """Only the hours that are partly in a range; the hour before it may have been looked into."""

@@ -148,6 +148,14 @@ def _second(item: Item) -> int:
     return int(item[SECOND]["N"])
 
 
+def in_column_order(block: Block) -> Block:
+    """The block with its counts first; the columns then do not depend on how many seconds are read at a
+    time."""
+    whole = [name for name in _COUNTS if name in block.columns]
+    rest = sorted(name for name in block.columns if name not in whole)
+    return Block(block.times_us, {name: block.columns[name] for name in (*whole, *rest)})
+
+
 def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
     if name in there:
         return [name]
@@ -157,10 +165,8 @@ def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
 def _block(items: Sequence[Item]) -> Block:
     rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
     names = dict.fromkeys(name for row in rows for name in row if name not in {TOPIC, SECOND, EXPIRES_S})
-    whole = [name for name in _COUNTS if name in names]
-    ordered = [*whole, *sorted(name for name in names if name not in whole)]
     times = objects([row[SECOND] for row in rows]).astype("int64") * 1_000_000
-    return Block(times, {name: column_of([row.get(name) for row in rows]) for name in ordered})
+    return Block(times, {name: column_of([row.get(name) for row in rows]) for name in names})
 
 
 def _value(value: Any) -> Any:

@@ -15,7 +15,7 @@ from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
 from iort_station.data.batches import PageProgress
-from iort_station.data.recorded import Recorded
+from iort_station.data.recorded import Origin, Recorded
 from iort_station.data.selection import Selection
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
@@ -38,19 +38,24 @@ class Export:
     """
 
     def __init__(
-        self, cloud: Cloud, selection: Selection, types: Mapping[str, MessageType], content: Content
+        self,
+        cloud: Cloud,
+        selection: Selection,
+        types: Mapping[str, MessageType],
+        content: Content,
+        origin: Origin | None = None,
     ) -> None:
         self.types = dict(types)
         self.others = self.empty = 0
         self.refused = RefusedItems()
-        self._cloud, self._selection, self._content = cloud, selection, content
+        self._recorded = Recorded(cloud, selection.robot, selection.stream, origin=origin)
+        self._selection, self._content = selection, content
         self._layouts = {name: kind.layout for name, kind in types.items()}
 
     def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
-        asked = self._selection
-        keys = with_samples_between(asked.start_us, asked.end_us)
-        for items in Recorded(self._cloud, asked.robot, asked.stream).items(keys, progress=progress):
+        keys = with_samples_between(self._selection.start_us, self._selection.end_us)
+        for items in self._recorded.items(keys, progress=progress):
             for item in items:
                 yield from self._of(plain(item))
 

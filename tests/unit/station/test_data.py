@@ -33,15 +33,14 @@ class FakeCloud:
     namespace = "iort"
 
     def __init__(self, client):
-        self.table = client
+        self.table, self.bucket = client, None
 
     def client(self, service):
-        assert service == "dynamodb"
-        return self.table
+        return {"dynamodb": self.table, "s3": self.bucket}[service]
 
     def output(self, _noun, name):
         tables = {"TelemetryTable": TELEMETRY, "SummaryTable": SUMMARY, "RobotsTable": ROBOTS}
-        return (tables | {"ArchiveTable": ARCHIVE})[name]
+        return (tables | {"ArchiveTable": ARCHIVE, "FilesBucket": "files"})[name]
 
 
 def cloud_of(*batches, page_items=2, robot="car", gain=None):
