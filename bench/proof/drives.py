@@ -47,7 +47,7 @@ def simulated(spec: DriveSpec, kept: Path | None = KEPT) -> Simulated:
     """Simulate a drive, or take it from the folder ``kept``."""
     if kept is None:
         return _simulate(spec)
-    path = kept / f"{_digest(spec)}.npz"
+    path = kept / f"{digest(spec)}.npz"
     if not path.exists():
         made = _simulate(spec)
         kept.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,8 @@ def _simulator() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()
 
 
-def _digest(spec: DriveSpec) -> str:
+def digest(spec: DriveSpec) -> str:
+    """A name for a drive as this simulator makes it."""
     return hashlib.sha256(f"{_simulator()} {spec!r}".encode()).hexdigest()[:32]
 
 

@@ -6,7 +6,8 @@ import re
 from datetime import datetime, timedelta, timezone
 from typing import Any, TypeAlias
 
-from iort_contract.messages.page import Archived, Extent
+from iort_contract.messages.insights import Extent
+from iort_contract.messages.page import Archived
 from iort_station.errors import UsageError
 
 Time: TypeAlias = int | str | datetime
