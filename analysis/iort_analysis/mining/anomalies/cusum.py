@@ -60,7 +60,7 @@ def _long_run(values: Array) -> float:
     # Two means were taken out at the place that fits best, and the window cuts off what lies beyond it: that
     # hides the more of the deviation, the longer the window is.
     hidden = n / (n - 2 * (lags + 1))
-    return hidden * math.sqrt(max(variance, float(values @ values) / n / 4))
+    return float(hidden * math.sqrt(max(variance, float(values @ values) / n / 4)))
 
 
 def _beyond(distance: float) -> float:

@@ -1,4 +1,4 @@
-"""Two speeds: the motor's beside that of the car's pose. Their ratio tells the wheels' size, and slip."""
+"""Slip: the motor's speed beside that of the car's pose, with torque and without."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.anomalies.readings import KRPM, MOVING_KRPM, Array, Readings
+from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
 from iort_analysis.mining.intervals import mean_of
 from iort_analysis.results import Mined
 from iort_contract.messages.findings import Estimate
 
-GAIN, SLIP = "erpm_per_mps", "slip_under_torque"
+SLIP = "slip_under_torque"
 # Distances over this time are compared: long enough for a pose with a centimetre's noise.
 _OVER_S = 0.25
 # Nearly no torque is below this share of the high currents, and much torque is above that one.
@@ -33,7 +33,7 @@ class _Ways(NamedTuple):
 
 
 def mine_slip(drive: Drive, samples: Readings) -> Mined:
-    """The wheels' turns for a metre without torque, and how many more with much torque."""
+    """How much further the wheels turn with much torque than without."""
     pose = None if drive.pose in {None, drive.vesc} else drive.streams[drive.pose or ""]
     if pose is None or len(pose.times_us) < _LEAST:
         return _missing("the drive has no second source of speed, such as a pose")
@@ -54,12 +54,7 @@ def mine_slip(drive: Drive, samples: Readings) -> Mined:
     turned_m = float(ways.turns[pulls].sum()) / gain
     slip = 1 - float(ways.moved_m[pulls].sum()) / turned_m
     half = math.hypot(_Z * noise_m * math.sqrt(float(pulls.sum())) / turned_m, (high - low) / 2 / gain)
-    return Mined(
-        estimates={
-            GAIN: Estimate(gain * KRPM, low * KRPM, high * KRPM, "erpm per m/s"),
-            SLIP: Estimate(slip, slip - half, slip + half, "1"),
-        }
-    )
+    return Mined(estimates={SLIP: Estimate(slip, slip - half, slip + half, "1")})
 
 
 def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
@@ -80,4 +75,4 @@ def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
 
 
 def _missing(reason: str) -> Mined:
-    return Mined(missing={GAIN: reason, SLIP: reason})
+    return Mined(missing={SLIP: reason})
