@@ -23,7 +23,7 @@ from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.streams import POSE_STREAM
-from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import TACHOMETER_COUNTS, VESC_STREAM
 
 KEPT = ROOT / "build" / "bench-analysis" / "drives"
 RATE_HZ, POSE_RATE_HZ = 50, 20
@@ -96,7 +96,10 @@ def _simulate(spec: DriveSpec) -> Simulated:
     seen = {
         # Weighted by the heat that it makes, as a fit over the drive does.
         "motor_resistance_now_ohm": resistance / heated,
+        "motor_a2_mean": heated / count,
         "distance_m": distance_m,
+        # With the tyres' creep, as distances give it.
+        "driven_erpm_per_mps": vehicle.counts_abs * 60 / TACHOMETER_COUNTS / distance_m,
         "slid_s": slid_s,
         "charge_left": battery.charge,
         "open_voltage_v": battery.open_v,
