@@ -166,6 +166,10 @@ def car_limits() -> None:
     _table(("limit", "unit", "meaning", "default", "from the calibration"), rows, right=False)
 
 
+def _code(name: str) -> str:
+    return f"`{name}`"
+
+
 def _kib(size: int) -> str:
     return f"{size / 1024:g}"
 
