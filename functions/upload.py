@@ -12,7 +12,7 @@ from functions.shared.bucket import Bucket, parts_sha256
 from functions.shared.dead_letter import DeadLetterQueue, refused_event
 from functions.shared.environment import variables
 from functions.shared.metrics import emit
-from functions.shared.upload_quota import UploadQuota
+from functions.shared.quota import DAY, Quota
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
@@ -25,7 +25,7 @@ from iort_contract.messages.files import (
     file_key,
     file_request_id,
 )
-from iort_contract.tables import TOPIC
+from iort_contract.tables import FILES_BYTES, FILES_DAY, TOPIC
 from iort_contract.topics import FILE, PONG, Topic, build_topic, parse_topic
 
 _log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ _log.setLevel(logging.INFO)
 _AGAIN_S = 3600
 
 
-def answer(robot: str, request: FileRequest, bucket: Bucket, quota: UploadQuota, now_s: float) -> FileAnswer:
+def answer(robot: str, request: FileRequest, bucket: Bucket, quota: Quota, now_s: float) -> FileAnswer:
     """The state of the file in the bucket, and the addresses for the rest. The robot comes from the topic,
     and the key from robot and file, so that no request can reach another file."""
     file, key = request.file, file_key(robot, request.file)
@@ -44,7 +44,7 @@ def answer(robot: str, request: FileRequest, bucket: Bucket, quota: UploadQuota,
     # A file in one piece counts for each address, a larger file when its upload begins.
     begins = upload_id is None and (file.parts > 1 or bool(request.parts))
     if begins and not quota.take(robot, file.size, now_s):
-        why = f"no more than {quota.bytes_a_day} bytes a day, and only of registered robots"
+        why = f"no more than {quota.most} bytes a day, and only of registered robots"
         return FileAnswer(request.id, refused=why, again_s=_AGAIN_S)
     if file.parts == 1:
         addresses = [bucket.address(key, file)] if request.parts else []
@@ -85,7 +85,7 @@ def serve(
     function_arn: str,
     *,
     bucket: Bucket,
-    quota: UploadQuota,
+    quota: Quota,
     reply: Callable[[Topic, FileAnswer], None],
     keep: Callable[[str], bool],
 ) -> None:
@@ -130,7 +130,13 @@ def handler(event: dict[str, Any], context: Any) -> None:
         event,
         context.invoked_function_arn,
         bucket=Bucket(clients.s3(), given.files_bucket),
-        quota=UploadQuota(clients.dynamodb(), table=given.robots_table, bytes_a_day=given.upload_bytes_a_day),
+        quota=Quota(
+            clients.dynamodb(),
+            table=given.robots_table,
+            named=(FILES_DAY, FILES_BYTES),
+            period=DAY,
+            most=given.upload_bytes_a_day,
+        ),
         reply=_reply,
         keep=lambda body: DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue).keep(body),
     )

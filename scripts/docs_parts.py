@@ -24,8 +24,10 @@ from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
+from iort_contract.messages.ask import REASONS
 from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
@@ -50,6 +52,8 @@ __all__ = [
     "metrics",
     "month",
     "page_contract",
+    "questions",
+    "reasons",
     "rules",
     "settings",
     "stream",
@@ -127,6 +131,31 @@ def stream(name: str) -> None:
 def settings() -> None:
     """The deployment's parameters."""
     _table(("key", "default", "meaning"), cloud_tables.settings_rows(), right=False)
+
+
+def questions() -> None:
+    """The questions that a robot may ask, from the catalogue."""
+    rows = [
+        (
+            f"`{q.name}`",
+            q.meaning,
+            str(q.per_hour),
+            str(q.timeout_s),
+            *map(_kib, (q.max_question_bytes, q.max_answer_bytes)),
+        )
+        for q in QUESTIONS.values()
+    ]
+    head = ("question", "answer", "a robot and hour", "s at most", "question, KiB", "answer, KiB")
+    _table(head, rows, right=False)
+
+
+def _kib(size: int) -> str:
+    return f"{size / 1024:g}"
+
+
+def reasons() -> None:
+    """Why a question has no answer."""
+    _table(("`refused`", "meaning"), [(f"`{name}`", text) for name, text in REASONS.items()], right=False)
 
 
 def rules() -> None:

@@ -90,9 +90,7 @@ class Analysis(PlatformStack):
             page_url=self.settings.page_url,
         )
         present = function(self, "Present", environment, timeout_s=_EVALUATE_S)
-        self._storage.findings.grant(
-            present, "dynamodb:Query", "dynamodb:PutItem", "dynamodb:DeleteItem"
-        )
+        self._storage.findings.grant(present, "dynamodb:Query", "dynamodb:PutItem", "dynamodb:DeleteItem")
         allow(present, ["s3:GetObject"], self._objects(PLANS_PREFIX))
         allow(present, ["sns:Publish"], self._alarms.topic_arn)
         return present

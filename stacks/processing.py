@@ -15,6 +15,7 @@ from aws_cdk import aws_sqs as sqs
 
 from iort_contract.catalog.environments import (
     AlertEnvironment,
+    AnswerEnvironment,
     Environment,
     LaterEnvironment,
     LiveEnvironment,
@@ -22,11 +23,13 @@ from iort_contract.catalog.environments import (
     SummarizeEnvironment,
     UploadEnvironment,
 )
+from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.rules import RULES, Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
+from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
-from iort_contract.tables import ALERT_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
-from iort_contract.topics import FILE, LAMBDA, PONG, SHADOW
+from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
+from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
 from stacks.parts.queue import queue
@@ -64,6 +67,7 @@ class Processing(PlatformStack):
         self._query()
         self.alarms = self._alarms()
         self.called = {**called, "live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        self.called["answer"] = self._answer()
         for rule in RULES.values():
             if isinstance(rule.action, Call) and rule.action.function not in self.called:
                 self.called[rule.action.function] = self._plain(rule.action.function)
@@ -226,7 +230,7 @@ class Processing(PlatformStack):
 
     def _echo(self) -> lambda_.Function:
         echo = self._plain("echo")
-        allow(echo, ["iot:Publish"], self._pongs(LAMBDA))
+        allow(echo, ["iot:Publish"], self._answers(PONG, LAMBDA))
         return echo
 
     def _upload(self) -> lambda_.Function:
@@ -249,10 +253,35 @@ class Processing(PlatformStack):
         allow(upload, signed, files.arn_for_objects(f"{FILES_PREFIX}*"))
         allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], files.bucket_arn)
         self._storage.may_keep(upload, FILES_DAY, FILES_BYTES)
-        allow(upload, ["iot:Publish"], self._pongs(FILE))
+        allow(upload, ["iot:Publish"], self._answers(PONG, FILE))
         return upload
 
-    def _pongs(self, path: str) -> str:
+    def _answer(self) -> lambda_.Function:
+        storage, questions = self._storage, QUESTIONS.values()
+        answer = function(
+            self,
+            "Answer",
+            AnswerEnvironment(
+                namespace=self.settings.namespace,
+                robots_table=storage.robots.table_name,
+                findings_table=storage.findings.table_name,
+                files_bucket=storage.files.bucket_name,
+                rejected_queue=self._rejected.queue_url,
+            ),
+            memory_mb=max(question.memory_mb for question in questions),
+            timeout_s=max(question.timeout_s for question in questions),
+        )
+        # A robot that waits asks again.
+        invoked_by_rule(answer, self._rejected)
+        storage.findings.grant(answer, "dynamodb:Query")
+        storage.may_keep(answer, f"{ASKED_PREFIX}*")
+        allow(answer, ["s3:GetObject"], storage.files.arn_for_objects(f"{FILES_PREFIX}*/{ASK_FOLDER}/*"))
+        results = storage.files.arn_for_objects(f"{RESULTS_PREFIX}{ASK_FOLDER}/*")
+        allow(answer, ["s3:GetObject", "s3:PutObject"], results)
+        allow(answer, ["iot:Publish"], self._answers(ANSWER, "*"))
+        return answer
+
+    def _answers(self, lane: str, name: str) -> str:
         """The topics of the answers to all robots."""
-        topic = f"{PONG}/{self.settings.namespace}/*/{path}"
+        topic = f"{lane}/{self.settings.namespace}/*/{name}"
         return str(self.format_arn(service="iot", resource="topic", resource_name=topic))

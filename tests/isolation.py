@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import (
+    ANSWER,
+    ASK,
     BROKER,
     CMD,
     FLEET,
@@ -74,6 +77,8 @@ ROWS = [
             build_topic(PING, A, BROKER),
             build_topic(PING, A, RULE),
             build_topic(PING, A, LAMBDA),
+            build_topic(ASK, A, CALIBRATION.name),
+            build_topic(ASK, A, "nobody"),
             f"{_shadow(A)}/get",
             f"{_shadow(A)}/update",
         ),
@@ -86,6 +91,8 @@ ROWS = [
             build_topic(PING, B, RULE),
             build_topic(CMD, B, "drive"),
             build_topic(PONG, B, RULE),
+            build_topic(ASK, B, CALIBRATION.name),
+            build_topic(ANSWER, B, CALIBRATION.name),
             f"{_shadow(B)}/update",
             f"{_shadow(B)}/get",
             f"{_shadow(B)}/delete",
@@ -94,6 +101,7 @@ ROWS = [
             # Messages of the operator and of the cloud.
             build_topic(CMD, A, "drive"),
             build_topic(PONG, A, RULE),
+            build_topic(ANSWER, A, CALIBRATION.name),
             f"$aws/events/presence/connected/{A}",
             f"$aws/events/presence/disconnected/{B}",
             # Topics without Basic Ingest, Basic Ingest to other rules, and Basic Ingest with another
@@ -101,6 +109,7 @@ ROWS = [
             build_topic(RECORD, A, "vesc"),
             *(f"$aws/rules/{rule_name(rule)}/{RECORD}/iort/{A}/vesc" for rule in RULES if rule != "record"),
             *(f"$aws/rules/{rule_name(rule)}/{LIVE}/iort/{A}/vesc" for rule in RULES if rule != "live"),
+            f"$aws/rules/{rule_name('ask')}/{ASK}/iort/{B}/{CALIBRATION.name}",
             f"$aws/rules/{rule_name('live')}/{LIVE}/iort",
             live_topic(A, "vesc", "lab2"),
             f"$aws/rules/{rule_name('live', 'lab2')}/{LIVE}/iort/{A}/vesc",
@@ -130,6 +139,7 @@ ROWS = [
             f"{CMD}/iort/{A}/+",
             f"{CMD}/iort/{A}/#",
             f"{PONG}/iort/{A}/+",
+            f"{ANSWER}/iort/{A}/+",
             build_topic(PING, A, BROKER),
             f"{PING}/iort/{A}/+",
             f"{FLEET}/iort/+/#",
@@ -147,6 +157,10 @@ ROWS = [
             f"{PING}/iort/+/{BROKER}",
             f"{PING}/iort/{B}/{BROKER}",
             f"{PING}/lab2/{A}/{BROKER}",
+            f"{ANSWER}/iort/{B}/{CALIBRATION.name}",
+            f"{ANSWER}/iort/+/{CALIBRATION.name}",
+            f"{ASK}/iort/{A}/+",
+            f"{ASK}/iort/{B}/{CALIBRATION.name}",
             f"{LIVE}/iort/{A}/vesc",
             live_topic(A, "vesc"),
             live_topic(B, "vesc"),
@@ -181,12 +195,14 @@ ROWS = [
         may=(
             build_topic(CMD, A, "drive"),
             build_topic(PONG, A, RULE),
+            build_topic(ANSWER, A, CALIBRATION.name),
             build_topic(FLEET, B, "pose"),
             f"{_shadow(A)}/update/accepted",
         ),
         may_not=(
             build_topic(CMD, B, "drive"),
             build_topic(PONG, B, RULE),
+            build_topic(ANSWER, B, CALIBRATION.name),
             build_topic(LIVE, B, "vesc"),
             build_topic(PING, B, BROKER),
             f"{_shadow(B)}/update/accepted",
@@ -252,7 +268,7 @@ TABLE_ACTIONS = (
 QUEUE_ACTIONS = ("SendMessage", "ReceiveMessage", "DeleteMessage", "PurgeQueue", "GetQueueAttributes")
 BUCKET_ACTIONS = ("ListBucket", "DeleteBucket")
 OBJECT_ACTIONS = ("GetObject", "PutObject", "DeleteObject")
-OBJECTS = ("robots/isolated-b/x", "results/x", "x")
+OBJECTS = ("robots/isolated-b/x", "robots/isolated-b/x/ask/x", "results/x", "results/ask/x", "x")
 PARAMETER_ACTIONS = ("GetParameter", "PutParameter", "DeleteParameter")
 FUNCTION_ACTIONS = ("InvokeFunction", "UpdateFunctionConfiguration")
 LOG_ACTIONS = ("CreateLogStream", "PutLogEvents", "GetLogEvents")
@@ -267,4 +283,7 @@ TOPICS = (
     build_topic(PONG, B, LAMBDA),
     build_topic(PONG, B, "file"),
     build_topic(PONG, B, LAMBDA, "lab2"),
+    build_topic(ANSWER, B, CALIBRATION.name),
+    build_topic(ANSWER, B, "nobody"),
+    build_topic(ANSWER, B, CALIBRATION.name, "lab2"),
 )

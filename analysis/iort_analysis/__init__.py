@@ -1,1 +1,1 @@
-"""The analysis of what robots recorded: pure functions over arrays, on the contract and numpy only."""
+"""The analysis of what robots recorded: pure functions over arrays. Only `archive` needs pyarrow."""

@@ -12,6 +12,8 @@ DEFAULT_RETENTION_DAYS = 90
 ROBOT = "robot"
 # Registry: the day (UTC) and the bytes of a robot's upload quota.
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
+# Registry: the hour (UTC) and the number of a robot's questions, two attributes for each with this prefix.
+ASKED_PREFIX = "asked_"
 # Registry: the time of the last mail, one attribute per cause with this prefix.
 ALERT_PREFIX = "alert_"
 # The fault's code follows, or "unknown".
@@ -33,6 +35,10 @@ MESSAGE_BASE64 = "message_base64"
 ABSENT = "absent"
 # In a second over DynamoDB's 400 KB: the number of attributes left out, the largest first.
 OMITTED = "omitted"
+
+# The findings table, by robot: findings by their ids, and after `PARAMETERS_OF` a drive's text the parameters
+# of that drive, as an object in JSON under `CONTENT`.
+FINDING, CONTENT, PARAMETERS_OF = "finding", "content", "parameters#"
 
 # The quarantine table: every refused message, by robot (`NO_ROBOT` if unknown) and an id made from its
 # content, so that a repeated message is one entry.
@@ -82,8 +88,3 @@ ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
 ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMITTED_CERTIFICATE, ADMITTED_MS)
 # The provisioning template's parameters.
 ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
-
-# The table of findings: by robot and a text that begins with the time of the drive. Beside the findings it
-# has a row of each analysed drive, for comparing with later ones, whose key begins with a prefix.
-FINDING, CONTENT = "finding", "content"
-PARAMETERS_PREFIX = "parameters#"

@@ -14,7 +14,9 @@ _RULE = re.compile(r"[a-z]{1,32}")
 _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 
 RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
-LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG)
+# A robot's questions to functions of the cloud, and their answers.
+ASK, ANSWER = "ask", "answer"
+LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG, ASK, ANSWER)
 BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
 # Another question on the lanes ping and pong: upload addresses of a file.
 FILE = "file"
@@ -28,7 +30,8 @@ COMMANDS, ACCEPTED = "commands", "accepted"
 class Topic(NamedTuple):
     """A parsed topic, ``<lane>/<namespace>/<robot>/<name>``.
 
-    ``name`` is the stream (record, live), the path (ping, pong) or the message's own name (fleet, cmd).
+    ``name`` is the stream (record, live), the path (ping, pong), the message's own name (fleet, cmd) or the
+    function (ask, answer).
     """
 
     lane: str

@@ -130,6 +130,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
     def wide(resource: str) -> str:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
 
+    files = f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03"
     a_robot = "the wildcard is the robot, which is known when the message arrives"
     to_a_queue = {
         "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
@@ -164,14 +165,20 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             "the alarm keeps its state"
         },
         "processing/UploadRole/DefaultPolicy": {
-            wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/robots/*"): (
+            wide(f"{files}/robots/*"): (
                 "the wildcard is the robot, and the function signs only for the robot that asked"
             ),
             wide(f"{iot}:topic/pong/{settings.namespace}/*/file"): a_robot,
             **to_a_queue,
         },
+        "processing/AnswerRole/DefaultPolicy": {
+            wide(f"{files}/robots/*/ask/*"): "the wildcard is the robot, and the function reads its own only",
+            wide(f"{files}/results/ask/*"): "the wildcard is the robot that asked, and its question's id",
+            wide(f"{iot}:topic/answer/{settings.namespace}/*/*"): f"{a_robot}, and its question",
+            **to_a_queue,
+        },
         "processing/QueryRole/DefaultPolicy": {
-            wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/results/*"): (
+            wide(f"{files}/results/*"): (
                 "the wildcard is the result, which the function gives a random name"
             ),
         },

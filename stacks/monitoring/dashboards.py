@@ -1,4 +1,4 @@
-"""The two dashboards: the platform, a row per service in the order of a message's path, and the robots.
+"""The dashboards: the platform, a row per service in the order of a message's path, the services, the robots.
 
 A dashboard of up to fifty metrics is free, three per account. A metric with an alarm that is normally zero is
 therefore not drawn again, and no widget uses SEARCH (decision 34).
@@ -12,7 +12,14 @@ from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
-from iort_contract.catalog.metrics import LIVE_CHART, METRICS, QUEUES_CHART, ROBOT_CHARTS, Chart
+from iort_contract.catalog.metrics import (
+    LIVE_CHART,
+    METRICS,
+    QUEUES_CHART,
+    ROBOT_CHARTS,
+    SERVICE_CHARTS,
+    Chart,
+)
 from iort_contract.catalog.rules import RULES
 from stacks.monitoring import metrics
 from stacks.monitoring.watched import Watched
@@ -23,7 +30,7 @@ _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "
 
 
 class Dashboards(Construct):
-    """``<namespace>-platform``, which starts with the state of every alarm, and ``<namespace>-robots``."""
+    """``<namespace>-platform``, which starts with the state of every alarm, ``-services`` and ``-robots``."""
 
     def __init__(
         self,
@@ -44,6 +51,9 @@ class Dashboards(Construct):
         platform.add_widgets(*_functions(watched))
         platform.add_widgets(_iterator_age(watched), self._queues(watched))
         platform.add_widgets(self._chart(LIVE_CHART))
+        services = self._dashboard("Services")
+        for row in SERVICE_CHARTS:
+            services.add_widgets(*map(self._chart, row))
         robots = self._dashboard("Robots")
         for row in ROBOT_CHARTS:
             robots.add_widgets(*map(self._chart, row))

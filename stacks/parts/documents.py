@@ -9,14 +9,15 @@ from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
-from iort_contract.topics import CMD, FLEET, LIVE, PING, RECORD, SHADOW, rule_name
+from iort_contract.topics import ANSWER, ASK, CMD, FLEET, LIVE, RECORD, SHADOW, rule_name
 
 # A robot's name is its thing name and its client id; the certificate is attached to the thing.
 _ME = "${iot:Connection.Thing.ThingName}"
-# A robot subscribes to its pongs, and to its own ping on the path broker. One pattern covers both, since the
-# policy has no room for two. In a policy ? is any one character ("Using wildcard characters in MQTT and AWS
-# IoT Core policies").
+# The policy has no room for each topic by itself, so patterns cover several. In a policy ? is any one
+# character, and * any number of them ("Using wildcard characters in MQTT and AWS IoT Core policies").
+# A robot subscribes to its pongs, and to its own ping on the path broker.
 _PING_OR_PONG = "p?ng"
+_LIVE_OR_PING = "?i??"
 
 
 def provisioning_template(namespace: str) -> dict[str, Any]:
@@ -71,7 +72,8 @@ def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
 def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
     """The IoT policy document of a robot: its own topics and shadow, and other robots' messages to the fleet.
 
-    AWS allows 2048 characters without white space; a test checks that with the longest names.
+    AWS allows 2048 characters without white space; a test checks that with the longest names. What a robot
+    receives it has subscribed to, so the lanes stand in the statement for subscriptions alone.
     """
     mine = f"{namespace}/{_ME}"
     shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
@@ -79,15 +81,16 @@ def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
         # Basic Ingest has the rule in the topic; only these rules are allowed.
         f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
         f"$aws/rules/{rule_name('live', namespace)}/{LIVE}/{mine}/*",
-        f"{LIVE}/{mine}/*",
+        f"{_LIVE_OR_PING}/{mine}/*",
         f"{FLEET}/{mine}/*",
-        f"{PING}/{mine}/*",
-        f"{shadow}/*",
+        f"{ASK}/{mine}/*",
     )
-    listen = (
+    fleet = f"{FLEET}/{namespace}/*"
+    subscribe = (
         f"{CMD}/{mine}/*",
         f"{_PING_OR_PONG}/{mine}/*",
-        f"{FLEET}/{namespace}/*",
+        f"{ANSWER}/{mine}/*",
+        fleet,
         f"{shadow}/*",
     )
     return {
@@ -98,13 +101,14 @@ def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
                 "Condition": {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}},
             },
             _allow("iot:Publish", _arns(stack, "topic", *publish)),
-            _allow("iot:Subscribe", _arns(stack, "topicfilter", *listen)),
-            _allow("iot:Receive", _arns(stack, "topic", *listen)),
+            _allow(["iot:Publish", "iot:Receive"], _arns(stack, "topic", f"{shadow}/*")),
+            _allow("iot:Subscribe", _arns(stack, "topicfilter", *subscribe)),
+            _allow("iot:Receive", _arns(stack, "topic", f"*/{mine}/*", fleet)),
         ],
     }
 
 
-def _allow(action: str, resources: list[str]) -> dict[str, Any]:
+def _allow(action: str | list[str], resources: list[str]) -> dict[str, Any]:
     return {"Effect": "Allow", "Action": action, "Resource": resources}
 
 

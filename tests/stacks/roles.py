@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import PRESENCE, STREAMS
 from iort_contract.topics import SHADOW
@@ -156,6 +157,18 @@ ROLES = {
         | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
     ),
+    "AnswerRole": (
+        "lambda.amazonaws.com",
+        {(action, "AnswerLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("dynamodb:Query", "Findings.Arn"), ("dynamodb:UpdateItem", "Robots.Arn")}
+        | {("iot:Publish", f"{IOT}:topic/answer/iort/*/*")}
+        | {("s3:GetObject", f"Files.Arn/{FILES_PREFIX}*/{ASK_FOLDER}/*")}
+        | {
+            (f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}{ASK_FOLDER}/*")
+            for action in ("GetObject", "PutObject")
+        },
+    ),
     "AdmitRole": (
         "lambda.amazonaws.com",
         {(action, "AdmitLog.Arn") for action in LOG}
@@ -184,6 +197,7 @@ ROLES = {
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/AskRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/FaultRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/BatteryRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
@@ -196,4 +210,5 @@ KEEPS = {
     "LaterRole": (STREAMS,),
     "SummarizeRole": (STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
+    "AnswerRole": ("asked_*",),
 }

@@ -76,7 +76,7 @@ def counted(app):
 
 def test_the_dashboards_are_free_and_the_cost_model_counts_their_metrics(synthesized):
     shown = counted(synthesized)
-    assert list(shown) == ["iort-platform", "iort-robots"]
+    assert list(shown) == ["iort-platform", "iort-services", "iort-robots"]
     assert tuple(one.metrics for one in shown.values()) == Usage().dashboards
     assert not any(one.searches for one in shown.values())
     assert all(one.metrics <= FREE_DASHBOARD_METRICS for one in shown.values())
@@ -85,7 +85,7 @@ def test_the_dashboards_are_free_and_the_cost_model_counts_their_metrics(synthes
 
 def test_the_last_dashboard_searches_the_metrics_of_every_robot(synthesized, production):
     searches = [one.searches for one in counted(production).values()]
-    assert searches == [0, ROBOT_SEARCHES]
+    assert searches == [0, 0, ROBOT_SEARCHES]
     assert [one.metrics for one in counted(production).values()] == list(Usage().dashboards)
     with_five = dashboard_metrics(Usage(robot_metrics=True, robots=5))
     assert with_five[-1] == Usage().dashboards[-1] + 5 * ROBOT_SEARCHES <= FREE_DASHBOARD_METRICS

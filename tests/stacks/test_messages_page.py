@@ -8,6 +8,8 @@ from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name
 from iort_contract.topics import (
+    ANSWER,
+    ASK,
     CMD,
     FILE,
     FLEET,
@@ -72,9 +74,9 @@ def test_a_robot_has_the_permissions_of_the_table():
         for what in does:
             assert allowed(document, topic, what), (topic, what)
         lane = plain(topic).split("/")[0]
-        if lane in (CMD, PONG):
+        if lane in (CMD, PONG, ANSWER):
             assert not allowed(document, topic, "publishes"), topic
-        if lane in (RECORD, LIVE):
+        if lane in (RECORD, LIVE, ASK):
             assert not allowed(document, topic, "hears"), topic
 
 
@@ -88,6 +90,8 @@ def test_the_table_has_every_topic_of_the_contract():
         *(build_topic(PING, ME, path) for path in (*PING_PATHS, FILE)),
         *(build_topic(PONG, ME, path) for path in (RULE, LAMBDA, FILE)),
         build_topic(CMD, ME, "drive"),
+        build_topic(ASK, ME, "drive"),
+        build_topic(ANSWER, ME, "drive"),
         build_topic(FLEET, ME, "drive"),
         f"{FLEET}/iort/+/drive",
     }

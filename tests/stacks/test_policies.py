@@ -8,8 +8,8 @@ import re
 
 from functions.alert import Notices, causes
 from functions.presence import change
-from functions.shared.upload_quota import UploadQuota
-from iort_contract.tables import ADMISSION
+from functions.shared.quota import DAY, Quota
+from iort_contract.tables import ADMISSION, FILES_BYTES, FILES_DAY
 from stacks.checks.invariants import EVERY_RESOURCE
 from stacks.parts.documents import provisioning_template
 from tests.stacks.roles import (
@@ -84,7 +84,7 @@ class Recorder:
 
 def test_each_function_changes_exactly_its_allowed_attributes():
     upload, alert, presence = Recorder(), Recorder(), Recorder()
-    UploadQuota(upload, table="robots", bytes_a_day=9).take("car", 1, 0)
+    Quota(upload, table="robots", named=(FILES_DAY, FILES_BYTES), period=DAY, most=9).take("car", 1, 0)
     notices = Notices(alert, "robots")
     for cause in causes({"fault_code": 1, "voltage_input": 1.0}, 10.5) + causes({"fault_code": 99}, 10.5):
         notices.take("car", cause.key, 0)
@@ -124,8 +124,11 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 # for its streams.
                 # Things and certificates have no names before they are provisioned; the hook reads
                 # whether a certificate was registered.
-                known = r":topic/pong/iort/\*/|:thing/\*/agent$|/(robots|results)/\*$|:AWSIotLogsV2:\*$"
-                named = re.sub(known, "", resource)
+                known = (
+                    r":topic/(pong|answer)/iort/\*/\*?|:thing/\*/agent$"
+                    r"|/(robots|results|ask)/\*$|:AWSIotLogsV2:\*$"
+                )
+                named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
                 of_the_hook = (role, action, named) == ("AdmitRole", "iot:DescribeCertificate", CERTIFICATES)
                 assert "*" not in named or of_provisioning or of_the_hook
@@ -153,6 +156,7 @@ def test_a_function_may_be_called_only_by_its_rule_or_template(synthesized, read
         ("Live.Arn", "Live.Arn"),
         ("Echo.Arn", "Echo.Arn"),
         ("Upload.Arn", "Upload.Arn"),
+        ("Ask.Arn", "Answer.Arn"),
         ("Presence.Arn", "Presence.Arn"),
         ("Version.Arn", "Presence.Arn"),
         ("Fault.Arn", "Alert.Arn"),

@@ -9,7 +9,7 @@ import pytest
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
-from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, ROBOT, SECOND, TOPIC
+from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import name
@@ -43,11 +43,12 @@ def test_the_rules_are_the_contracts(rules):
 def test_every_rule_has_exactly_its_one_action(rules, reader):
     actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
     assert all(len(each) == 1 for each in actions.values())
-    record, live, pong, echo, upload, presence, version, *alerts = (actions[rule][0] for rule in RULES)
+    record, live, pong, echo, upload, ask, presence, version, *alerts = (actions[rule][0] for rule in RULES)
     assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Batches"
     assert reader.text(live["Lambda"]["FunctionArn"]) == "Live.Arn"
     assert reader.text(echo["Lambda"]["FunctionArn"]) == "Echo.Arn"
     assert reader.text(upload["Lambda"]["FunctionArn"]) == "Upload.Arn"
+    assert reader.text(ask["Lambda"]["FunctionArn"]) == "Answer.Arn"
     assert [reader.text(alert["Lambda"]["FunctionArn"]) for alert in alerts] == 2 * ["Alert.Arn"]
     for kept in (presence, version):
         assert reader.text(kept["Lambda"]["FunctionArn"]) == "Presence.Arn"
@@ -99,12 +100,14 @@ def test_the_tables_keys_are_the_contracts(synthesized):
     assert keys("Summary") == [(TOPIC, "HASH", "S"), (SECOND, "RANGE", "N")]
     assert keys("Robots") == [(ROBOT, "HASH", "S")]
     assert keys("Quarantine") == [(ROBOT, "HASH", "S"), (ENTRY, "RANGE", "S")]
+    assert keys("Findings") == [(ROBOT, "HASH", "S"), (FINDING, "RANGE", "S")]
     expires = {"AttributeName": EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
         "Batches": expires,
         "Summary": expires,
         "Robots": None,
         "Quarantine": expires,
+        "Findings": None,
     }
     streams = {t: v.get("StreamSpecification") for t, v in tables.items()}
     assert {t: stream for t, stream in streams.items() if stream} == {
@@ -143,11 +146,13 @@ def test_live_messages_and_pings_are_not_retried(synthesized, reader):
         "Live": 0,
         "Echo": 0,
         "Upload": 0,
+        "Answer": 0,
         "Presence": 2,
         "Alert": 1,
     }
     ages_s = {reader.text(c["FunctionName"]): c["MaximumEventAgeInSeconds"] for c in configs}
-    assert ages_s == {"Live": 60, "Echo": 60, "Upload": 60, "Presence": 6 * 3600, "Alert": 300}
+    minutes = dict.fromkeys(("Live", "Echo", "Upload", "Answer"), 60)
+    assert ages_s == {**minutes, "Presence": 6 * 3600, "Alert": 300}
     for config in configs:
         assert reader.text(config["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
 

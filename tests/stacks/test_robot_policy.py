@@ -11,6 +11,8 @@ from aws_cdk import Stack
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import (
+    ANSWER,
+    ASK,
     BROKER,
     CMD,
     FILE,
@@ -32,7 +34,8 @@ from tests.stacks.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"
 SHADOW = f"$aws/things/{ME}/shadow/name/agent/*"
-LISTEN = (f"cmd/iort/{ME}/*", f"p?ng/iort/{ME}/*", "fleet/iort/*", SHADOW)
+SUBSCRIBE = (f"cmd/iort/{ME}/*", f"p?ng/iort/{ME}/*", f"answer/iort/{ME}/*", "fleet/iort/*", SHADOW)
+RECEIVE = (f"*/iort/{ME}/*", "fleet/iort/*")
 ROBOT_POLICY = [
     {
         "Effect": "Allow",
@@ -46,14 +49,14 @@ ROBOT_POLICY = [
         "Resource": [
             f"{IOT}:topic/$aws/rules/iort_record/dt/iort/{ME}/*",
             f"{IOT}:topic/$aws/rules/iort_live/live/iort/{ME}/*",
-            f"{IOT}:topic/live/iort/{ME}/*",
+            f"{IOT}:topic/?i??/iort/{ME}/*",
             f"{IOT}:topic/fleet/iort/{ME}/*",
-            f"{IOT}:topic/ping/iort/{ME}/*",
-            f"{IOT}:topic/{SHADOW}",
+            f"{IOT}:topic/ask/iort/{ME}/*",
         ],
     },
-    {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": [f"{IOT}:topicfilter/{t}" for t in LISTEN]},
-    {"Effect": "Allow", "Action": "iot:Receive", "Resource": [f"{IOT}:topic/{t}" for t in LISTEN]},
+    {"Effect": "Allow", "Action": ["iot:Publish", "iot:Receive"], "Resource": [f"{IOT}:topic/{SHADOW}"]},
+    {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": [f"{IOT}:topicfilter/{t}" for t in SUBSCRIBE]},
+    {"Effect": "Allow", "Action": "iot:Receive", "Resource": [f"{IOT}:topic/{t}" for t in RECEIVE]},
 ]
 
 # Provisioning with this fleet's template, and receiving the result.
@@ -117,20 +120,27 @@ def _joined(value, real):
 def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy):
     for statement in robot_policy:
         assert statement["Effect"] == "Allow"
-        assert statement["Action"] in {"iot:Connect", "iot:Publish", "iot:Subscribe", "iot:Receive"}
+        assert actions(statement) <= {"iot:Connect", "iot:Publish", "iot:Subscribe", "iot:Receive"}
         for resource in statement["Resource"]:
             if ME not in resource:
-                assert statement["Action"] in {"iot:Subscribe", "iot:Receive"}
+                assert actions(statement) <= {"iot:Subscribe", "iot:Receive"}
                 assert resource.endswith("/fleet/iort/*")
-            # A wildcard stands only below the thing's own level, and no other variable is trusted.
-            assert "*" not in resource.removesuffix("/*")
+            # A wildcard stands only below the thing's own level, or for the lane of what was subscribed to.
+            # No other variable is trusted.
+            if resource != f"{IOT}:topic/*/iort/{ME}/*" or "iot:Publish" in actions(statement):
+                assert "*" not in resource.removesuffix("/*")
             assert set(re.findall(r"\$\{iot:[^}]*\}", resource)) <= {ME}
+
+
+def actions(statement):
+    given = statement["Action"]
+    return {given} if isinstance(given, str) else set(given)
 
 
 def allows(policy, action, kind, topic, thing="car"):
     """IoT Core's rule: * and ? are wildcards in a policy, + and # are plain characters."""
     for statement in policy:
-        if statement["Action"] != f"iot:{action}":
+        if f"iot:{action}" not in actions(statement):
             continue
         for resource in statement["Resource"]:
             pattern = re.escape(resource.removeprefix(f"{IOT}:").replace(ME, thing))
@@ -146,6 +156,7 @@ def test_a_robot_may_publish_on_the_agents_topics_under_its_own_name_only(robot_
         build_topic(LIVE, "car", "vesc"),
         build_topic(FLEET, "car", "pose"),
         *(build_topic(PING, "car", path) for path in (*PING_PATHS, FILE)),
+        build_topic(ASK, "car", "calibration"),
     ]
     for topic in own:
         assert allows(robot_policy, "Publish", "topic", topic), topic
@@ -159,6 +170,7 @@ def test_a_robot_may_not_publish_on_the_topics_of_others(robot_policy):
     for topic in (
         build_topic(CMD, "car", "stop"),
         build_topic(PONG, "car", "rule"),
+        build_topic(ANSWER, "car", "calibration"),
         # The record lane costs messaging unless it is sent by Basic Ingest.
         build_topic(RECORD, "car", "vesc"),
         "$aws/things/car/shadow/update",
@@ -175,6 +187,7 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         "cmd/iort/car/#",
         "cmd/iort/car/+",
         "pong/iort/car/+",
+        "answer/iort/car/+",
         "fleet/iort/+/#",
         "fleet/iort/car2/pose",
     ):
@@ -187,6 +200,8 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         "cmd/iort/car2/#",
         "pong/iort/+/rule",
         "ping/iort/+/broker",
+        "answer/iort/+/calibration",
+        "ask/iort/car/#",
         "dt/iort/car/#",
         "live/iort/car/#",
         "$aws/#",
@@ -198,12 +213,14 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         build_topic(CMD, "car", "stop"),
         build_topic(FLEET, "car2", "pose"),
         build_topic(PONG, "car", "rule"),
+        build_topic(ANSWER, "car", "calibration"),
     ):
         assert allows(robot_policy, "Receive", "topic", topic), topic
     for topic in (
         build_topic(CMD, "car2", "stop"),
-        build_topic(LIVE, "car", "vesc"),
+        build_topic(LIVE, "car2", "vesc"),
         build_topic(PONG, "car2", "rule"),
+        build_topic(ANSWER, "car2", "calibration"),
     ):
         assert not allows(robot_policy, "Receive", "topic", topic), topic
 

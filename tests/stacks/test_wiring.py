@@ -52,6 +52,7 @@ HANDLERS = (
     "Quarantine",
     "Alert",
     "Later",
+    "Answer",
 )
 CONTRACT = sorted((ROOT / "contract" / "iort_contract").rglob("*"))
 ANALYSIS = sorted((ROOT / "analysis" / "iort_analysis").rglob("*"))
@@ -213,6 +214,7 @@ def test_the_variables_have_the_values_that_the_functions_expect(functions, read
     )
     files = environments.UploadEnvironment(name, "Files", "Robots", "Rejected", 50 * 10**9)
     query = environments.QueryEnvironment(name, "Batches", "Robots", "Files")
+    answer = environments.AnswerEnvironment(name, "Robots", "Findings", "Files", "Rejected")
     fields = {VESC_STREAM: list(VESC_FIELDS)}
     parameter = pubnub_parameter()
     assert given("Later", environments.LaterEnvironment) == later
@@ -221,6 +223,7 @@ def test_the_variables_have_the_values_that_the_functions_expect(functions, read
     )
     assert given("Upload", environments.UploadEnvironment) == files
     assert given("Query", environments.QueryEnvironment) == query
+    assert given("Answer", environments.AnswerEnvironment) == answer
     assert given("Live", environments.LiveEnvironment) == environments.LiveEnvironment(
         name, parameter, fields, "Rejected"
     )

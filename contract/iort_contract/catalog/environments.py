@@ -75,6 +75,16 @@ class UploadEnvironment(Environment):
 
 
 @dataclass(frozen=True)
+class AnswerEnvironment(Environment):
+    """The function that answers robots' questions; ``findings_table`` has the robots' parameters."""
+
+    robots_table: str
+    findings_table: str
+    files_bucket: str
+    rejected_queue: str
+
+
+@dataclass(frozen=True)
 class AlertEnvironment(Environment):
     """The function that mails."""
 

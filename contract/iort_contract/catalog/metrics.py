@@ -39,12 +39,17 @@ FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
 PRESENCE_CHART = Chart("Robots: who comes and goes")
 ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
 FILES_CHART = Chart("Robots: files")
+ASKS_CHART = Chart("Robots: questions, and the time of an answer, p95 ms")
+# What the robots ask of the cloud, and what it does by itself: the rows of the services' dashboard.
+SERVICE_CHARTS: tuple[tuple[Chart, ...], ...] = (
+    (PRESENCE_CHART, ADMISSION_CHART),
+    (FILES_CHART, ASKS_CHART),
+)
 # The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
 ROBOT_CHARTS: tuple[tuple[Chart, ...], ...] = (
     (REPORTS_CHART, BATCHES_CHART, GAPS_CHART, BACKLOG_CHART),
     (HOPS_CHART, ROUND_TRIPS_CHART),
     (BATTERY_CHART, TEMPERATURE_CHART, FAULTS_CHART),
-    (PRESENCE_CHART, ADMISSION_CHART, FILES_CHART),
 )
 
 
@@ -202,6 +207,10 @@ METRICS = {
         Metric("FilesStored", "upload", FILES_CHART),
         Metric("FilesRefused", "upload", FILES_CHART),
         Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
+        Metric("QuestionsAnswered", "answer", ASKS_CHART),
+        Metric("QuestionsRefused", "answer", ASKS_CHART),
+        # From the rule's receipt to the answer's publish.
+        _delay("AnswerMs", "answer", ASKS_CHART, right=True),
     )
 }
 

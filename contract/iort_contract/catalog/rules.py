@@ -20,6 +20,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import (
+    ASK,
     FILE,
     LAMBDA,
     LIVE,
@@ -134,6 +135,12 @@ RULES = {
             "answers requests for upload addresses",
             f"SELECT {_BYTES} FROM '{PING}/{{namespace}}/+/{FILE}'",
             Call("upload"),
+        ),
+        Rule(
+            "ask",
+            "answers the questions of robots",
+            f"SELECT {_BYTES} FROM '{ASK}/{{namespace}}/+/+'",
+            Call("answer"),
         ),
         Rule(
             "presence",

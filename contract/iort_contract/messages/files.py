@@ -222,6 +222,11 @@ def decode_file_answer(message: bytes | str) -> FileAnswer:
     return FileAnswer(given_id, key, stored, have, addresses)
 
 
+def check_sha256(value: object, what: str = "SHA-256") -> str:
+    """Return the value if it is a SHA-256 in hex."""
+    return checked(_SHA256, value, what, "64 of 0-9 a-f")
+
+
 def _check_file_request(request: FileRequest) -> None:
     checked(BOOT, request.id, "id", "8 to 32 of 0-9 a-f")
     file = _check_file(request.file)
@@ -229,9 +234,9 @@ def _check_file_request(request: FileRequest) -> None:
         raise ContractError(f"parts must be at most {MAX_ADDRESSES}, got {len(request.parts)}")
     for part, sha256 in request.parts.items():
         part_range(file, part)
-        checked(_SHA256, sha256, f"SHA-256 of part {part}", "64 of 0-9 a-f")
+        check_sha256(sha256, f"SHA-256 of part {part}")
     if request.parts_sha256 is not None:
-        checked(_SHA256, request.parts_sha256, "parts_sha256", "64 of 0-9 a-f")
+        check_sha256(request.parts_sha256, "parts_sha256")
 
 
 def _check_file(file: File) -> File:
@@ -239,7 +244,7 @@ def _check_file(file: File) -> File:
     if file.kind not in KINDS:
         raise ContractError(f"kind must be one of {', '.join(KINDS)}, got {shown(file.kind)}")
     checked(_CONTENT_TYPE, file.content_type, "content type", "type/subtype in lower case")
-    checked(_SHA256, file.sha256, "SHA-256", "64 of 0-9 a-f")
+    check_sha256(file.sha256)
     if type(file.size) is not int or not 0 <= file.size <= MAX_FILE_BYTES:
         raise ContractError(f"size must be 0 to {MAX_FILE_BYTES} bytes, got {shown(file.size)}")
     if check_time(file.t_us, "file time") < 0:

@@ -8,7 +8,7 @@ from functions import live
 from functions.shared.summary import stored
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
-from iort_contract.messages import commands, files
+from iort_contract.messages import ask, commands, files
 from iort_contract.ros1.message import MAX_LAYOUT
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
@@ -20,6 +20,7 @@ UNITS = {
     "MAX_COLUMNS_BYTES": (2**20, "MiB"),
     "MAX_SERIALIZED_BYTES": (2**20, "MiB"),
     "PART_BYTES": (2**20, "MiB"),
+    "MAX_INLINE_BYTES": (1024, "KiB"),
     "MAX_FILE_BYTES": (2**30, "GiB"),
     "MAX_BATCH_SPAN_US": (1_000_000, "s"),
     "MAX_AHEAD_US": (86_400_000_000, "days"),
@@ -28,12 +29,12 @@ UNITS = {
     "STALE_S": (1, "s"),
     "GONE_S": (1, "s"),
     **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
-    **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS"), (1, "ms")),
+    **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS", "MAX_ASK_MS"), (1, "ms")),
     "upload_gb_a_day": (1, "GB"),
 }
 
 # The modules that define limits.
-MODULES = (limits, commands, files)
+MODULES = (limits, commands, files, ask)
 
 
 def test_each_limit_has_its_value_on_the_page() -> None:

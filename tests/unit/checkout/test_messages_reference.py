@@ -15,6 +15,17 @@ from iort_agent.control.runtime_settings import RuntimeSettings, overlay
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
+from iort_contract.messages.ask import (
+    OVER_QUOTA,
+    Answer,
+    Ask,
+    Content,
+    Refusal,
+    decode_answer,
+    decode_ask,
+    encode_answer,
+    encode_ask,
+)
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.messages.commands import (
     Command,
@@ -87,6 +98,18 @@ PONG = pong(rule_event(PING, build_topic("ping", "car7", "lambda"), T_US // 1000
 REFUSED = FileAnswer(
     ASKED, refused="no more than 50000000000 bytes a day, and only of registered robots", again_s=3600
 )
+ASK_KEY = file_key("car7", File("ask/track.json", "other", "application/json", 250_000, HASH, T_US))
+ANSWER_URL = f"https://iort-files.s3.eu-west-1.amazonaws.com/results/ask/car7/{ASKED}.json?X-Amz-Signature=0"
+RESISTANCE = {"value": 0.05, "low": 0.04, "high": 0.06, "unit": "ohm"}
+ASKS = {
+    "ask": Ask(ASKED, T_US, 10_000, {}, -1_500),
+    "ask_file": Ask(ASKED, T_US, 10_000, Content(ASK_KEY, HASH, 250_000)),
+}
+ANSWERS = {
+    "answered": Answer(ASKED, {"parameters": {"battery_resistance_ohm": RESISTANCE}}),
+    "answered_file": Answer(ASKED, Content(ANSWER_URL, HASH, 250_000)),
+    "unanswered": Answer(ASKED, Refusal(OVER_QUOTA, "60 an hour, and only of registered robots")),
+}
 UPDATE = json.dumps(live_update("car7", "vesc", LIVE, T_US // 1000 + 30, T_US + 41_000)).encode()
 
 
@@ -117,6 +140,8 @@ WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
         as_object(decode_file_answer),
         REFUSED,
     ),
+    **{name: (encode_ask(ask), as_object(decode_ask), ask) for name, ask in ASKS.items()},
+    **{name: (encode_answer(answer), as_object(decode_answer), answer) for name, answer in ANSWERS.items()},
 }
 SAMPLES: dict[str, accounts.Account | MessageType] = {
     "account": accounts.StreamAccount("vesc", 1500, 1450, 0, 0, 0, 29, ended=False),
@@ -218,6 +243,10 @@ BOUNDS = [
     ("file", "file.t", 0, -1, "from 1970 on"),
     ("file", "parts", {}, {"2": HASH}, "from 1"),
     ("refused", "again_s", 86_400, 86_401, "0 to 86,400"),
+    ("ask", "valid_ms", 60_000, 60_001, "1 to 60,000"),
+    ("ask", "valid_ms", 1, 0, "1 to 60,000"),
+    ("ask", "id", "f" * 32, "F" * 32, "`boot`"),
+    ("ask_file", "file.size", 0, -1, "from 0"),
 ]
 
 

@@ -57,7 +57,7 @@ def test_a_message_cannot_overwrite_a_key_that_the_cloud_adds(rule):
     assert (RECEIVED_MS in names) == (rule not in ("presence", "version"))
     assert (TOPIC in names) == (rule not in ("pong", "presence", "version"))
     assert (EXPIRES_S in names) == (rule == "record")
-    assert (MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload"))
+    assert (MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload", "ask"))
     for name, part in zip(names, selected.split(", ")):
         if name in (
             RECEIVED_MS,
@@ -90,5 +90,6 @@ def test_a_statement_contains_the_deployments_parameters():
 
 
 def test_every_metrics_chart_is_drawn():
-    drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES_CHART, metrics.LIVE_CHART}
+    rows = (*ROBOT_CHARTS, *metrics.SERVICE_CHARTS)
+    drawn = {chart for row in rows for chart in row} | {metrics.QUEUES_CHART, metrics.LIVE_CHART}
     assert {metric.chart for metric in METRICS.values()} == drawn

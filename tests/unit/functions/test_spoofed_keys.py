@@ -24,7 +24,7 @@ from iort_contract.tables import (
     ROBOT,
     TOPIC,
 )
-from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
+from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
 from tests.iot_sql import Message, evaluate
 from verify.tools.spoofing import spoofed
 
@@ -50,6 +50,7 @@ SENT = {
     "pong": (PING, RULE, PING_MESSAGE),
     "echo": (PING, LAMBDA, PING_MESSAGE),
     "upload": (PING, FILE, PING_MESSAGE),
+    "ask": (ASK, "calibration", PING_MESSAGE),
 }
 WHOSE = {rule: build_topic(lane, "a", name) for rule, (lane, name, _) in SENT.items()}
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from functions import upload
 from functions.quarantine import entries
 from functions.shared.bucket import Bucket
-from functions.shared.upload_quota import UploadQuota
+from functions.shared.quota import DAY, Quota
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
 from iort_contract.messages.event import rule_event
@@ -37,7 +37,7 @@ from iort_contract.messages.files import (
     file_key,
     parse_file_key,
 )
-from iort_contract.tables import FILES_BYTES, ROBOT
+from iort_contract.tables import FILES_BYTES, FILES_DAY, ROBOT
 from iort_contract.topics import FILE, PING, PONG, build_topic
 
 NAME, ROBOTS = "files", "robots"
@@ -65,6 +65,10 @@ def asking(content: bytes, *parts: int, done: bool = False) -> FileRequest:
     hashes = {n: sha256(part) for n, part in parts_of(content).items()}
     whole = sha256(b"".join(bytes.fromhex(one) for one in hashes.values()))
     return FileRequest(ID, file_of(content), {n: hashes[n] for n in parts}, whole if done else None)
+
+
+def quota(dynamodb, bytes_a_day):
+    return Quota(dynamodb, table=ROBOTS, named=(FILES_DAY, FILES_BYTES), period=DAY, most=bytes_a_day)
 
 
 SMALL = asking(b"small", 1)
@@ -257,7 +261,7 @@ def ask(s3, dynamodb):
     """Send a request as `car`, or as another named robot."""
 
     def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
-        allotment = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
+        allotment = quota(dynamodb, bytes_a_day)
         return upload.answer(robot, request, Bucket(s3, NAME), allotment, now_s)
 
     return ask
@@ -366,7 +370,7 @@ class Desk:
 
     def __init__(self, s3, dynamodb):
         self.bucket = Bucket(s3, NAME)
-        self.quota = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=10**9)
+        self.quota = quota(dynamodb, 10**9)
         self.answered, self.kept, self.takes = [], [], True
 
     def __call__(self, event):

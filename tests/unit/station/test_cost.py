@@ -79,11 +79,13 @@ def test_an_idle_deployment_pays_for_polling_monitoring_and_storage():
     rest = deployment_dollars_per_month(_ONE)
     # Five long polls of 20 s at all times, for each of two queues.
     assert rest["polling the queues"] == pytest.approx(2 * 657_000 * 0.40e-6)
-    assert rest["alarms"] == pytest.approx(1.6), "ten of 26 are free"
-    assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.8), "and none of those"
-    assert rest["metrics"] == pytest.approx((36 - 10) * 0.30)
-    # Twenty hours, twice a minute, 45 metrics each.
-    assert rest["metrics requested by the live page"] == pytest.approx(20 * 120 * 45 * 0.00001)
+    assert rest["alarms"] == pytest.approx((_ONE.alarms - 10) * 0.10), "ten are free"
+    insights = rest["alarms by Metrics Insights, at most"]
+    assert insights == pytest.approx(_ONE.insights_metrics * 0.10), "and none of those"
+    assert rest["metrics"] == pytest.approx((len(METRICS) - 10) * 0.30)
+    # Twenty hours, twice a minute, the largest dashboard.
+    shown = max(_ONE.dashboards)
+    assert rest["metrics requested by the live page"] == pytest.approx(20 * 120 * shown * 0.00001)
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
     fleet = deployment_dollars_per_month(replace(_ONE, robots=1000, device_defender=True))
@@ -101,11 +103,11 @@ def test_three_dashboards_of_up_to_fifty_metrics_are_free(dashboards, billed):
 
 
 def test_metrics_of_every_robot_are_billed_per_robot():
-    for robots, billed in ((5, 0), (6, 1)):
+    for robots, billed in ((7, 0), (8, 1)):
         usage = replace(_ONE, robots=robots, robot_metrics=True)
         rest = deployment_dollars_per_month(usage)
-        assert rest["dashboards"] == billed * 3.0, "29 metrics and four a robot"
-        assert rest["metrics"] == pytest.approx((36 + 9 * robots - 10) * 0.30)
+        assert rest["dashboards"] == billed * 3.0, "20 metrics and four a robot"
+        assert rest["metrics"] == pytest.approx((len(METRICS) + 9 * robots - 10) * 0.30)
 
 
 def test_the_live_page_refreshes_as_often_as_the_model_assumes():
@@ -210,12 +212,12 @@ def test_the_quota_that_breaks_first_needs_the_fewest_robots():
 
 def test_the_documents_and_the_model_count_the_same_monitoring():
     text = (ROOT / "docs/reference/metrics.md").read_text()
-    platform, robots = _ONE.dashboards
+    platform, services, robots = _ONE.dashboards
     for line in (
         f"| {len(METRICS)} | $0.30 each | {FREE_METRICS} |",
         f"| {_ONE.alarms} | $0.10 each | {FREE_ALARMS} |",
         f"| 4, of up to {_ONE.insights_metrics} metrics | $0.10 for each",
-        f"| 2, of {platform} and {robots} metrics | $3 each | {FREE_DASHBOARDS}, of up to",
+        f"| 3, of {platform}, {services} and {robots} metrics | $3 each | {FREE_DASHBOARDS}, of up to",
         f"of up to {FREE_DASHBOARD_METRICS} metrics each |",
         f"| {platform} metrics every {PAGE_REFRESH_S} s | $0.01 for 1,000 metrics | none |",
     ):

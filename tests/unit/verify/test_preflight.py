@@ -276,7 +276,7 @@ CASES = [
         {},
         {"ListTopicRules": {"rules": [{"ruleName": f"other{n}"} for n in range(992)]}},
         STOPS,
-        "992 rules of others and 9 of ours exceed the limit 1000",
+        "992 rules of others and 10 of ours exceed the limit 1000",
     ),
     (
         "quotas",

@@ -1,0 +1,160 @@
+"""Reads the archive's files: samples as blocks, batches without their samples, and the stored items again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from iort_analysis.archive import columns as names
+from iort_analysis.archive.columns import MIXED, column_name, named, runs, to_numpy
+from iort_analysis.samples.batches import Part, Wanted
+from iort_analysis.samples.blocks import Block, column_of
+from iort_contract.archive import Hour
+from iort_contract.dynamodb import Item
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, SAMPLES
+
+# In the file's metadata: the first row group and the number of them by hour, and the fields' kinds.
+HOURS, KINDS = b"iort:hours", b"iort:kinds"
+_HEAD = (names.BATCH_ID, names.RECEIVED, names.NOT_FINITE, names.PREVIOUS_RUNS, names.HASH)
+
+
+class ArchiveFile:
+    """A file of the archive: an hour of a stream, or a day's hours.
+
+    ``source`` is the file's bytes, or a file that can seek; only what is asked for is read from it. ``hour``
+    chooses one in the methods that take it; None is all.
+    """
+
+    def __init__(self, source: bytes | BinaryIO) -> None:
+        self._file = pq.ParquetFile(pa.BufferReader(source) if isinstance(source, bytes) else source)
+        metadata = self._file.schema_arrow.metadata
+        self._hours: dict[str, list[int]] = json.loads(metadata[HOURS])
+        self.kinds: dict[str, str] = json.loads(metadata[KINDS])
+
+    @property
+    def hours(self) -> Sequence[str]:
+        """The hours in the file."""
+        return list(self._hours)
+
+    def groups(self, hour: Hour | None = None) -> range:
+        """The row groups of an hour."""
+        if hour is None:
+            return range(self._file.num_row_groups)
+        first, count = self._hours.get(str(hour), (0, 0))
+        return range(first, first + count)
+
+    def pages(
+        self,
+        hour: Hour | None = None,
+        wanted: Wanted = lambda _name: True,
+        *,
+        first_us: int | None = None,
+        last_us: int | None = None,
+        messages: bool = True,
+        but: frozenset[str] = frozenset(),
+    ) -> Iterator[Part]:
+        """The samples in the order of their batches, with the fields that are ``wanted``; `in_order` brings
+        them into the order of time.
+
+        Row groups without any sample between two times are left out, and the batches whose ids are in
+        ``but``; without ``messages`` those of ROS messages, too.
+        """
+        for group in self.groups(hour):
+            if self._overlaps(group, first_us, last_us):
+                yield self._block(group, wanted, messages=messages, but=but)
+
+    def headers(self, hour: Hour | None = None) -> Iterator[Item]:
+        """The batches as stored items without their samples: id, count of samples, and what else is small."""
+        for group in self.groups(hour):
+            table = self._read(group, _HEAD)
+            ids, rows = runs(table[names.BATCH_ID])
+            head = table.take(pa.array(rows[:-1]))
+            for i, n in enumerate(np.diff(rows).tolist()):
+                yield {BATCH: {"S": ids[i]}, SAMPLES: {"N": str(n)}, **head_of(head, i)}
+
+    def hashes(self, hour: Hour | None = None) -> Iterator[tuple[str, str]]:
+        """The ids of the batches, and the hashes of their items."""
+        for group in self.groups(hour):
+            table = self._read(group, (names.BATCH_ID, names.HASH))
+            ids, rows = runs(table[names.BATCH_ID])
+            yield from zip(ids, table[names.HASH].take(pa.array(rows[:-1])).to_pylist(), strict=True)
+
+    def table(self, group: int) -> Any:
+        """A row group as a table like a piece's."""
+        table = self._read(group, self._file.schema_arrow.names)
+        fields = {column_name(name): named(name) for name in self.kinds}
+        return table.rename_columns([fields.get(name, name) for name in table.column_names])
+
+    def _block(self, group: int, wanted: Wanted, *, messages: bool, but: frozenset[str]) -> Part:
+        chosen = {name: column_name(name) for name in self.kinds if wanted(name)}
+        own = (names.TIME, names.BATCH_ID, names.FIELDS, names.ABOUT, names.LAYOUT, names.OTHER)
+        table = self._read(group, (*own, *chosen.values()))
+        ids, rows = runs(table[names.BATCH_ID])
+        last_us = batch_id(ids[-1]).t_us
+        kept = [each not in but for each in ids]
+        if not messages:
+            heads = table.select([names.ABOUT, names.LAYOUT]).take(pa.array(rows[:-1])).to_pylist()
+            kept = [keep and set(head.values()) == {None} for keep, head in zip(kept, heads, strict=True)]
+        if not all(kept):
+            table = table.filter(pa.array(np.repeat(kept, np.diff(rows))))
+        times = table[names.TIME].cast(pa.int64()).to_numpy()
+        present = {
+            name for text in runs(table[names.FIELDS])[0] for name in text.replace("|", ",").split(",")
+        }
+        block = Block(times, {})
+        for name, column in chosen.items():
+            if name in present:
+                block.columns[name] = to_numpy(table[column], is_json=self.kinds[name] == MIXED)
+        self._add_others(block, table[names.OTHER], present, wanted)
+        return Part(block, last_us)
+
+    def _add_others(self, block: Block, others: Any, present: set[str], wanted: Wanted) -> None:
+        """Add the fields that have no column."""
+        missing = sorted(name for name in present - block.columns.keys() if name and wanted(name))
+        if missing:
+            rows = [json.loads(text or "{}") for text in others.to_pylist()]
+            block.columns.update({name: column_of([row.get(name) for row in rows]) for name in missing})
+
+    def _overlaps(self, group: int, first_us: int | None, last_us: int | None) -> bool:
+        if first_us is None and last_us is None:
+            return True
+        low, high = self._spans[group]
+        return (last_us is None or low <= last_us) and (first_us is None or high >= first_us)
+
+    @cached_property
+    def _spans(self) -> list[tuple[int, int]]:
+        """The first and the last time of each row group."""
+        spans = []
+        for group in range(self._file.num_row_groups):
+            statistics = self._file.metadata.row_group(group).column(0).statistics
+            spans.append(
+                tuple(
+                    pa.scalar(t, pa.timestamp("us", tz="UTC")).value for t in (statistics.min, statistics.max)
+                )
+            )
+        return spans
+
+    def _read(self, group: int, columns: Sequence[str]) -> Any:
+        table = self._file.read_row_group(group, columns=list(columns), use_threads=False)
+        # Parquet takes a name with dots for a path, and reads what else begins like it.
+        return table.select(list(columns)).combine_chunks().to_batches()[0]
+
+
+def head_of(table: Any, row: int) -> Item:
+    """What a stored item says beside its samples, from a row of a table."""
+    received, nonfinite, previous, digest = (table[name][row].as_py() for name in _HEAD[1:])
+    item: Item = {"_sha256": {"S": digest}}
+    if received is not None:
+        item[RECEIVED_MS] = {"N": str(received)}
+    if nonfinite is not None:
+        item[NONFINITE] = {"N": str(nonfinite)}
+    if previous is not None:
+        item[PREVIOUS] = {"S": previous}
+    return item

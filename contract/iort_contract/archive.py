@@ -1,0 +1,170 @@
+"""The archive of finished hours: the names of its objects in the files' bucket, and the rows of its manifest.
+
+An hour is one of UTC, and has the batches whose first sample lies in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from typing import Any, Iterable, Mapping, NamedTuple
+
+from iort_contract.checks import checked, integer, text
+from iort_contract.dynamodb import Item, Keys, TopicTable, plain
+from iort_contract.limits import ContractError
+from iort_contract.tables import BATCH, ENVELOPE, TOPIC
+from iort_contract.topics import Topic
+
+ARCHIVE_PREFIX = "archive/"
+# The manifest's sort key: the hour, such as 2026-11-22T07.
+HOUR = "hour"
+# The manifest's partition of the hours that are not archived yet. The sort key is the hour, `#` and the
+# topic; a row has the newest receipt of a batch.
+PENDING = "pending"
+NEWEST_MS = "newest_ms"
+HOUR_US = 3_600_000_000
+_HOUR = re.compile(r"\d{4}-\d\d-\d\dT\d\d")
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+# The part of a batch's envelope that its hash covers.
+_HASHED = tuple(name for name in ENVELOPE if name != BATCH)
+# In an item that comes back from the archive: the hash of the item that was stored.
+HASH = "_sha256"
+
+
+class Hour(NamedTuple):
+    """An hour of UTC, counted from the epoch."""
+
+    number: int
+
+    @property
+    def start_us(self) -> int:
+        """Its first microsecond."""
+        return self.number * HOUR_US
+
+    @property
+    def end_us(self) -> int:
+        """The first microsecond of the next hour."""
+        return (self.number + 1) * HOUR_US
+
+    @property
+    def date(self) -> str:
+        """Its day, such as 2026-11-22."""
+        return str(self)[:10]
+
+    def __str__(self) -> str:
+        return f"{_EPOCH + timedelta(hours=self.number):%Y-%m-%dT%H}"
+
+
+def hour_of(t_us: int) -> Hour:
+    """The hour of a time."""
+    return Hour(t_us // HOUR_US)
+
+
+def parse_hour(name: str) -> Hour:
+    """Parse an hour's text; raises `ContractError`."""
+    checked(_HOUR, name, HOUR, "an hour such as 2026-11-22T07")
+    try:
+        since = datetime.strptime(name + "+0000", "%Y-%m-%dT%H%z") - _EPOCH
+    except ValueError as error:
+        raise ContractError(f"{HOUR} must be an hour such as 2026-11-22T07, got {name}") from error
+    return Hour(since // timedelta(hours=1))
+
+
+def hour_key(topic: Topic, hour: Hour) -> str:
+    """The object of an hour."""
+    return f"{_day(topic, hour)}{str(hour)[-2:]}.parquet"
+
+
+def day_key(topic: Topic, hour: Hour) -> str:
+    """The object of an hour's day."""
+    return f"{_day(topic, hour)}day.parquet"
+
+
+def refused_key(topic: Topic, hour: Hour) -> str:
+    """The object of an hour's stored items that are not batches: DynamoDB's JSON, a line each."""
+    return f"{_day(topic, hour)}{str(hour)[-2:]}.refused.jsonl"
+
+
+def _day(topic: Topic, hour: Hour) -> str:
+    return f"{ARCHIVE_PREFIX}robot={topic.robot}/stream={topic.name}/date={hour.date}/"
+
+
+@dataclass(frozen=True)
+class ArchivedHour:
+    """A row of the manifest: what an hour's object holds.
+
+    The object ``key`` is the hour's or, once compacted, its day's; the file itself says which row groups are
+    the hour's. ``content`` is `content_hash`, ``sha256`` and ``size_bytes`` are the object's. In
+    ``first_expires_s`` the first of the hour's items leaves the telemetry table. An hour with refused items
+    only has an empty ``key``.
+    """
+
+    topic: str
+    hour: str
+    key: str
+    batches: int
+    samples: int
+    refused: int
+    content: str
+    sha256: str
+    size_bytes: int
+    archived_ms: int
+    first_expires_s: int
+
+    def item(self) -> Item:
+        """The row as DynamoDB's item."""
+        return {
+            name: {"S": value} if isinstance(value, str) else {"N": str(value)}
+            for name, value in vars(self).items()
+        }
+
+
+def archived_hour(item: Mapping[str, Any]) -> ArchivedHour:
+    """Decode a row of the manifest, as DynamoDB sends it; raises `ContractError`."""
+    row = plain(item)
+    kinds = ArchivedHour.__annotations__
+    values: Any = {name: (text if kinds[name] == "str" else integer)(row, name) for name in kinds}
+    return ArchivedHour(**values)
+
+
+class ArchiveTable(TopicTable):
+    """The archive's manifest, by topic and hour."""
+
+    def __init__(self, client: Any, name: str) -> None:
+        super().__init__(client, name, HOUR)
+
+
+def hours_between(first: Hour | None, last: Hour | None) -> Keys:
+    """The keys of hours between two, both inclusive; None is open."""
+    low, high = ("0" if first is None else str(first)), ("9~" if last is None else str(last))
+    return Keys({"S": low}, {"S": high}, low > high)
+
+
+def item_hash(item: Item) -> str:
+    """The hash of a stored item's content: 16 hex digits. A batch that was sent twice keeps its hash."""
+    if HASH in item:
+        return str(item[HASH]["S"])
+    content = json.dumps([item.get(name) for name in _HASHED], separators=(",", ":"), default=repr)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def content_hash(hashes: Iterable[tuple[str, str]]) -> str:
+    """The hash of an hour: over its batches' ids and their hashes, in the order of the ids."""
+    whole = hashlib.sha256()
+    for batch, each in hashes:
+        whole.update(f"{batch} {each}\n".encode("utf-8", "surrogatepass"))
+    return whole.hexdigest()
+
+
+def pending_key(topic: str, hour: Hour) -> Item:
+    """The key of the row that says that an hour is to be archived."""
+    return {TOPIC: {"S": PENDING}, HOUR: {"S": f"{hour}#{topic}"}}
+
+
+def parse_pending(item: Item) -> tuple[str, Hour]:
+    """The topic and the hour of such a row; raises `ContractError`."""
+    hour, _, topic = str(item[HOUR]["S"]).partition("#")
+    return topic, parse_hour(hour)

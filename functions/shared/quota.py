@@ -1,0 +1,61 @@
+"""A robot's quota: a count of a day or an hour in its row of the robots table."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from iort_contract.tables import ROBOT
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
+
+# Periods in UTC, as the row names them.
+DAY, HOUR = "%Y-%m-%d", "%Y-%m-%dT%H"
+
+
+class Quota:
+    """Counts up to ``most`` in each ``period``, which is `DAY` or `HOUR`.
+
+    ``named`` are the attributes of the robot's row: the period that is counted, and the count.
+    """
+
+    def __init__(
+        self, client: DynamoDBClient, *, table: str, named: tuple[str, str], period: str, most: int
+    ) -> None:
+        self._client, self._table, self._named, self._period = client, table, named, period
+        self.most = most
+
+    def take(self, robot: str, amount: int, now_s: float) -> bool:
+        """Count the amount and return True if it fits in this period's quota. An unregistered robot has
+        none."""
+        if amount > self.most:
+            return False
+        period, count = self._named
+        names = {"#period": period, "#count": count}
+        values = {
+            ":now": {"S": time.strftime(self._period, time.gmtime(now_s))},
+            ":amount": {"N": str(amount)},
+        }
+        return self._update(
+            robot,
+            UpdateExpression="ADD #count :amount",
+            ConditionExpression="#period = :now AND #count <= :left",
+            ExpressionAttributeNames=names,
+            ExpressionAttributeValues={**values, ":left": {"N": str(self.most - amount)}},
+        ) or self._update(
+            robot,
+            UpdateExpression="SET #period = :now, #count = :amount",
+            ConditionExpression=(
+                "attribute_exists(#robot) AND (attribute_not_exists(#period) OR #period <> :now)"
+            ),
+            ExpressionAttributeNames={**names, "#robot": ROBOT},
+            ExpressionAttributeValues=values,
+        )
+
+    def _update(self, robot: str, **update: Any) -> bool:
+        try:
+            self._client.update_item(TableName=self._table, Key={ROBOT: {"S": robot}}, **update)
+        except self._client.exceptions.ConditionalCheckFailedException:
+            return False
+        return True

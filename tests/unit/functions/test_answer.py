@@ -1,0 +1,332 @@
+"""Answer: what a robot asks is answered once, within its limits, and everything else is refused with why."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import boto3
+import pytest
+from botocore.config import Config
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from functions import answer
+from functions.quarantine import entries
+from functions.shared.bodies import Bodies
+from functions.shared.quota import HOUR, Quota
+from functions.shared.work import RefusedError, work_of
+from iort_contract.catalog.environments import AnswerEnvironment
+from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, Question
+from iort_contract.limits import ContractError
+from iort_contract.messages.ask import (
+    FAILED,
+    INVALID,
+    MALFORMED,
+    MAX_INLINE_BYTES,
+    NO_DATA,
+    OVER_QUOTA,
+    REASONS,
+    TOO_LARGE,
+    TOO_LATE,
+    UNKNOWN,
+    Answer,
+    Ask,
+    Content,
+    Refusal,
+    decode_answer,
+    encode_answer,
+    encode_ask,
+)
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.files import File, file_key
+from iort_contract.messages.findings import (
+    DriveKey,
+    Estimate,
+    Parameters,
+    encode_parameters,
+)
+from iort_contract.tables import CONTENT, FINDING, PARAMETERS_OF, ROBOT
+from iort_contract.topics import ANSWER, ASK, build_topic
+
+NOW_S = 1_700_000_000.0
+NOW_US, NOW_MS = int(NOW_S * 1e6), int(NOW_S * 1000)
+ARN = "arn:aws:lambda:eu-west-1:000000000000:function:answer"
+ID = "0123456789abcdef"
+ECHO = Question("echo", "the body", 2, max_question_bytes=2 * MAX_INLINE_BYTES, max_answer_bytes=10**6)
+BUCKET, ROBOTS, FINDINGS = "files", "robots", "findings"
+
+
+def ask(body=None, **changes):
+    return Ask(**{"id": ID, "sent_us": NOW_US, "valid_ms": 5_000, "body": body or {}, **changes})
+
+
+def event(asked, robot="car", name="echo"):
+    message = asked if isinstance(asked, bytes) else encode_ask(asked)
+    return rule_event(message, build_topic(ASK, robot, name), NOW_MS)
+
+
+@pytest.fixture
+def s3(aws):
+    client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
+    client.create_bucket(Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
+    return client
+
+
+@pytest.fixture
+def dynamodb(aws):
+    client = boto3.client("dynamodb")
+    for table, keys in {ROBOTS: (ROBOT,), FINDINGS: (ROBOT, FINDING)}.items():
+        client.create_table(
+            TableName=table,
+            KeySchema=[
+                {"AttributeName": key, "KeyType": kind}
+                for key, kind in zip(keys, ("HASH", "RANGE"), strict=False)
+            ],
+            AttributeDefinitions=[{"AttributeName": key, "AttributeType": "S"} for key in keys],
+            BillingMode="PAY_PER_REQUEST",
+        )
+    client.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
+    return client
+
+
+class Served:
+    """One environment of the function, with its answers and its dead letters."""
+
+    def __init__(self, s3, dynamodb):
+        self.dynamodb = dynamodb
+        self.said, self.kept, self.takes = [], [], True
+        self.work = lambda _robot, body: body
+        self.desk = answer.Desk(
+            lambda _: self._worked, self._quota, Bodies(s3, BUCKET), self._reply, self._keep
+        )
+
+    def __call__(self, asked, *, now_s=NOW_S, **event_of):
+        answer.serve(event(asked, **event_of), ARN, self.desk, now_s)
+        return self.said[-1][1].body if self.said else None
+
+    def _worked(self, robot, body):
+        return self.work(robot, body)
+
+    def _quota(self, question):
+        named = (question.hour_attribute, question.count_attribute)
+        return Quota(self.dynamodb, table=ROBOTS, named=named, period=HOUR, most=question.per_hour)
+
+    def _reply(self, topic, found):
+        self.said.append((topic.robot, decode_answer(encode_answer(found))))
+
+    def _keep(self, body):
+        if self.takes:
+            self.kept.append(body)
+        return self.takes
+
+
+@pytest.fixture
+def serve(s3, dynamodb, monkeypatch):
+    monkeypatch.setitem(QUESTIONS, ECHO.name, ECHO)
+    return Served(s3, dynamodb)
+
+
+def test_the_robot_of_the_topic_is_answered_and_counted(serve, capsys):
+    assert serve(ask({"a": [1.5, None]})) == {"a": [1.5, None]}
+    assert serve.said == [("car", Answer(ID, {"a": [1.5, None]}))]
+    assert json.loads(capsys.readouterr().out)["QuestionsAnswered"] == 1
+
+
+def test_an_unknown_question_is_refused(serve, capsys):
+    refused = serve(ask(), name="nobody")
+    assert (refused.reason, "calibration" in refused.text) == (UNKNOWN, True)
+    assert json.loads(capsys.readouterr().out)["QuestionsRefused"] == 1
+
+
+def test_the_quota_is_a_robots_own_and_new_each_hour(serve, dynamodb):
+    dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car2"}})
+    assert [serve(ask({"n": n})) for n in range(2)] == [{"n": 0}, {"n": 1}]
+    assert serve(ask()).reason == OVER_QUOTA
+    assert serve(ask({"n": 1}), robot="car2") == {"n": 1}
+    assert answer_at(serve, NOW_S + 3600) == {"n": 3}
+
+
+def answer_at(serve, now_s):
+    """The answer to a question that the rule received at this time."""
+    asked = encode_ask(ask({"n": 3}, sent_us=int(now_s * 1e6)))
+    received = rule_event(asked, build_topic(ASK, "car", "echo"), int(now_s * 1000))
+    answer.serve(received, ARN, serve.desk, now_s)
+    return serve.said[-1][1].body
+
+
+def test_an_unregistered_robot_is_not_answered(serve, dynamodb):
+    assert serve(ask(), robot="stranger").reason == OVER_QUOTA
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "stranger"}})
+
+
+@pytest.mark.parametrize(
+    ("asked", "late_s"),
+    [
+        # By the cloud's clock, whatever the robot's own says.
+        ({"sent_us": NOW_US - 90_000_000, "offset_us": 90_000_000, "valid_ms": 1000}, 1.0),
+        # Without an offset from the receipt, so a clock of 1970 is no reason.
+        ({"sent_us": 0, "valid_ms": 1000}, 1.0),
+    ],
+)
+def test_the_deadline_is_judged_by_the_clouds_clock(serve, asked, late_s):
+    assert serve(ask({"n": 1}, **asked), now_s=NOW_S + late_s - 0.01) == {"n": 1}
+    assert serve(ask({"n": 2}, **asked), now_s=NOW_S + late_s + 0.01).reason == TOO_LATE
+
+
+def test_a_late_question_costs_no_quota(serve):
+    for _ in range(5):
+        assert serve(ask(), now_s=NOW_S + 60).reason == TOO_LATE
+    assert serve(ask({"n": 1})) == {"n": 1}
+
+
+def text(size):
+    return "x" * size
+
+
+def uploaded(s3, content, name="ask/track.json", robot="car"):
+    """The file of a body, as the agent's upload leaves it."""
+    sha256 = hashlib.sha256(content).hexdigest()
+    key = file_key(robot, File(name, "other", "application/json", len(content), sha256, NOW_US))
+    s3.put_object(Bucket=BUCKET, Key=key, Body=content)
+    return Content(key, sha256, len(content))
+
+
+def test_a_large_body_is_a_file_both_ways(serve, s3):
+    body = {"text": text(MAX_INLINE_BYTES)}
+    found = serve(ask(uploaded(s3, json.dumps(body).encode())))
+    assert found.place.startswith(f"https://{BUCKET}.s3.eu-west-1.amazonaws.com/results/ask/car/{ID}.json?")
+    stored = s3.get_object(Bucket=BUCKET, Key=f"results/ask/car/{ID}.json")["Body"].read()
+    assert json.loads(stored) == body
+    assert (hashlib.sha256(stored).hexdigest(), len(stored)) == (found.sha256, found.size)
+
+
+def test_too_large_a_question_or_answer_is_refused(serve, s3):
+    assert serve(ask({"text": text(MAX_INLINE_BYTES)})).reason == TOO_LARGE
+    huge = uploaded(s3, json.dumps({"text": text(ECHO.max_question_bytes)}).encode())
+    assert serve(ask(huge)).reason == TOO_LARGE
+    serve.work = lambda *_: {"text": text(ECHO.max_answer_bytes)}
+    assert serve(ask()).reason == TOO_LARGE
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"robot": "car2"},
+        {"name": "notes.json"},
+        {"content": b"no JSON"},
+    ],
+)
+def test_a_file_that_is_not_the_robots_own_question_is_refused(serve, s3, wrong):
+    given = {"content": b"{}", **wrong}
+    assert serve(ask(uploaded(s3, **given))).reason == INVALID
+
+
+def test_a_file_with_other_content_than_told_is_refused(serve, s3):
+    told = uploaded(s3, b'{"a":1}')
+    for wrong in ({"sha256": "0" * 64}, {"size": 3}, {"place": told.place.replace("track", "none")}):
+        # Each attempt is a question of its own hour.
+        serve.dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
+        assert serve(ask(told._replace(**wrong))).reason == INVALID
+
+
+def test_a_refusal_of_the_answer_reaches_the_robot(serve):
+    def no_data(*_):
+        raise RefusedError(NO_DATA, "nothing yet")
+
+    serve.work = no_data
+    assert serve(ask()) == Refusal(NO_DATA, "nothing yet")
+
+
+def test_an_error_is_told_to_the_robot_and_fails_the_invocation(serve):
+    serve.work = lambda *_: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        serve(ask())
+    assert serve.said[-1][1].body == Refusal(FAILED, "ZeroDivisionError")
+
+
+asks = st.dictionaries(
+    st.sampled_from(["v", "id", "sent_us", "valid_ms", "offset_us", "body", "file"]),
+    st.none() | st.booleans() | st.integers() | st.text(max_size=9) | st.just({}) | st.just([]),
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(asks.map(lambda said: json.dumps(said).encode()) | st.binary(max_size=20))
+def test_every_malformed_question_is_kept_and_told_if_it_has_an_id(serve, message):
+    serve.said.clear()
+    serve.kept.clear()
+    serve(message)
+    (body,) = serve.kept
+    (entry,) = entries(body, list)
+    assert (entry.source, entry.robot, entry.payload) == ("function answer", "car", message)
+    assert all(found.body.reason == MALFORMED for _, found in serve.said)
+
+
+def test_a_malformed_question_fails_the_invocation_if_the_queue_does_not_take_it(serve):
+    serve.takes = False
+    with pytest.raises(ContractError):
+        serve(b"{}")
+
+
+# --- the questions that ship ------------------------------------------------------------------------
+
+
+class Context:
+    invoked_function_arn = ARN
+
+
+@pytest.fixture
+def deployed(aws, s3, dynamodb, monkeypatch):
+    given = AnswerEnvironment("iort", ROBOTS, FINDINGS, BUCKET, "queue")
+    for name, value in given.variables().items():
+        monkeypatch.setenv(name, value)
+    return dynamodb
+
+
+def parameters(dynamodb, start_us, **values):
+    drive = DriveKey("car", start_us, "00c0ffee")
+    estimates = {name: Estimate(value, value - 1, value + 1, "ohm") for name, value in values.items()}
+    item = {
+        ROBOT: {"S": "car"},
+        FINDING: {"S": f"{PARAMETERS_OF}{drive}"},
+        CONTENT: {"S": json.dumps(encode_parameters(Parameters(drive, estimates)))},
+    }
+    dynamodb.put_item(TableName=FINDINGS, Item=item)
+
+
+def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
+    parameters(deployed, 1_000_000, old=1.0, both=1.0)
+    parameters(deployed, 2_000_000, both=2.0)
+    broken = {ROBOT: {"S": "car"}, FINDING: {"S": f"{PARAMETERS_OF}9"}, CONTENT: {"S": "{}"}}
+    deployed.put_item(TableName=FINDINGS, Item=broken)
+    asked = {"robot": "car", "question": CALIBRATION.name, "body": {}}
+    found = answer.handler(asked, Context)["body"]["parameters"]
+    assert {name: (one["value"], one["drive"][:16]) for name, one in found.items()} == {
+        "old": (1.0, "0000000001000000"),
+        "both": (2.0, "0000000002000000"),
+    }
+    assert answer.handler({**asked, "robot": "car2"}, Context)["refused"] == NO_DATA
+    assert answer.handler({**asked, "question": "nobody"}, Context)["refused"] == UNKNOWN
+
+
+def test_the_handler_answers_a_robot(deployed):
+    from moto.backends import get_backend
+    from moto.core import DEFAULT_ACCOUNT_ID
+
+    asked = encode_ask(ask(valid_ms=60_000))
+    parameters(deployed, 1_000_000, resistance=1.0)
+    now_ms = 4_000_000_000_000
+    answer.handler(rule_event(asked, build_topic(ASK, "car", "calibration"), now_ms), Context)
+    ((topic, payload),) = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"].published_payloads
+    assert topic == build_topic(ANSWER, "car", "calibration")
+    assert decode_answer(payload).body["parameters"]["resistance"]["value"] == 1.0
+
+
+def test_every_question_of_the_catalogue_has_its_work():
+    for name, question in QUESTIONS.items():
+        # A name is a module's, and an attribute's of the robot's row.
+        assert name.isidentifier()
+        assert callable(work_of(question))
+        assert question.max_question_bytes <= 8 * 1024 * 1024
+    assert all(reason.isidentifier() for reason in REASONS)
