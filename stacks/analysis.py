@@ -7,9 +7,8 @@ compares them, and Present keeps and mails what was found: docs/explanation/anal
 from __future__ import annotations
 
 import json
-from typing import Any
 
-from aws_cdk import App, ArnFormat, CfnOutput, Duration
+from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_scheduler as scheduler
@@ -109,46 +108,41 @@ class Analysis(PlatformStack):
         self._storage.robots.grant(function_, "dynamodb:GetItem")
 
     def _objects(self, prefix: str) -> str:
-        return self._storage.files.arn_for_objects(f"{prefix}*")
+        return str(self._storage.files.arn_for_objects(f"{prefix}*"))
 
     def _machine(self, functions: dict[str, lambda_.Function]) -> stepfunctions.StateMachine:
-        role = iam.Role(self, "MachineRole", assumed_by=iam.ServicePrincipal("states.amazonaws.com"))
+        role = self._role("Machine", "states.amazonaws.com")
 
-        def may(actions: list[str], resources: list[str], **more: Any) -> None:
-            role.add_to_policy(iam.PolicyStatement(actions=actions, resources=resources, **more))
+        def may(actions: list[str], resources: list[str]) -> None:
+            role.add_to_policy(iam.PolicyStatement(actions=actions, resources=resources))
 
         may(["lambda:InvokeFunction"], [one.function_arn for one in functions.values()])
         # The map lists the plans of its run, and reads them.
-        plans = {"StringLike": {"s3:prefix": [f"{PLANS_PREFIX}*"]}}
-        may(["s3:ListBucket"], [self._storage.files.bucket_arn], conditions=plans)
+        may(["s3:ListBucket"], [self._storage.files.bucket_arn])
         may(["s3:GetObject"], [self._objects(PLANS_PREFIX)])
-        name = f"{self.settings.namespace}-analysis"
-        # The map's children are executions of the machine itself: "IAM policies for using Distributed Map
-        # states".
-        own = self.format_arn(
-            service="states",
-            resource="stateMachine",
-            resource_name=name,
-            arn_format=ArnFormat.COLON_RESOURCE_NAME,
-        )
-        may(["states:StartExecution"], [own])
         definition = states(
             self.partition,
             {name: one.function_arn for name, one in functions.items()},
             bucket=self._storage.files.bucket_name,
             at_once=(_EMBEDDED, _EMBEDDED) if self.settings.embedded else (_ROBOTS, _DRIVES),
         )
-        return stepfunctions.StateMachine(
+        machine = stepfunctions.StateMachine(
             self,
             "Machine",
-            state_machine_name=name,
             role=role,
-            definition_body=stepfunctions.DefinitionBody.from_string(self.to_json_string(definition)),
+            definition_body=stepfunctions.DefinitionBody.from_string(json.dumps(definition)),
             timeout=Duration.hours(12),
         )
+        # The map's children are executions of the machine itself, which is made after its role: "IAM policies
+        # for using Distributed Map states".
+        children = iam.Policy(self, "MapPolicy", roles=[role])
+        children.add_statements(
+            iam.PolicyStatement(actions=["states:StartExecution"], resources=[machine.state_machine_arn])
+        )
+        return machine
 
     def _nightly(self) -> None:
-        role = iam.Role(self, "NightlyRole", assumed_by=iam.ServicePrincipal("scheduler.amazonaws.com"))
+        role = self._role("Nightly", "scheduler.amazonaws.com")
         self.machine.grant_start_execution(role)
         scheduler.CfnSchedule(
             self,
@@ -161,3 +155,8 @@ class Analysis(PlatformStack):
                 input=json.dumps({"robots": [], "last_s": _NIGHTLY_S}),
             ),
         )
+
+    def _role(self, name: str, service: str) -> iam.Role:
+        # The service acts for every account; only for ours may it take our role.
+        conditions = {"StringEquals": {"aws:SourceAccount": self.account}}
+        return iam.Role(self, f"{name}Role", assumed_by=iam.ServicePrincipal(service, conditions=conditions))

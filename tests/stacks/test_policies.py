@@ -105,7 +105,7 @@ def test_every_role_can_be_assumed_by_one_service_of_this_account(synthesized, r
         service, _ = ROLES[role]
         assert (statement["Effect"], statement["Action"]) == ("Allow", "sts:AssumeRole")
         assert statement["Principal"] == {"Service": service}
-        if service == "iot.amazonaws.com":
+        if service != "lambda.amazonaws.com":
             # The service acts for every account; only for ours may it take our role.
             condition = statement["Condition"]
             assert condition == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
