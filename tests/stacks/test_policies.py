@@ -126,7 +126,7 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 # whether a certificate was registered.
                 known = (
                     r":topic/(pong|answer)/iort/\*/\*?|:thing/\*/agent$"
-                    r"|/(robots|results|ask)/\*$|:AWSIotLogsV2:\*$"
+                    r"|/(robots|results|ask|plans|analysis)/\*$|/analysis/robot=\*$|:AWSIotLogsV2:\*$"
                 )
                 named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
