@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-analysis bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -14,9 +14,9 @@ help: ## show this
 setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py
 
-demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag REPORT=report.json PORT=8080
+demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong REPORT=report.json PORT=8080
 	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
-		$(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT))
+		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT))
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder
@@ -60,6 +60,9 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
 	@$(BIN)/python -m bench.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
 
+bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 OUT=docs/bench
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysis $(if $(QUICK),--quick) $(if $(OUT),--out $(OUT))
+
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
 
@@ -81,7 +84,7 @@ docs-serve: ## serve the documentation site on this machine, and follow what you
 	@$(PYTHON) scripts/setup.py --docs
 	@$(MKDOCS) serve --dev-addr localhost:$(or $(PORT),8000)
 
-layer: ## build Lambda 1's layer for AWS
+layer: ## build the functions' layers for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda
 
 # Its warning is about mkdocs 2, which requirements/docs.txt excludes.
@@ -109,6 +112,8 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		requirements/dev.in -o requirements/dev.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		-c requirements/dev.txt requirements/layer.in -o requirements/layer.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		-c requirements/dev.txt requirements/analysis-layer.in -o requirements/analysis-layer.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		-c requirements/dev.txt requirements/build.in -o requirements/build.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \

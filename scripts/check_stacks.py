@@ -77,13 +77,15 @@ def main() -> None:
         (layer / "python").mkdir(parents=True)
         for stage, given in STAGES.items():
             with timed(f"stage {stage} synthesized, cdk-nag"):
-                known[stage] = synthesize(Settings(layer=layer, **given), Path(folder) / stage)
+                known[stage] = synthesize(
+                    Settings(layer=layer, analysis_layer=layer, **given), Path(folder) / stage
+                )
                 found += nag(Path(folder) / stage)
         # cdk-nag's and checkov's findings depend only on the parameters of the stages.
         with timed(f"{len(VARIATIONS)} variations synthesized"):
             for name, given in VARIATIONS.items():
                 app = App(outdir=str(Path(others) / name))
-                build(app, Settings(layer=layer, **given))
+                build(app, Settings(layer=layer, analysis_layer=layer, **given))
                 app.synth()
         found += own(Path(folder), Path(others))
         with timed("cfn-lint"):

@@ -1,6 +1,9 @@
-"""Builds Lambda 1's layer into build/layer/<for>: the packages of requirements/layer.txt, and their bytecode.
+"""Builds a layer into build/layer/<name>: the packages of its requirements, and their bytecode.
 
-    python -m scripts.layer {local,lambda}
+    python -m scripts.layer {local,lambda,analysis}
+
+`lambda` is Lambda 1's for AWS, `local` the same for this machine; `analysis` has numpy and pyarrow for AWS.
+On the embedded cloud functions see this machine's packages, and need no such layer.
 
 The packages depend only on the target's Python and platform, not on this machine. Bytecode fits only one
 version of Python, so that version is needed here; without it Lambda compiles at every cold start.
@@ -13,6 +16,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,18 +44,43 @@ LOCAL = Target(f"{sys.version_info[0]}.{sys.version_info[1]}")
 LAMBDA = Target(PYTHON, PLATFORM)
 
 
+@dataclass(frozen=True)
+class Layer:
+    """A layer: its target, its locked packages, and the patterns of their files that nothing of ours uses."""
+
+    target: Target
+    requirements: str
+    unused: tuple[str, ...] = ()
+
+
+# Together with the code a function may have 250 MB ("Lambda quotas"), and numpy and pyarrow have more. These
+# are tests, what C compilers need, and Arrow's network clients. Arrow's other libraries need each other.
+_UNUSED = (
+    *("**/tests", "**/*.pyi", "**/*.pxd", "**/*.pyx", "**/*.pxi", "**/*.h", "**/*.hpp", "**/*.lib", "**/*.a"),
+    *("pyarrow/include", "pyarrow/src", "numpy/_core/include", "numpy/f2py", "numpy/random/lib"),
+    *("pyarrow/*flight*", "pyarrow/libarrow_s3*", "pyarrow/_s3fs*", "pyarrow/_gcsfs*", "pyarrow/_azurefs*"),
+    # The same libraries by names that only a linker asks for.
+    *("pyarrow/libarrow*.so", "pyarrow/libarrow*.so.*.*.*"),
+)
+LAYERS = {
+    "local": Layer(LOCAL, "layer.txt"),
+    "lambda": Layer(LAMBDA, "layer.txt"),
+    "analysis": Layer(LAMBDA, "analysis-layer.txt", _UNUSED),
+}
+
+
 def main() -> None:
     """Build one layer."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("name", choices=["local", "lambda"], help="for this machine, or for AWS")
+    parser.add_argument("name", choices=LAYERS, help="which layer: for this machine, or for AWS")
     name = parser.parse_args().name
-    target, compiler = (LOCAL, sys.executable) if name == "local" else (LAMBDA, interpreter(PYTHON))
+    layer = LAYERS[name]
+    compiler = sys.executable if layer.target == LOCAL else interpreter(layer.target.python)
     if compiler is None:
         print(f"setup: no bytecode: Python {PYTHON} is missing here, and uv could not fetch it.")
-        print(
-            "setup: Cold starts take longer. Install it, remove build/setup/layer-lambda, and run this again."
-        )
-    build(ROOT / "build" / "layer" / name, ROOT / "requirements" / "layer.txt", target, compiler)
+        print("setup: Cold starts take longer. Install it, and run this again after")
+        print(f"setup: rm build/setup/layer-{name}")
+    build(ROOT / "build" / "layer" / name, layer, compiler)
 
 
 def interpreter(version: str) -> str | None:
@@ -62,24 +91,42 @@ def interpreter(version: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def build(folder: Path, requirements: Path, target: Target, compiler: str | None) -> None:
+def build(folder: Path, layer: Layer, compiler: str | None) -> None:
     """Build the layer from scratch; raises `subprocess.CalledProcessError`."""
     shutil.rmtree(folder, ignore_errors=True)
-    packages = folder / "python"
+    packages, target = folder / "python", layer.target
     platform = ["--python-platform", target.platform] if target.platform else []
     subprocess.run(
         [
             *(UV, "pip", "install", "--quiet", *LOCKED),
             *("--python", sys.executable, "--python-version", target.python, *platform),
-            *("--target", packages, "--link-mode", "copy", "--requirements", requirements),
+            *(
+                "--target",
+                packages,
+                "--link-mode",
+                "copy",
+                "--requirements",
+                ROOT / "requirements" / layer.requirements,
+            ),
         ],
         check=True,
     )
     # Scripts start with this machine's Python path, and Lambda never calls them.
     shutil.rmtree(packages / "bin", ignore_errors=True)
     (packages / ".lock").unlink(missing_ok=True)
+    trim(packages, layer.unused)
     if compiler is not None:
         compile_all(packages, compiler)
+
+
+def trim(packages: Path, unused: Sequence[str]) -> None:
+    """Remove the files and folders that these patterns name."""
+    for path in sorted({path for pattern in unused for path in packages.glob(pattern)}):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            # It may have been in a folder that went before.
+            path.unlink(missing_ok=True)
 
 
 def compile_all(folder: Path, compiler: str) -> None:

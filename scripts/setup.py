@@ -65,7 +65,7 @@ class Step(NamedTuple):
 def main() -> None:
     """Run the steps that are due."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
+    parser.add_argument("--layer", choices=["lambda"], help="also build the layers that `cdk deploy` needs")
     parser.add_argument("--checkov", action="store_true", help="also install what `make check` needs")
     parser.add_argument("--docs", action="store_true", help="also install what `make docs` needs")
     parser.add_argument("--oldest", metavar="PYTHON", help="also install the robot's tests for Python 3.8")
@@ -104,6 +104,9 @@ def steps(*, layer: bool, checkov: bool, docs: bool, oldest: str | None) -> Iter
     if layer:
         aws = (".venv/bin/python -m scripts.layer lambda",)
         yield Step("layer-lambda", "Lambda layer, AWS", made_of, aws)
+        arrays = ("requirements/analysis-layer.txt", *made_of[1:])
+        aws = (".venv/bin/python -m scripts.layer analysis",)
+        yield Step("layer-analysis", "Lambda layer of numpy and pyarrow, AWS", arrays, aws)
     if checkov:
         apart = (
             f".venv/bin/uv venv --clear --python {base} build/checkov",

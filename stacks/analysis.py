@@ -19,6 +19,7 @@ from iort_contract.catalog.environments import EvaluateEnvironment, PlanEnvironm
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import allow, function
+from stacks.parts.layers import arrays
 from stacks.parts.states import states
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -40,6 +41,7 @@ class Analysis(PlatformStack):
     def __init__(self, app: App, settings: Settings, *, storage: Storage, alarms: sns.ITopic) -> None:
         super().__init__(app, "analysis", settings, storage.encryption)
         self._storage, self._alarms = storage, alarms
+        self._layers = arrays(self)
         functions = {
             "Plan": self._plan(),
             "Analyse": self._analyse(),
@@ -52,7 +54,9 @@ class Analysis(PlatformStack):
             self._nightly()
 
     def _plan(self) -> lambda_.Function:
-        plan = function(self, "Plan", self._reading(), memory_mb=_CORE_MB, timeout_s=_PLAN_S)
+        plan = function(
+            self, "Plan", self._reading(), memory_mb=_CORE_MB, timeout_s=_PLAN_S, layers=self._layers
+        )
         self._may_read(plan)
         self._storage.robots.grant(plan, "dynamodb:Scan")
         self._storage.findings.grant(plan, "dynamodb:Query")
@@ -60,7 +64,9 @@ class Analysis(PlatformStack):
         return plan
 
     def _analyse(self) -> lambda_.Function:
-        analyse = function(self, "Analyse", self._reading(), memory_mb=_CORE_MB, timeout_s=_ANALYSE_S)
+        analyse = function(
+            self, "Analyse", self._reading(), memory_mb=_CORE_MB, timeout_s=_ANALYSE_S, layers=self._layers
+        )
         self._may_read(analyse)
         self._storage.findings.grant(analyse, "dynamodb:PutItem")
         allow(analyse, ["s3:PutObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
@@ -73,7 +79,9 @@ class Analysis(PlatformStack):
             findings_table=self._storage.findings.table_name,
             files_bucket=self._storage.files.bucket_name,
         )
-        evaluate = function(self, "Evaluate", environment, memory_mb=_CORE_MB, timeout_s=_EVALUATE_S)
+        evaluate = function(
+            self, "Evaluate", environment, memory_mb=_CORE_MB, timeout_s=_EVALUATE_S, layers=self._layers
+        )
         self._storage.robots.grant(evaluate, "dynamodb:Scan")
         self._storage.findings.grant(evaluate, "dynamodb:Query")
         allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))

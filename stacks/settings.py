@@ -203,6 +203,11 @@ class Settings(BaseModel):
     layer: Annotated[Path, BeforeValidator(lambda folder: ROOT / folder)] = Field(
         default=ROOT / "build" / "layer" / "lambda", description="the folder of Lambda 1's third-party code"
     )
+    analysis_layer: Annotated[Path, BeforeValidator(lambda folder: ROOT / folder)] = Field(
+        default=ROOT / "build" / "layer" / "analysis",
+        description="the folder of numpy and pyarrow, for the functions that archive and analyse. The "
+        "embedded cloud's functions use this machine's",
+    )
     live_fields: dict[str, list[str]] = {VESC_STREAM: list(VESC_FIELDS)}
 
     @property
@@ -256,8 +261,9 @@ class Settings(BaseModel):
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
             )
-        if not settings.layer.is_dir():
-            raise SettingsError(f"layer {settings.layer} is missing: run `make layer`")
+        needed = [settings.layer] if settings.embedded else [settings.layer, settings.analysis_layer]
+        if missing := [folder for folder in needed if not folder.is_dir()]:
+            raise SettingsError(f"layer {missing[0]} is missing: run `make layer`")
         return settings
 
 

@@ -65,14 +65,22 @@ class DriveSpec:
 
 
 def drive_of(
-    car: int, number: int, faults: Sequence[FaultConfig] = (), *, seconds: float = DRIVE_S
+    car: int,
+    number: int,
+    faults: Sequence[FaultConfig] = (),
+    *,
+    day: int | None = None,
+    seconds: float = DRIVE_S,
 ) -> DriveSpec:
-    """A drive of a car of the fleet: the same for the same numbers. Cars with even numbers have the fields of
-    the ROS 1 driver, the others all that a VESC sends on its serial line."""
+    """A drive of a car of the fleet: the same for the same numbers, on the day of its number or on ``day``.
+
+    Cars with even numbers have the fields of the ROS 1 driver, the others all that a VESC sends on its serial
+    line.
+    """
     chance = _chance("drive", car, number)
     vehicle = _varied(_varied(VehicleConfig(), _CARS, _chance("car", car)), _DRIVES, chance)
     vehicle = replace(vehicle, charge=chance.uniform(*_CHARGES), ambient_degc=chance.uniform(*_AMBIENT_DEGC))
-    start_us = _FIRST_US + number * _DAY_US + chance.randrange(3_600_000_000)
+    start_us = _FIRST_US + (number if day is None else day) * _DAY_US + chance.randrange(3_600_000_000)
     return DriveSpec(
         key=DriveKey(f"car{car}", start_us, f"{chance.randrange(1 << 32):08x}"),
         vehicle=vehicle,

@@ -47,7 +47,7 @@ def simulated(spec: DriveSpec, kept: Path | None = KEPT) -> Simulated:
     """Simulate a drive, or take it from the folder ``kept``."""
     if kept is None:
         return _simulate(spec)
-    path = kept / f"{_digest(spec)}.npz"
+    path = kept / f"{digest(spec)}.npz"
     if not path.exists():
         made = _simulate(spec)
         kept.mkdir(parents=True, exist_ok=True)
@@ -69,6 +69,8 @@ def _simulate(spec: DriveSpec) -> Simulated:
     times: dict[str, list[int]] = {VESC_STREAM: [], POSE_STREAM: []}
     names: dict[str, tuple[str, ...]] = {}
     heated = resistance = distance_m = slid_s = 0.0
+    battery = vehicle.battery
+    full_v = battery.open_v
     for i in range(count):
         vehicle.step(dt, None if stands <= i < count - stands else _STANDING)
         now_us = spec.key.start_us + i * 1_000_000 // RATE_HZ + round(abs(jitter.gauss(0, _JITTER_US)))
@@ -96,7 +98,9 @@ def _simulate(spec: DriveSpec) -> Simulated:
         "motor_resistance_now_ohm": resistance / heated,
         "distance_m": distance_m,
         "slid_s": slid_s,
-        "charge_left": vehicle.battery.charge,
+        "charge_left": battery.charge,
+        "open_voltage_v": battery.open_v,
+        "voltage_per_ah": (full_v - battery.open_v) / (battery.drawn_ah - battery.regen_ah),
         "motor_degc": vehicle.heat.motor_degc,
         "board_degc": vehicle.heat.board_degc,
     }
@@ -130,7 +134,8 @@ def _simulator() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()
 
 
-def _digest(spec: DriveSpec) -> str:
+def digest(spec: DriveSpec) -> str:
+    """A name for a drive as this simulator makes it."""
     return hashlib.sha256(f"{_simulator()} {spec!r}".encode()).hexdigest()[:32]
 
 

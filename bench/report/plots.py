@@ -84,6 +84,23 @@ def ranges(
     return _picture(fill, unit, height=0.5 * len(names) + 1.0)
 
 
+def grouped(series: Mapping[str, Mapping[str, float]], *, unit: str) -> Draw:
+    """A group of bars for each name, with a bar for each series, the palest first."""
+    names = list(next(iter(series.values())))
+    thick = 0.8 / len(series)
+
+    def fill(axes: mpl.axes.Axes) -> None:
+        for i, (label, values) in enumerate(series.items()):
+            at = [k + (i - (len(series) - 1) / 2) * thick for k in range(len(names))]
+            shade: dict[str, Any] = {"color": COLOURS[0], "alpha": (i + 1) / len(series), "label": label}
+            axes.barh(at, [values[name] for name in names], thick * 0.9, **shade)
+        axes.set_yticks(range(len(names)), names)
+        axes.invert_yaxis()
+        axes.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(series))
+
+    return _picture(fill, unit, height=0.42 * len(names) + 1.0)
+
+
 def lines(x: Sequence[float], series: Mapping[str, Sequence[float]], *, x_label: str, y_label: str) -> Draw:
     """One line for each name, over the same x values, on logarithmic axes."""
 

@@ -11,7 +11,7 @@ from typing import Any, Iterator, Mapping
 from iort_contract.checks import json_object
 from iort_contract.messages.analysis import AnalysedDrive, decode_analysed, encode_analysed
 from iort_contract.messages.findings import DriveKey, Finding, decode_finding, encode_finding
-from iort_contract.tables import CONTENT, FINDING, PARAMETERS_OF, ROBOT
+from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
 
 _FIRST, _LAST = "0", "9~"
 
@@ -43,8 +43,8 @@ class FindingsTable:
         most: int | None = None,
     ) -> Iterator[AnalysedDrive]:
         """A robot's analysed drives that begin in a range, the newest first; at most so many."""
-        first = f"{PARAMETERS_OF}{'' if start_us is None else f'{start_us:016d}'}"
-        last = f"{PARAMETERS_OF}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
+        first = f"{PARAMETERS_PREFIX}{'' if start_us is None else f'{start_us:016d}'}"
+        last = f"{PARAMETERS_PREFIX}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
         found = map(decode_analysed, self._content(robot, first, last, newest_first=True, page_items=most))
         for number, one in enumerate(found, 1):
             yield one
@@ -57,7 +57,7 @@ class FindingsTable:
 
     def put_drive(self, analysed: AnalysedDrive) -> None:
         """Write the row of an analysed drive; an earlier one of the drive is replaced."""
-        key = f"{PARAMETERS_OF}{analysed.drive}"
+        key = f"{PARAMETERS_PREFIX}{analysed.drive}"
         self._put(analysed.drive.robot, key, encode_analysed(analysed))
 
     def remove(self, finding: Finding) -> None:

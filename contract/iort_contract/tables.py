@@ -88,3 +88,8 @@ ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
 ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMITTED_CERTIFICATE, ADMITTED_MS)
 # The provisioning template's parameters.
 ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
+
+# The table of findings: by robot and a text that begins with the time of the drive. Beside the findings it
+# has a row of each analysed drive, for comparing with later ones, whose key begins with a prefix.
+FINDING, CONTENT = "finding", "content"
+PARAMETERS_PREFIX = "parameters#"

@@ -36,8 +36,8 @@ FLIPS: dict[str, dict[str, Any]] = {
     },
 }
 KEY: dict[str, Any] = {"customer_key": True}
-# Another namespace is another deployment, and so is the embedded cloud; the layer is a folder.
-NOT_FLIPPED = {"namespace", "embedded", "layer"}
+# Another namespace is another deployment, and so is the embedded cloud; the layers are folders.
+NOT_FLIPPED = {"namespace", "embedded", "layer", "analysis_layer"}
 # The longest that the contract allows; resource names contain it.
 LONGEST_NAMESPACE = "n" * 16
 EVERYTHING: dict[str, Any] = {name: value for flip in FLIPS.values() for name, value in flip.items()} | KEY

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Synthesized
-from tests.stacks.templates import Reader
+from tests.stacks.templates import Reader, layers
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +47,7 @@ def deployment(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Deploy
         key = repr(sorted(given.items()))
         if key not in made:
             app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-            build(app, Settings(layer=layer, **given))
+            build(app, Settings(**layers(layer), **given))
             stacks = app.synth().stacks
             made[key] = Deployment(Path(app.outdir), {stack.stack_name: stack.template for stack in stacks})
         return made[key]

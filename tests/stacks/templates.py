@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from tests.conftest import Synthesized
@@ -52,3 +53,8 @@ class Reader:
 
     def texts(self, value: Any) -> list[str]:
         return [self.text(one) for one in (value if isinstance(value, list) else [value])]
+
+
+def layers(folder: Path) -> dict[str, Any]:
+    """The settings that use a folder for every layer."""
+    return {"layer": str(folder), "analysis_layer": str(folder)}

@@ -7,6 +7,7 @@ from aws_cdk import App, assertions
 
 from stacks.account import Account
 from stacks.settings import Settings, SettingsError
+from tests.stacks.templates import layers
 
 KINDS = {"AWS::IoT::AccountAuditConfiguration", "AWS::IoT::ScheduledAudit", "AWS::IoT::Logging"}
 
@@ -56,7 +57,7 @@ def built(tmp_path):
 
     def build_with(**settings):
         app = App(outdir=str(tmp_path / "out"))
-        build(app, Settings(layer=tmp_path / "layer", **settings))
+        build(app, Settings(**layers(tmp_path / "layer"), **settings))
         return app.synth().stacks
 
     return build_with
@@ -80,7 +81,7 @@ def test_the_embedded_cloud_has_no_account_wide_settings(built):
 
 @pytest.mark.parametrize(("given", "level"), [("off", ""), ("debug", "debug")])
 def test_the_log_level_is_read_from_the_context(tmp_path, given, level):
-    app = App(context={"iot_log_level": given, "layer": str(tmp_path)})
+    app = App(context={"iot_log_level": given, **layers(tmp_path)})
     assert Settings.from_context(app).iot_log_level == level
 
 
@@ -88,4 +89,4 @@ def test_an_unknown_log_level_is_refused(tmp_path):
     with pytest.raises(
         SettingsError, match=r"iot_log_level must be off, error, warn, info or debug, got 'loud'"
     ):
-        Settings.from_context(App(context={"iot_log_level": "loud", "layer": str(tmp_path)}))
+        Settings.from_context(App(context={"iot_log_level": "loud", **layers(tmp_path)}))

@@ -11,6 +11,7 @@ import pytest
 
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings, SettingsError
+from tests.stacks.templates import layers
 
 
 def run(tmp_path, name, **context):
@@ -22,7 +23,7 @@ def run(tmp_path, name, **context):
         "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
         "CDK_VALIDATION": os.environ["CDK_VALIDATION"],
         "CDK_OUTDIR": str(tmp_path / name),
-        "CDK_CONTEXT_JSON": json.dumps({"layer": str(tmp_path / "layer"), **context}),
+        "CDK_CONTEXT_JSON": json.dumps({**layers(tmp_path / "layer"), **context}),
         # Every lookup goes to a port without a listener.
         "AWS_EC2_METADATA_DISABLED": "true",
         "HTTPS_PROXY": "http://127.0.0.1:9",
@@ -86,13 +87,13 @@ def settings(tmp_path, layer):
     def read(**context):
         from aws_cdk import App
 
-        return Settings.from_context(App(context={"layer": str(tmp_path / "layer"), **context}))
+        return Settings.from_context(App(context={**layers(tmp_path / "layer"), **context}))
 
     return read
 
 
 def test_the_context_sets_the_settings(settings, tmp_path):
-    assert settings() == Settings(layer=tmp_path / "layer")
+    assert settings() == Settings(**layers(tmp_path / "layer"))
     # The CDK CLI gives every -c as text.
     given = settings(namespace="lab2", retention_days="7", live_concurrency="0", embedded="true")
     assert (given.namespace, given.retention_days, given.live_concurrency, given.embedded) == (

@@ -12,7 +12,7 @@ from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
-from tests.stacks.templates import name
+from tests.stacks.templates import layers, name
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +230,7 @@ def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
     (layer / "nothing.py").touch()
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
     account = {"device_defender": True, "iot_log_level": "error"}
-    build(app, Settings(namespace="lab2", layer=layer, retention_days=7, **account))
+    build(app, Settings(namespace="lab2", **layers(layer), retention_days=7, **account))
     stacks = app.synth().stacks
     assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
     text = json.dumps([stack.template for stack in stacks])

@@ -114,11 +114,10 @@ def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
 
 
 def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
-    """The row's content as an object for JSON: the drive's `Parameters`, and more."""
-    content = {name: value for name, value in vars(analysed).items() if name != "drive"}
+    """The row's content as an object for JSON."""
     return {
-        **vars(analysed.drive),
-        **content,
+        **vars(analysed),
+        "drive": vars(analysed.drive),
         "estimates": {name: encode_estimate(one) for name, one in analysed.estimates.items()},
     }
 
@@ -126,7 +125,7 @@ def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
 def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
     """Decode a row's content; raises `ContractError`."""
     return AnalysedDrive(
-        drive=_drive(content),
+        drive=_drive(_object(content, "drive")),
         end_us=integer(content, "end_us"),
         job=text(content, "job"),
         samples=integer(content, "samples"),

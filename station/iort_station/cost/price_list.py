@@ -58,6 +58,7 @@ PRODUCTS = {
     "invocation": Product("AWSLambda", "Request"),
     "compute_arm": Product("AWSLambda", "Lambda-GB-Second-ARM"),
     "compute_x86": Product("AWSLambda", "Lambda-GB-Second"),
+    "transition": Product("AmazonStates", "StateTransition"),
     "logs": Product("AmazonCloudWatch", "DataProcessing-Bytes"),
     "metric": Product("AmazonCloudWatch", "CW:MetricMonitorUsage"),
     "metric_request": Product("AmazonCloudWatch", "CW:GMD-Metrics"),

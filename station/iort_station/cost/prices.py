@@ -37,6 +37,7 @@ _IOT = "https://aws.amazon.com/iot-core/pricing/"
 _DEFENDER = "https://aws.amazon.com/iot-device-defender/pricing/"
 _DYNAMODB = "https://aws.amazon.com/dynamodb/pricing/on-demand/"
 _LAMBDA = "https://aws.amazon.com/lambda/pricing/"
+_STATES = "https://aws.amazon.com/step-functions/pricing/"
 _CLOUDWATCH = "https://aws.amazon.com/cloudwatch/pricing/"
 _SQS = "https://aws.amazon.com/sqs/pricing/"
 _KMS = "https://aws.amazon.com/kms/pricing/"
@@ -62,6 +63,7 @@ PRICES = {
     "invocation": Price(0.20, 1e6, "invocation", _LAMBDA),
     "compute_arm": Price(0.0000133334, 1, "GB-second, Arm", _LAMBDA, _ARTILLERY),
     "compute_x86": Price(0.0000166667, 1, "GB-second, x86", _LAMBDA, _ARTILLERY),
+    "transition": Price(0.025, 1000, "state transition", _STATES, "the page's table, Europe (Ireland)"),
     "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
     "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH, "signoz.io, 2026-02-15"),
     "metric_request": Price(0.01, 1000, "metric requested by GetMetricData", _CLOUDWATCH),

@@ -40,7 +40,7 @@ from aws_cdk import App
 from app import build
 from stacks.settings import Settings
 app = App(outdir="cdk.out")
-build(app, Settings(layer=Path("scripts")))
+build(app, Settings(layer=Path("scripts"), analysis_layer=Path("scripts")))
 app.synth()
 """
 

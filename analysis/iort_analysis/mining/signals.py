@@ -1,0 +1,70 @@
+"""Signals on even steps of time: means, lags and smooth curves, as columns of a model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_CHUNK = 64
+
+
+def binned(times_s: Array, values: Array, width_s: float) -> Array:
+    """The means of a column within bins of ``width_s`` from 0 on; NaN where a bin has no value."""
+    at = (times_s / width_s).astype(np.int64)
+    known = np.isfinite(values)
+    n = int(at[-1]) + 1 if len(at) else 0
+    count = np.bincount(at[known], minlength=n)
+    total = np.bincount(at[known], weights=values[known], minlength=n)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / np.where(count == 0, np.nan, count), dtype=np.float64)
+
+
+def bridged(values: Array) -> Array:
+    """The values with a straight line across their gaps; zeros if there is none."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return np.nan_to_num(values)
+    at = np.arange(len(values))
+    return np.interp(at, at[known], values[known])
+
+
+def lagged(values: Array, steps: float) -> Array:
+    """The response of a first-order lag of so many steps, from rest, at the end of each step."""
+    keep = float(np.exp(-1 / steps))
+    at = np.arange(_CHUNK)
+    powers = keep**at
+    kernel = np.tril(powers[np.abs(np.subtract.outer(at, at))]) * (1 - keep)
+    padded = np.zeros(-(-len(values) // _CHUNK) * _CHUNK)
+    padded[: len(values)] = values
+    answer = padded.reshape(-1, _CHUNK) @ kernel.T
+    state = 0.0
+    for i in range(len(answer)):
+        answer[i] += state * keep * powers
+        state = answer[i, -1]
+    return np.asarray(answer.reshape(-1)[: len(values)], dtype=np.float64)
+
+
+def smooth_basis(values: Array, pieces: int) -> list[Array]:
+    """Columns whose sums are the smooth curves over the values' range: quadratic B-splines of so many pieces.
+
+    They sum to 1 everywhere.
+    """
+    low, high = float(values.min()), float(values.max())
+    at = np.clip((values - low) / max(high - low, 1e-12), 0, 1 - 1e-12) * pieces
+    return [_spline(at - first) for first in range(-2, pieces)]
+
+
+def _spline(u: Array) -> Array:
+    inner = np.where(u < 2, (-2 * u**2 + 6 * u - 3) / 2, (3 - u) ** 2 / 2)
+    return np.where((u < 0) | (u > 3), 0.0, np.where(u < 1, u**2 / 2, inner))
+
+
+def resolution(values: Array) -> float:
+    """The step of a sensor's values: their smallest difference; 0 if they have none."""
+    different = np.unique(values[np.isfinite(values)])
+    steps = np.diff(different)
+    # Values that a float rounds differ by next to nothing.
+    steps = steps[steps > 1e-6 * np.abs(different[1:])]
+    return float(steps.min()) if len(steps) else 0.0

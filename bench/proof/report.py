@@ -1,0 +1,159 @@
+"""The report's sections about the analysis: tables, a picture, and the figures that have a target."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+
+from bench.proof.judging import RIGHT, Case, Coverage, Detected, Judged
+from bench.proof.plan import Plan
+from bench.proof.speed import Bill
+from bench.report import plots
+from bench.report.result import Section
+from iort_agent.sources.sim.faults import KINDS, STRENGTHS
+
+_TARGETS = {"middle": 80.0, "strong": 95.0}
+_FALSE_ALARMS_HOURS, _COVERED = 24.0, (85.0, 95.0)
+# Other kinds of finding are named that come with this share of the strong faults.
+_OFTEN = 0.2
+
+
+def detected(plan: Plan, found: Mapping[Case, Detected]) -> Section:
+    """The faults found, by kind and strength."""
+    section = Section("detection", "Faults found in the simulated fleet")
+    rows = []
+    for kind, what in KINDS.items():
+        strong = found[kind, "strong"]
+        others = [f"{name} {n}" for name, n in strong.others.most_common() if n >= _OFTEN * strong.drives]
+        cells = [_shown(found[kind, strength], _TARGETS.get(strength)) for strength in STRENGTHS]
+        rows.append(
+            [kind, ", ".join(sorted(RIGHT[kind])), _strengths(kind), what.unit, *cells, ", ".join(others)]
+        )
+    section.table(
+        f"{plan.cars} cars, each with {plan.baseline} healthy drives of {plan.seconds / 60:g} minutes before",
+        [
+            "fault",
+            "right finding",
+            "weak, middle, strong",
+            "unit",
+            *STRENGTHS,
+            "other findings of the strong",
+        ],
+        rows,
+    )
+    section.plot(
+        "detection",
+        "Drives with a fault in which it was found",
+        plots.grouped(
+            {strength: {kind: _percent(found[kind, strength]) for kind in KINDS} for strength in STRENGTHS},
+            unit="%",
+        ),
+    )
+    for strength in STRENGTHS:
+        of = [found[kind, strength] for kind in KINDS]
+        share = 100 * sum(one.found for one in of) / sum(one.drives for one in of)
+        section.ratio(
+            f"faults found, {strength}",
+            round(share, 1),
+            _TARGETS.get(strength),
+            unit="%",
+            at_least=True,
+            tolerance=1.05,
+        )
+    section.notes.append(
+        "A fault counts as found if its first drive has a finding of the right kind. A sensor's fault is in "
+        "another field from car to car."
+    )
+    section.raw = {
+        f"{kind} {strength}": {"drives": one.drives, "found": one.found, "others": dict(one.others)}
+        for (kind, strength), one in found.items()
+    }
+    return section
+
+
+def alarms(plan: Plan, judged: Sequence[Judged]) -> Section:
+    """The findings about healthy cars."""
+    section = Section("false alarms", "False alarms of healthy cars")
+    findings = [finding for car in judged for finding in car.false_alarms]
+    section.table(
+        f"{plan.healthy_hours:.1f} driving hours of {plan.cars} healthy cars: {len(findings)} findings",
+        ["robot", "finding", "text"],
+        [[one.drive.robot, f"{one.kind} ({one.subject})", one.text] for one in findings],
+    )
+    often = len(findings) * _FALSE_ALARMS_HOURS / plan.healthy_hours
+    section.ratio("false alarms in 24 driving hours", round(often, 2), 1.0, unit="findings", tolerance=2.0)
+    section.raw = {"hours": plan.healthy_hours, "findings": [one.id for one in findings]}
+    return section
+
+
+def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) -> Section:
+    """How often the intervals hold the truth."""
+    section = Section("coverage", "Intervals that hold the truth")
+    low, high = _COVERED
+    section.table(
+        f"90 % intervals of {drives} healthy cars with a drive each",
+        ["parameter", "drives", "held", "width, median", "off, median"],
+        [
+            [
+                name,
+                str(one.drives),
+                _marked(f"{100 * one.share:.1f} %", good=low <= 100 * one.share <= high),
+                f"{100 * median(one.widths):.1f} %",
+                f"{100 * median(one.off):+.1f} %",
+            ]
+            for name, one in sorted(found.items())
+        ],
+    )
+    for name, one in sorted(found.items()):
+        section.ratio(
+            f"coverage off 90 %, {name}",
+            round(abs(100 * one.share - 90), 1),
+            5.0,
+            unit="points",
+            tolerance=2.0,
+        )
+    if without:
+        section.notes.append(f"The simulator has no single truth for {', '.join(without)}.")
+    section.raw = {name: {"drives": one.drives, "held": one.held} for name, one in found.items()}
+    return section
+
+
+def speed(cpu_s: float, samples: int, robot_hours: float, bill: Bill) -> Section:
+    """The time and the cost of the analysis."""
+    section = Section("speed", "Time and cost of the analysis")
+    dollars = sum(bill.dollars.values())
+    section.table(
+        f"{robot_hours:,.0f} robot-hours on AWS, by the cost model from the measured processor time",
+        ["", "dollars"],
+        [*([what, f"{usd:.3f}"] for what, usd in bill.dollars.items()), ["in all", f"{dollars:.3f}"]],
+    )
+    section.ratio(
+        f"an hour's {samples:,} samples, processor", round(cpu_s, 2), 2.0, unit="s", by_machine=True
+    )
+    section.ratio(f"{robot_hours:,.0f} robot-hours on AWS", round(dollars, 2), 1.0, unit="dollars")
+    section.ratio(
+        f"{robot_hours:,.0f} robot-hours on AWS, time", round(bill.seconds / 60, 1), 10.0, unit="minutes"
+    )
+    section.raw = {"cpu_s": cpu_s, "samples": samples, "dollars": bill.dollars, "seconds": bill.seconds}
+    return section
+
+
+def _strengths(kind: str) -> str:
+    of = KINDS[kind]
+    told = [
+        ", ".join(f"{one:g}" for one in three)
+        for three in dict.fromkeys(of.by_field.values() or [of.strengths])
+    ]
+    return "; ".join(told)
+
+
+def _percent(one: Detected) -> float:
+    return 100 * one.found / one.drives
+
+
+def _shown(one: Detected, target: float | None) -> str:
+    return _marked(f"{_percent(one):.0f} %", good=target is None or _percent(one) >= target)
+
+
+def _marked(text: str, *, good: bool) -> str:
+    return text if good else f"**{text}**"

@@ -1,0 +1,68 @@
+"""The processor time that the analysis of a robot-hour takes, and what 1,000 of them take and cost on AWS."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from math import ceil
+from statistics import median
+
+from bench.proof.cars import drive_of
+from bench.proof.drives import simulated
+from iort_analysis.process import analyse
+from iort_contract.catalog.derived import F1TENTH
+from iort_station.cost.prices import PRICES
+
+HOUR_S = 3600.0
+_REPEATS = 3
+# A function has a whole processor from this memory on ("Configure Lambda function memory").
+_MB_PER_CPU = 1769
+
+
+@dataclass(frozen=True)
+class Function:
+    """The function that analyses a drive, as deployed: memory, how many run at once, and seconds per drive
+    besides the analysis, for reading and writing."""
+
+    memory_mb: int = _MB_PER_CPU
+    at_once: int = 100
+    drive_s: float = 0.5
+    transitions: int = 4
+
+
+@dataclass(frozen=True)
+class Bill:
+    """What many robot-hours take on AWS: the time in seconds, and dollars by purpose."""
+
+    seconds: float
+    dollars: dict[str, float]
+
+
+def hour_cpu_s(car: int) -> tuple[float, int]:
+    """The processor time in seconds to analyse an hour's drive, the median of some, and its samples."""
+    spec = drive_of(car, 0, seconds=HOUR_S)
+    streams, _ = simulated(spec)
+    spent = []
+    for _ in range(_REPEATS):
+        began = time.process_time()
+        result = analyse(spec.key, streams, F1TENTH, {"mass_kg": spec.vehicle.mass_kg})
+        spent.append(time.process_time() - began)
+    return median(spent), result.samples
+
+
+def bill(robot_hours: float, cpu_s: float, drive_s: float, function: Function | None = None) -> Bill:
+    """What the analysis of so many robot-hours takes and costs, in drives of ``drive_s`` seconds.
+
+    A function's share of a processor is its share of the memory that has a whole one.
+    """
+    f = function or Function()
+    drives = ceil(robot_hours * HOUR_S / drive_s)
+    billed_s = cpu_s * drive_s / HOUR_S * max(1.0, _MB_PER_CPU / f.memory_mb) + f.drive_s
+    return Bill(
+        ceil(drives / f.at_once) * billed_s,
+        {
+            "Lambda computing": drives * billed_s * f.memory_mb / 1024 * PRICES["compute_arm"].each,
+            "Lambda invoked": drives * PRICES["invocation"].each,
+            "Step Functions": drives * f.transitions * PRICES["transition"].each,
+        },
+    )
