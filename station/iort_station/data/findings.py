@@ -24,7 +24,7 @@ def findings(
     found = [
         one
         for name in _named(cloud, robot)
-        for one in islice(findings_table(cloud).findings(name, start_us, end_us), most)
+        for one in islice(table(cloud).findings(name, start_us, end_us), most)
     ]
     return sorted(found, key=lambda one: one.id, reverse=True)[:most]
 
@@ -39,15 +39,13 @@ def drives(
 ) -> list[AnalysedDrive]:
     """Analysed drives that begin in a range, the newest first; of all robots without one."""
     found = [
-        one
-        for name in _named(cloud, robot)
-        for one in findings_table(cloud).drives(name, start_us, end_us, most=most)
+        one for name in _named(cloud, robot) for one in table(cloud).drives(name, start_us, end_us, most=most)
     ]
     return sorted(found, key=lambda one: str(one.drive), reverse=True)[:most]
 
 
-def findings_table(cloud: Cloud) -> FindingsTable:
-    """The table of findings; raises `StationError` if it is not deployed."""
+def table(cloud: Cloud) -> FindingsTable:
+    """The table of findings."""
     return FindingsTable(cloud.client("dynamodb"), cloud.output("storage", "FindingsTable"))
 
 
