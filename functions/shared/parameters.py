@@ -1,4 +1,4 @@
-"""The parameters of a robot's drives, in the findings table."""
+"""The parameters of a robot, from the analysis of its drives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def latest(robot: str) -> dict[str, tuple[Estimate, DriveKey]]:
     """Each parameter with the newest drive that has it."""
     table = FindingsTable(clients.dynamodb(), variables(AnswerEnvironment).findings_table)
     found: dict[str, tuple[Estimate, DriveKey]] = {}
-    for drive in table.drives(robot, most=_DRIVES):
-        for name, estimate in drive.estimates.items():
-            found.setdefault(name, (estimate, drive.drive))
+    for analysed in table.drives(robot, most=_DRIVES):
+        for name, estimate in analysed.estimates.items():
+            found.setdefault(name, (estimate, analysed.drive))
     return found
