@@ -60,7 +60,6 @@ TRUTHS: dict[str, Truth] = {
         _friction_n(truth) / truth["newtons_per_amp"] / truth["drivetrain_efficiency"]
     ),
     "brake_drag_a": _nothing,
-    "erpm_per_mps": _same("speed_to_erpm_gain"),
     "voltage_drift_v": _nothing,
     "motor_current_drift_a": _nothing,
     "temperature_drift_k": _nothing,
