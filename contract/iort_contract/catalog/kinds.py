@@ -54,7 +54,7 @@ KINDS = {
             "tyre_flat",
             "the wheels turn more often for the same way",
             "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
-            " calibrate the car",
+            " run `iort calibrate`",
             explains=("friction_added", "payload_added", "brake_dragging"),
             alternatives=("smaller wheels or another gear than before",),
         ),
@@ -115,6 +115,12 @@ KINDS = {
             "samples of the motor controller are missing again and again",
             "check the cable and plugs between computer and controller, and the CAN bus' terminators",
             explains=("pattern_unusual",),
+        ),
+        Kind(
+            "fault_reported",
+            "the motor controller reported a fault",
+            "read what the fault's name means in VESC Tool's manual; look at the evidence in the history",
+            severity="serious",
         ),
         Kind(
             "pattern_unusual",
