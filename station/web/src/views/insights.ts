@@ -5,6 +5,7 @@ import { el, Text } from "../base/dom";
 import { dayTime, zone } from "../base/format";
 import { readTime, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
+import { Analyse } from "../insights/analyse";
 import { drivesTable } from "../insights/drives_table";
 import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
@@ -24,6 +25,7 @@ export class InsightsView {
   private readonly driven = el("div", { class: "insights-part" });
   private readonly parameters = new Parameters();
   private readonly laps = new LapsPanel((laps) => this.write(laps));
+  private readonly analyse = new Analyse((text) => this.note.set(text), () => void this.load(this.robot, {}));
   private loading: AbortController | undefined;
   private robot: string | undefined;
   private answer: InsightsAnswer | undefined;
@@ -31,7 +33,8 @@ export class InsightsView {
 
   constructor(private readonly config: Config) {
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
-    const served = [this.note.node, this.found, this.laps.node, this.parameters.node, this.driven];
+    const status = el("div", { class: "history-status" }, this.note.node, ...(config.actions.includes("analyse") ? [this.analyse.node] : []));
+    const served = [status, this.found, this.laps.node, this.parameters.node, this.driven];
     this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
   }
 
@@ -40,12 +43,14 @@ export class InsightsView {
     this.title.set(robot ?? "Fleet");
     this.tools.replaceChildren(...(robot === undefined ? [] : [el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"), el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"), el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet")]));
     if (!this.config.answers) return;
+    this.analyse.of(robot);
     if (robot === this.robot && this.answer) void this.present(query);
     else void this.load(robot, query);
   }
 
   leave(): void {
     this.loading?.abort();
+    this.analyse.stop();
     this.answer = undefined;
     this.laps.clear();
     this.parameters.clear();
