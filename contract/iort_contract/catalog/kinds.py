@@ -92,6 +92,7 @@ KINDS = {
             "sensor_stuck",
             "a field kept exactly the same value while the car moved",
             "check the sensor and its wires; the analysis leaves out the samples in between",
+            explains=("pattern_unusual",),
         ),
         Kind(
             "sensor_drift",
@@ -110,6 +111,7 @@ KINDS = {
             "can_intermittent",
             "samples of the motor controller are missing again and again",
             "check the cable and plugs between computer and controller, and the CAN bus' terminators",
+            explains=("pattern_unusual",),
         ),
         Kind(
             "pattern_unusual",
