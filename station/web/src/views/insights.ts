@@ -1,6 +1,6 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import type { Config, InsightsAnswer, RunsAnswer } from "../base/contract";
+import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { dayTime, zone } from "../base/format";
 import { readTime, writeTime, type Range } from "../base/range";
@@ -70,12 +70,15 @@ export class InsightsView {
       this.answer = await ask<InsightsAnswer>("insights", robot === undefined ? {} : { robot }, loading.signal);
       if (!loading.signal.aborted) await this.present(query);
     } catch (error) {
-      if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (loading.signal.aborted) return;
+      this.note.set(error instanceof AnswerError ? error.message : String(error));
+      // Laps need no findings.
+      if (robot !== undefined && !this.answer) await this.showLaps(robot, undefined, query).catch(() => undefined);
     }
   }
 
   private async present(query: Query<"insights">): Promise<void> {
-    const { robot, loading } = this;
+    const { robot } = this;
     const answer = this.answer!;
     const { findings, drives, groups } = answer;
     const newest = drives[0];
@@ -94,15 +97,18 @@ export class InsightsView {
     const bars = styles(drives, groups[STYLE_GROUP] ?? {});
     this.driven.replaceChildren(...(bars ? [bars] : []), ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
     this.parameters.show(answer, [STYLE_GROUP]);
-    this.drive = chosen ? [chosen.from_us / 1e6, chosen.to_us / 1e6] : await this.newestRun(robot, loading!.signal);
-    this.laps.node.hidden = this.drive === undefined;
-    if (this.drive && !loading!.signal.aborted) await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
+    await this.showLaps(robot, chosen, query);
   }
 
-  /** Before anything is analysed, laps are those of the newest run. */
-  private async newestRun(robot: string, signal: AbortSignal): Promise<Range | undefined> {
-    const { runs } = await ask<RunsAnswer>("runs", { robot, count: "1" }, signal);
-    return runs[0] && [runs[0].from_us / 1e6, runs[0].to_us / 1e6];
+  /** Show the laps of a drive; before anything is analysed, those of the newest run. */
+  private async showLaps(robot: string, of: Extent | undefined, query: Query<"insights">): Promise<void> {
+    const { signal } = this.loading!;
+    const extent = of ?? (await ask<RunsAnswer>("runs", { robot, count: "1" }, signal)).runs[0];
+    if (signal.aborted) return;
+    this.laps.node.hidden = extent === undefined;
+    if (!extent) return;
+    this.drive = [extent.from_us / 1e6, extent.to_us / 1e6];
+    await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
   }
 
   private write(laps: readonly number[]): void {
