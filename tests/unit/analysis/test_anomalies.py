@@ -81,6 +81,7 @@ def test_a_current_that_drifts_is_told_from_the_voltage() -> None:
 @pytest.mark.parametrize(
     ("fault", "kind", "fields"),
     [
+        (FaultConfig("cell_dropout", "middle"), "cell_dropout", ("voltage_input", "current_input")),
         (FaultConfig("intermittent_can", "middle"), "can_intermittent", ()),
         (FaultConfig("sensor_stuck", "middle", 100.0, "current_motor"), "sensor_stuck", ("current_motor",)),
     ],
@@ -96,6 +97,9 @@ def test_a_fault_that_comes_and_goes_is_an_event(
     if kind == "sensor_stuck":
         assert (event.start_us - drive.key.start_us) / 1e6 == pytest.approx(100, abs=0.1)
         assert "kept the same value for 15 s" in event.text
+    elif kind == "cell_dropout":
+        assert event.effect is not None
+        assert event.effect.value == pytest.approx(0.8, abs=0.05)
 
 
 def test_the_estimates_are_those_of_the_simulators_physics() -> None:
