@@ -51,7 +51,7 @@ KINDS = {
             "tyre_flat",
             "the wheels turn more often for the same way",
             "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
-            " run `iort calibrate`",
+            " calibrate the car",
             explains=("friction_added", "payload_added", "brake_dragging"),
             alternatives=("smaller wheels or another gear than before",),
         ),
@@ -114,6 +114,12 @@ KINDS = {
             explains=("pattern_unusual",),
         ),
         Kind(
+            "fault_reported",
+            "the motor controller reported a fault",
+            "read what the fault's name means in VESC Tool's manual; look at the evidence in the history",
+            severity="serious",
+        ),
+        Kind(
             "pattern_unusual",
             "a stretch of the drive is like no other one",
             "look at the evidence in the history",
@@ -122,7 +128,7 @@ KINDS = {
         Kind(
             "analysis_failed",
             "a drive could not be analysed",
-            "the text has the reason; the samples are kept, and `iort analyse` tries again",
+            "the text has the reason; the samples are kept, so analyse it again",
         ),
     )
 }

@@ -112,4 +112,4 @@ def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
     assert slow.dollars["Lambda computing"] > once.dollars["Lambda computing"]
-    assert slow.dollars["Step Functions"] == once.dollars["Step Functions"]
+    assert slow.dollars["DynamoDB, samples read"] == once.dollars["DynamoDB, samples read"]
