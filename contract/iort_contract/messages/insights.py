@@ -79,13 +79,11 @@ class AnalysisStarted(TypedDict):
 
 
 class AnalysisAnswer(TypedDict):
-    """Answers ``analysis``: how far a run is. ``drives`` is null until they are found; ``reason`` says why the
-    run failed."""
+    """Answers ``analysis``: how far a run is. ``drives`` is null until they are found."""
 
-    state: Literal["running", "done", "failed"]
+    running: bool
     drives: int | None
     done: int
-    reason: str
 
 
 class Lap(Extent):

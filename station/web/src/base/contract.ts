@@ -379,12 +379,11 @@ export interface AnalysisStarted {
   readonly run: string;
 }
 
-/** Answers ``analysis``: how far a run is. ``drives`` is null until they are found; ``reason`` says why the run failed. */
+/** Answers ``analysis``: how far a run is. ``drives`` is null until they are found. */
 export interface AnalysisAnswer {
-  readonly state: "running" | "done" | "failed";
+  readonly running: boolean;
   readonly drives: number | null;
   readonly done: number;
-  readonly reason: string;
 }
 
 /** A lap; null for what is not known. ``complete`` is false if it does not fit the others. */

@@ -15,10 +15,10 @@ export class Analyse {
   private run = "";
   private timer: number | undefined;
 
-  /** `say` shows a text; `done` is called when the findings are there. */
+  /** `say` shows a text; `done` is called with the number of analysed drives. */
   constructor(
     private readonly say: (text: string) => void,
-    private readonly done: () => void,
+    private readonly done: (drives: number) => void,
   ) {
     this.node = el("form", { class: "range analyse" }, this.last, this.button);
     this.node.addEventListener("submit", (event) => {
@@ -56,16 +56,15 @@ export class Analyse {
 
   private async look(run: string): Promise<void> {
     try {
-      const { state, drives, done, reason } = await ask<AnalysisAnswer>("analysis", { run });
+      const { running, drives, done } = await ask<AnalysisAnswer>("analysis", { run });
       if (run !== this.run) return;
-      if (state === "running") {
+      if (running) {
         this.say(drives === null ? "Looking for drives …" : `${done} of ${drives} drives are analysed …`);
         this.timer = window.setTimeout(() => void this.look(run), POLL_MS);
         return;
       }
       this.stop();
-      if (state === "failed") this.say(`The analysis has failed: ${reason}`);
-      else this.done();
+      this.done(drives ?? 0);
     } catch (error) {
       this.fail(error);
     }

@@ -25,7 +25,7 @@ export class InsightsView {
   private readonly driven = el("div", { class: "insights-part" });
   private readonly parameters = new Parameters();
   private readonly laps = new LapsPanel((laps) => this.write(laps));
-  private readonly analyse = new Analyse((text) => this.note.set(text), () => void this.load(this.robot, {}));
+  private readonly analyse = new Analyse((text) => this.note.set(text), (drives) => void this.analysed(drives));
   private loading: AbortController | undefined;
   private robot: string | undefined;
   private answer: InsightsAnswer | undefined;
@@ -75,6 +75,12 @@ export class InsightsView {
       // Laps need no findings.
       if (robot !== undefined && !this.answer) await this.showLaps(robot, undefined, query).catch(() => undefined);
     }
+  }
+
+  /** Show the new findings; without drives, say why there are none. */
+  private async analysed(drives: number): Promise<void> {
+    await this.load(this.robot, {});
+    if (drives === 0) this.note.set("No drive of that time is over yet: a drive ends when the car has stood, or sent nothing, for a minute.");
   }
 
   private async present(query: Query<"insights">): Promise<void> {
