@@ -51,7 +51,7 @@ KINDS = {
             "tyre_flat",
             "the wheels turn more often for the same way",
             "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
-            " calibrate the car",
+            " run `iort calibrate`",
             explains=("friction_added", "payload_added", "brake_dragging"),
             alternatives=("smaller wheels or another gear than before",),
         ),

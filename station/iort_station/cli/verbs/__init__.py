@@ -18,6 +18,7 @@ VERBS = {
     "data.export": "Write a recording: MCAP or a ROS 1 bag.",
     "data.plot": "Draw recorded samples.",
     "data.laps": "List laps: time, distance, energy, and compare two.",
+    "data.calibrate": "Print a car's parameters, for vesc.yaml too.",
     "operations.trace": "Measure the delay of live updates, hop by hop.",
     "page.watch": "Show every car in the terminal, live, until Ctrl-C.",
     "page.site": "Upload the page to the stack iort-site, which serves it.",
