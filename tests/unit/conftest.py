@@ -95,7 +95,10 @@ def dynamodb(aws, tables):
     nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
     for logical, properties in tables.items():
         client.create_table(
-            TableName=next(name for noun, name in nouns.items() if logical.lower().startswith(noun)),
+            TableName=next(
+                (name for noun, name in nouns.items() if logical.lower().startswith(noun)),
+                logical[:-8].lower(),  # without the CDK's hash
+            ),
             KeySchema=properties["KeySchema"],
             AttributeDefinitions=properties["AttributeDefinitions"],
             BillingMode=properties["BillingMode"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -46,11 +46,11 @@ class Written(NamedTuple):
 
 def write_hour(
     items: Iterable[Item],
-    into: BinaryIO,
+    into: IO[bytes],
     *,
     hour: Hour,
-    refused: BinaryIO,
-    scratch: BinaryIO,
+    refused: IO[bytes],
+    scratch: IO[bytes],
     describe: Describe = lambda _field: ("", ""),
 ) -> Written:
     """Write the batches of an hour, in the order of their ids.
@@ -93,7 +93,7 @@ def write_hour(
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
 
 
-def write_day(hours: Mapping[Hour, ArchiveFile], into: BinaryIO, *, describe: Describe) -> None:
+def write_day(hours: Mapping[Hour, ArchiveFile], into: IO[bytes], *, describe: Describe) -> None:
     """Join files to one with the row groups of these hours, each from the file that is given for it."""
     kinds: dict[str, str] = {}
     places: dict[str, tuple[int, int]] = {}
@@ -107,7 +107,7 @@ def write_day(hours: Mapping[Hour, ArchiveFile], into: BinaryIO, *, describe: De
 
 
 def _write(
-    into: BinaryIO,
+    into: IO[bytes],
     kinds: Mapping[str, str],
     tables: Iterable[tuple[Any, Mapping[str, str]]],
     places: Mapping[str, tuple[int, int]],
@@ -133,7 +133,7 @@ def _write(
             writer.write_table(rows, row_group_size=max(1, len(rows)))
 
 
-def _read(scratch: BinaryIO) -> Any:
+def _read(scratch: IO[bytes]) -> Any:
     return pa.ipc.open_stream(scratch).read_all().combine_chunks().to_batches()[0]
 
 
