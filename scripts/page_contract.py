@@ -17,7 +17,7 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, page
+from iort_contract.messages import commands, insights, page
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -145,8 +145,8 @@ export type Value = null | boolean | number | string;
 
 
 def _types() -> Iterator[str]:
-    """An interface for each message of `iort_contract.messages.page`."""
-    for name, message in vars(page).items():
+    """An interface for each message to the page."""
+    for name, message in {**vars(insights), **vars(page)}.items():
         if is_typeddict(message) and not name.startswith("_"):
             comment = " ".join((message.__doc__ or "").split())
             yield f"/** {comment} */\nexport interface {name} {{"

@@ -6,7 +6,7 @@ import re
 from datetime import datetime, timedelta, timezone
 from typing import Any, TypeAlias
 
-from iort_contract.messages.page import Extent
+from iort_contract.messages.insights import Extent
 from iort_station.errors import UsageError
 
 Time: TypeAlias = int | str | datetime

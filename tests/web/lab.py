@@ -11,11 +11,13 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
+from tests.web.insights import delta, insights, laps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.page import AlarmEntry, Extent, HistoryAnswer, Run, RunPart, RunsAnswer
+    from iort_contract.messages.insights import Extent
+    from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 
@@ -36,6 +38,8 @@ VIEWS = {
         "car-1/2026-05-04T11:00:00.000Z/2026-05-04T11:01:00.000Z",
         ".compare-view .charts canvas",
     ),
+    "insights": View("#/insights/car-1", ".insights-view .charts canvas"),
+    "insights of the fleet": View("#/insights", ".insights-view .drives tbody tr"),
     "alarms": View("#/alarms", "[data-alarm=Quarantined] .cases li"),
     "cloudwatch": View("#/cloudwatch", ".log summary"),
 }
@@ -126,6 +130,9 @@ class Lab:
             "streams": lambda _: {"streams": [VESC_STREAM]},
             "runs": lambda _: runs(),
             "history": history,
+            "insights": insights,
+            "laps": laps,
+            "delta": delta,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
             "log": lambda _: {

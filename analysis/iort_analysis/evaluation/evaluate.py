@@ -15,7 +15,7 @@ from iort_contract.catalog.findings import KINDS, PARAMETERS, Parameter
 from iort_contract.messages.findings import DriveKey, Estimate, Finding
 
 # A finding counts up to this rate of false discoveries among those of one evaluation.
-FALSE_DISCOVERY_RATE = 0.01
+FALSE_DISCOVERY_RATE = 0.05
 # With fewer earlier drives of its own, a robot is compared with the fleet; and with fewer robots, not at all.
 MIN_DRIVES = MIN_ROBOTS = 3
 # A drive as unlikely as this takes no part in the baseline of the next one.
@@ -57,9 +57,10 @@ class _Comparison:
         self.findings: list[Finding] = []
         self.unusual: set[str] = set()
         for name, estimate in sorted(result.mined.estimates.items()):
-            parameter = PARAMETERS[name]
-            expected = _expected(parameter, earlier, fleet)
-            if expected is not None:
+            # A result may be of another version of the analysis.
+            parameter = PARAMETERS.get(name)
+            expected = parameter and _expected(parameter, earlier, fleet)
+            if parameter and expected:
                 self._compare(result, parameter, estimate, *expected)
 
     def _compare(
@@ -96,17 +97,17 @@ def _expected(
 def _spread(parameter: Parameter, estimates: Sequence[Estimate]) -> float:
     """What a healthy car's drives differ by, by the catalogue."""
     middle = sorted(estimate.value for estimate in estimates)[len(estimates) // 2]
-    return parameter.least_change(middle) / 3
+    return parameter.least_change(middle) / 4
 
 
 def _trends(result: DriveResult, earlier: Sequence[Measured]) -> Iterable[Finding]:
     """The parameters that grew worse over the last drives, up to this one."""
     drives = [*earlier, Measured(result.drive, result.mined.estimates)]
     for name, newest in sorted(result.mined.estimates.items()):
-        parameter = PARAMETERS[name]
+        parameter = PARAMETERS.get(name)
         having = [one for one in drives if name in one.estimates]
         days = (having[-1].drive.start_us - having[0].drive.start_us) / US_PER_DAY
-        if not parameter.kind or len(having) < _TREND_DRIVES or days < _TREND_DAYS:
+        if not parameter or not parameter.kind or len(having) < _TREND_DRIVES or days < _TREND_DAYS:
             continue
         found = trend(
             [one.drive.start_us for one in having],

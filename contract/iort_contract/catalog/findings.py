@@ -28,7 +28,7 @@ class Parameter:
 
     ``worse`` is the direction of a change for the worse; ``kind`` names the finding about such a change,
     empty if a change is no finding. A change counts from ``least`` in the unit and from ``least_share`` of
-    the baseline on: less means nothing on a car, and healthy drives differ by a third of it. ``fields`` are
+    the baseline on: less means nothing on a car, and healthy drives differ by a quarter. ``fields`` are
     those of the VESC that it was estimated from.
     """
 
@@ -103,6 +103,102 @@ _STYLES = tuple(
     for style, meaning in STYLES.items()
 )
 
+# What the motor needs and what its sensors say; currents and speeds as the VESC has them, so that no number
+# of the car need be known.
+_DRIVETRAIN = (
+    Parameter(
+        "inertia_a_per_krpm_s",
+        "A s/krpm",
+        "motor current for an acceleration of 1000 erpm in a second: mass and gears",
+        worse="up",
+        kind="payload_added",
+        fields=("current_motor", "speed"),
+        least_share=0.08,
+    ),
+    Parameter(
+        "rolling_current_a",
+        "A",
+        "motor current that rolling takes, without air drag",
+        worse="up",
+        kind="friction_added",
+        fields=("current_motor", "speed"),
+        least=0.8,
+    ),
+    Parameter(
+        "brake_drag_a",
+        "A",
+        "motor current against a brake that still holds, just after braking",
+        worse="up",
+        kind="brake_dragging",
+        fields=("current_motor", "speed"),
+        least=2.0,
+        least_share=0.0,
+    ),
+    Parameter(
+        "erpm_per_mps",
+        "erpm per m/s",
+        "motor speed for a speed of the car, without torque",
+        worse="up",
+        kind="tyre_flat",
+        fields=("speed",),
+        least_share=0.03,
+    ),
+    Parameter(
+        "slip_under_torque",
+        "1",
+        "share that the motor turns further under much torque than without",
+        worse="up",
+        kind="pinion_loose",
+        fields=("speed", "current_motor"),
+        least=0.015,
+        least_share=0.0,
+    ),
+)
+_SENSORS = (
+    Parameter(
+        "voltage_drift_v",
+        "V",
+        "error of the battery's voltage that grew in the drive, against duty cycle, speed and current",
+        kind="sensor_drift",
+        fields=("voltage_input", "duty_cycle", "speed"),
+        least=0.15,
+        least_share=0.0,
+    ),
+    Parameter(
+        "motor_current_drift_a",
+        "A",
+        "error of the motor's current that grew in the drive, against duty cycle and battery current",
+        kind="sensor_drift",
+        fields=("current_motor", "current_input", "duty_cycle"),
+        least=0.6,
+        least_share=0.0,
+    ),
+    Parameter(
+        "temperature_drift_k",
+        "K",
+        "error of the controller's temperature that grew in the drive, against how a board warms up",
+        kind="sensor_drift",
+        fields=("temperature_pcb", "temp_fet", "current_motor"),
+        least=3.5,
+        least_share=0.0,
+    ),
+    Parameter(
+        "controller_lag_s",
+        "s",
+        "time in which the controller's temperature follows its load: longer with less cooling",
+        worse="up",
+        kind="cooling_lost",
+        fields=("temperature_pcb", "temp_fet", "current_motor"),
+        least_share=0.5,
+    ),
+)
+
 # The groups in the order in which a person reads them.
-GROUPS = {"Battery": _BATTERY, "Laps": _LAPS, "Driving style": _STYLES}
+GROUPS = {
+    "Battery": _BATTERY,
+    "Drivetrain": _DRIVETRAIN,
+    "Sensors": _SENSORS,
+    "Laps": _LAPS,
+    "Driving style": _STYLES,
+}
 PARAMETERS = {parameter.name: parameter for group in GROUPS.values() for parameter in group}

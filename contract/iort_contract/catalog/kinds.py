@@ -91,12 +91,20 @@ KINDS = {
         Kind(
             "sensor_stuck",
             "a field kept exactly the same value while the car moved",
-            "check the sensor and its wires; the samples in between are left out of the analysis",
+            "check the sensor and its wires; the analysis leaves out the samples in between",
         ),
         Kind(
             "sensor_drift",
             "a field went away from what the other fields say",
             "compare the field with a meter; calibrate or replace the sensor",
+            explains=(
+                "friction_added",
+                "payload_added",
+                "brake_dragging",
+                "motor_resistance_grown",
+                "battery_worn",
+                "pattern_unusual",
+            ),
         ),
         Kind(
             "can_intermittent",

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Literal, TypedDict, Union
 
 from iort_contract.limits import Value
+from iort_contract.messages.insights import DeltaAnswer, Extent, InsightsAnswer, LapsAnswer
 
 
 class TrackMap(TypedDict):
@@ -67,13 +68,6 @@ class StreamsAnswer(TypedDict):
     """Answers ``streams``: the names of a robot's streams."""
 
     streams: list[str]
-
-
-class Extent(TypedDict):
-    """From the first sample to the time just after the last one, in microseconds since the epoch."""
-
-    from_us: int
-    to_us: int
 
 
 class RunPart(Extent):
@@ -282,6 +276,9 @@ class Logs(TypedDict):
 
 
 Answer = Union[
+    InsightsAnswer,
+    LapsAnswer,
+    DeltaAnswer,
     RobotsAnswer,
     TagsAnswer,
     VehiclesAnswer,

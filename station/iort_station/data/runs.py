@@ -21,7 +21,8 @@ from iort_contract.dynamodb import Keys, plain, starting_between
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
 from iort_contract.messages.batch import BatchId, batch_id, decode_batch, open_batch
-from iort_contract.messages.page import Extent, Run, RunPart, RunsAnswer, RunState
+from iort_contract.messages.insights import Extent
+from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import BATCH, RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory

@@ -24,6 +24,8 @@ from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.fleet import registry, tags
 from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
+from iort_station.page import insights, laps
+from iort_station.page.parameters import text, whole
 
 # No chart is wider, in points.
 MAX_ROWS = 5_000
@@ -57,6 +59,8 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         ),
         "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
         "rejected": lambda _asked: alarms.rejected(cloud),
+        "insights": lambda asked: insights.insights(cloud, asked),
+        **laps.answers(cloud),
     }
 
 
@@ -183,19 +187,3 @@ def _last_known(column: Column, starts: Any) -> Any:
     ranked = np.where(known, np.arange(n), -1)
     last = np.maximum.reduceat(ranked, starts)
     return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
-
-
-def text(asked: Mapping[str, str], name: str) -> str:
-    """A text that is not empty; raises `StationError`."""
-    if not asked.get(name):
-        raise StationError(f"the request must have the parameter {name}")
-    return asked[name]
-
-
-def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
-    """A whole number in the range; raises `StationError`."""
-    found = text(asked, name)
-    # Sixteen digits are enough for every allowed number.
-    if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
-        raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
-    return int(found)

@@ -17,7 +17,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import commands, registry
 from iort_station.fleet import settings as fleet_settings
 from iort_station.fleet.shadow import Shadow, State
-from iort_station.page.answers import text, whole
+from iort_station.page.parameters import text, whole
 from iort_station.page.server import Answer
 
 # A viewer waits for it.

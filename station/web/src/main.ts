@@ -8,7 +8,7 @@ import { Alarms } from "./live/alarms";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
-import { observer } from "./observer";
+import { observer } from "./live/observer";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
@@ -19,13 +19,14 @@ import { CompareView } from "./views/compare";
 import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
 import { HistoryView } from "./views/history";
+import { InsightsView } from "./views/insights";
 
 // The period of ages and states, and the shortest period of values and charts.
 const CLOCK_S = 0.25;
 const VALUES_S = 0.04;
 
 /** The views that the bar above links to. */
-const TABS = ["fleet", "alarms", "cloudwatch"] as const;
+const TABS = ["fleet", "insights", "alarms", "cloudwatch"] as const;
 
 class Page {
   private readonly fleet: Fleet;
@@ -36,6 +37,7 @@ class Page {
   private readonly fleetView: FleetView;
   private readonly carView: CarView;
   private readonly historyView: HistoryView;
+  private readonly insightsView: InsightsView;
   private readonly compareView: CompareView;
   private readonly cloudWatchView: CloudWatchView;
   private readonly alarmsView: AlarmsView;
@@ -62,6 +64,7 @@ class Page {
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
+    this.insightsView = new InsightsView(config);
     this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
     this.alarmsView = new AlarmsView(config, alarms);
@@ -78,9 +81,9 @@ class Page {
     this.route = readRoute(location.hash);
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, insights: this.insightsView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
     document.body.dataset["view"] = view;
-    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", compare: "Compare · iort", car: "iort live", history: "iort live" }[view];
+    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", compare: "Compare · iort", insights: "Insights · iort", car: "iort live", history: "iort live" }[view];
     if (this.stage.firstElementChild !== shown.node) {
       this.stage.replaceChildren(shown.node);
       window.scrollTo(0, 0);
@@ -92,6 +95,8 @@ class Page {
     if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
     else this.historyView.show(undefined);
     this.compareView.show(this.route.view === "compare" ? this.route.query : undefined);
+    if (this.route.view === "insights") this.insightsView.show(this.route.robot, this.route.query);
+    else this.insightsView.leave();
     this.cloudWatchView.show(view === "cloudwatch");
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
@@ -112,6 +117,7 @@ class Page {
       const [before, after] = this.neighbours(robot);
       this.tools.replaceChildren(
         el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
+        el("a", { class: "tool", href: route({ view: "insights", robot }) }, "Insights"),
         ...(before && after ? [link("‹", `Previous car, ${before}`, before), link("›", `Next car, ${after}`, after)] : []),
       );
     }

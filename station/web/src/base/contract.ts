@@ -314,6 +314,99 @@ export interface FieldTable {
 
 export type Value = null | boolean | number | string;
 
+/** From the first sample to the time just after the last one, in microseconds since the epoch. */
+export interface Extent {
+  readonly from_us: number;
+  readonly to_us: number;
+}
+
+/** A value with its interval, which holds the truth in nine of ten cases. */
+export interface EstimateEntry {
+  readonly value: number;
+  readonly low: number;
+  readonly high: number;
+  readonly unit: string;
+}
+
+/** A parameter of the catalogue. */
+export interface ParameterEntry {
+  readonly unit: string;
+  readonly meaning: string;
+  readonly worse: "up" | "down" | "either";
+}
+
+/** A finding of the analysis, with its kind's entry in the catalogue. ``start_us`` is the drive's start, the extent that of the evidence. ``effect`` is the change from ``baseline``, or the size of an event. ``q`` is the false discovery rate; null if no test was made. */
+export interface FindingEntry {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly id: string;
+  readonly robot: string;
+  readonly start_us: number;
+  readonly kind: string;
+  readonly severity: "info" | "warning" | "serious";
+  readonly meaning: string;
+  readonly action: string;
+  readonly subject: string;
+  readonly stream: string;
+  readonly fields: readonly string[];
+  readonly text: string;
+  readonly effect: EstimateEntry | null;
+  readonly baseline: EstimateEntry | null;
+  readonly q: number | null;
+}
+
+/** An analysed drive. ``failed`` is the reason if it could not be analysed, ``missing`` that of each parameter that could not be computed, ``repairs`` counts what was cleaned. */
+export interface DriveEntry {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly robot: string;
+  readonly samples: number;
+  readonly failed: string;
+  readonly repairs: Readonly<Record<string, number>>;
+  readonly estimates: Readonly<Record<string, EstimateEntry>>;
+  readonly missing: Readonly<Record<string, string>>;
+}
+
+/** Answers ``insights``: the findings and the drives of a robot or of the fleet, the newest first. ``groups`` has the parameters in the order in which a person reads them. */
+export interface InsightsAnswer {
+  readonly findings: readonly FindingEntry[];
+  readonly drives: readonly DriveEntry[];
+  readonly groups: Readonly<Record<string, Readonly<Record<string, ParameterEntry>>>>;
+}
+
+/** A lap; null for what is not known. ``complete`` is false if it does not fit the others. */
+export interface Lap {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly lap: number;
+  readonly time_s: number;
+  readonly distance_m: number | null;
+  readonly energy_wh: number | null;
+  readonly energy_wh_per_km: number | null;
+  readonly mean_speed_mps: number | null;
+  readonly top_speed_mps: number | null;
+  readonly complete: boolean;
+  readonly best: boolean;
+}
+
+/** Answers ``laps``: those of a robot in a range. ``method`` is "gate" or "pattern", and empty without laps, for the ``reason`` given. ``estimates`` has the best and the mean. */
+export interface LapsAnswer {
+  readonly laps: readonly Lap[];
+  readonly method: string;
+  readonly confidence: number;
+  readonly reason: string;
+  readonly estimates: Readonly<Record<string, EstimateEntry>>;
+}
+
+/** Answers ``delta``: how far lap ``other`` is behind lap ``one`` at each place, and their speeds. Places are in metres; in shares of the lap if its length is not known, and then the speeds are null. */
+export interface DeltaAnswer {
+  readonly places: readonly number[];
+  readonly unit: "m" | "%";
+  readonly delta_s: readonly number[];
+  readonly one_mps: readonly (number | null)[];
+  readonly other_mps: readonly (number | null)[];
+}
+
 /** A closed track's centre line and its widths to either side: `iort_contract.track.Track`. */
 export interface TrackMap {
   readonly x_m: readonly number[];
@@ -360,12 +453,6 @@ export interface VehiclesAnswer {
 /** Answers ``streams``: the names of a robot's streams. */
 export interface StreamsAnswer {
   readonly streams: readonly string[];
-}
-
-/** From the first sample to the time just after the last one, in microseconds since the epoch. */
-export interface Extent {
-  readonly from_us: number;
-  readonly to_us: number;
 }
 
 /** What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent counted, up to its last report; null without a report. */

@@ -37,5 +37,10 @@ export function setAttribute(node: Element, name: string, value: string): void {
   if (node.getAttribute(name) !== value) node.setAttribute(name, value);
 }
 
+/** A text with its `code`. */
+export function marked(text: string): (HTMLElement | string)[] {
+  return text.split("`").map((part, i) => (i % 2 === 1 ? el("code", {}, part) : part));
+}
+
 /** Natural order: car-2 before car-10. */
 export const byName = new Intl.Collator("en", { numeric: true }).compare;

@@ -96,10 +96,13 @@ export function milliseconds(value: number): string {
   return number(value, Math.abs(value) < 9.95 ? 1 : 0);
 }
 
+export function capital(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
 function humanise(field: string): string {
   const words = field.split(/[_.]/).map((word) => (CAPITALS.has(word) ? word.toUpperCase() : word));
-  const text = words.join(" ");
-  return text.charAt(0).toUpperCase() + text.slice(1);
+  return capital(words.join(" "));
 }
 
 /** This device's time zone at a time: UTC, CET, GMT+2. */

@@ -9,6 +9,7 @@ const PARAMETERS = {
   fleet: ["find", "sort", "group"],
   car: ["window", "charts"],
   history: ["stream", "from", "to", "fields", "at"],
+  insights: ["drive", "laps"],
   compare: ["runs", "stream", "fields", "x", "zoom"],
   cloudwatch: [],
   alarms: [],
@@ -33,11 +34,11 @@ interface Address<V extends View> {
 interface RobotAddress<V extends View> extends Address<V> {
   readonly robot: string;
 }
-export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history">;
+export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history"> | (Address<"insights"> & { readonly robot?: string });
 
 export function route(to: Route): string {
   const view = to.view === "fleet" ? "" : to.view;
-  const robot = "robot" in to ? `/${encodeURIComponent(to.robot)}` : "";
+  const robot = "robot" in to && to.robot !== undefined ? `/${encodeURIComponent(to.robot)}` : "";
   const pairs = Object.entries<string | undefined>(to.query ?? {}).filter(([, value]) => value !== undefined);
   const query = pairs.map(([name, value]) => `${name}=${encodeURIComponent(value!).replace(/%(2C|2F|3A)/g, decodeURIComponent)}`);
   return `#/${view}${robot}${query.length > 0 ? `?${query.join("&")}` : ""}`;
@@ -49,6 +50,7 @@ export function readRoute(hash: string): Route {
   const read = <V extends View>(view: V): Query<V> =>
     Object.fromEntries(PARAMETERS[view].flatMap((key) => (values.has(key) ? [[key, values.get(key)]] : []))) as Query<V>;
   if ((name === "car" || name === "history") && robot !== undefined) return { view: name, robot, query: read(name) };
+  if (name === "insights") return { view: name, ...(robot === undefined ? {} : { robot }), query: read(name) };
   if (name === "cloudwatch") return { view: name, query: read(name) };
   if (name === "alarms") return { view: name, query: read(name) };
   if (name === "compare") return { view: name, query: read(name) };

@@ -1,8 +1,8 @@
-// Adds another robot's run to a comparison.
+// Adds a run of any robot to a comparison, or one of its laps.
 
-import type { RunsAnswer } from "../base/contract";
+import type { LapsAnswer, RunsAnswer } from "../base/contract";
 import { byName, el, Text } from "../base/dom";
-import { age, dayTime, zone } from "../base/format";
+import { age, dayTime, number, zone } from "../base/format";
 import { NAME } from "../base/contract";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
@@ -15,8 +15,11 @@ export class AddPart {
   private readonly robot = el("input", { id: "part-robot", list: "part-robots", autocomplete: "off", spellcheck: "false" });
   private readonly known = el("datalist", { id: "part-robots" });
   private readonly run = el("select", { id: "part-run" });
+  private readonly lap = el("select", { id: "part-lap" });
   private readonly note = new Text("note", "span", { role: "status" });
   private runs: Part[] = [];
+  private laps: Part[] = [];
+  private looking: AbortController | undefined;
   private stream = "";
 
   constructor(
@@ -24,11 +27,12 @@ export class AddPart {
     add: (part: Part) => void,
   ) {
     const button = el("button", { type: "submit", class: "tool" }, "Add");
-    this.node.append(el("label", {}, "robot ", this.robot, this.known), el("label", {}, "run ", this.run), button, this.note.node);
+    this.node.append(el("label", {}, "robot ", this.robot, this.known), el("label", {}, "run ", this.run), el("label", {}, "lap ", this.lap), button, this.note.node);
     this.robot.addEventListener("change", () => void this.find());
+    this.run.addEventListener("change", () => void this.findLaps());
     this.node.addEventListener("submit", (event) => {
       event.preventDefault();
-      const part = this.runs[this.run.selectedIndex];
+      const part = this.laps[this.lap.selectedIndex - 1] ?? this.runs[this.run.selectedIndex];
       if (part) add(part);
     });
   }
@@ -48,6 +52,7 @@ export class AddPart {
     const { stream } = this;
     this.runs = [];
     this.run.replaceChildren();
+    this.offer([]);
     this.note.set("");
     if (!NAME.test(robot)) return;
     try {
@@ -57,8 +62,30 @@ export class AddPart {
       this.runs = parts.map(({ from_us, to_us }) => ({ robot, range: [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000] }));
       this.run.replaceChildren(...this.runs.map(({ range: [from, to] }) => el("option", {}, `${dayTime(from)} ${zone(from)}, ${age(to - from)}`)));
       if (parts.length === 0) this.note.set(`${robot} has no runs of ${stream}.`);
+      await this.findLaps();
     } catch (error) {
       if (robot === this.robot.value.trim()) this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
+  }
+
+  /** Offer the laps of the chosen run, if it has any. */
+  private async findLaps(): Promise<void> {
+    this.looking?.abort();
+    const looking = (this.looking = new AbortController());
+    const run = this.runs[this.run.selectedIndex];
+    this.offer([]);
+    if (!run) return;
+    const [from_us, to_us] = run.range.map((at) => String(Math.round(at * 1e6))) as [string, string];
+    try {
+      this.offer((await ask<LapsAnswer>("laps", { robot: run.robot, from_us, to_us }, looking.signal)).laps, run.robot);
+    } catch {
+      // The whole run can be added anyway.
+    }
+  }
+
+  private offer(laps: LapsAnswer["laps"], robot = ""): void {
+    this.laps = laps.map(({ from_us, to_us }) => ({ robot, range: [from_us / 1e6, to_us / 1e6] }));
+    const told = laps.map(({ lap, time_s, best }) => `${lap}: ${number(time_s, 2)} s${best ? ", the best" : ""}`);
+    this.lap.replaceChildren(...["the whole run", ...told].map((text) => el("option", {}, text)));
   }
 }

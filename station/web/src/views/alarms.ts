@@ -2,8 +2,8 @@
 
 import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
-import { el, Text } from "../base/dom";
-import { clockTime, dayTime, zone } from "../base/format";
+import { el, marked, Text } from "../base/dom";
+import { capital, clockTime, dayTime, zone } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { route } from "../base/route";
 import type { Alarms, CarState, Raised } from "../live/alarms";
@@ -166,13 +166,4 @@ function past(robot: string, from_s: number, to_s: number, text: string): HTMLEl
 
 function row({ key, meaning, state, since_s, advice }: AlarmEntry): HTMLElement {
   return el("tr", {}, el("td", {}, el("code", {}, key)), el("td", { class: "words" }, meaning), el("td", {}, `${STATES[state]} since ${dayTime(since_s)}`), el("td", { class: "words" }, ...marked(advice)));
-}
-
-/** A text with its `code`. */
-function marked(text: string): (HTMLElement | string)[] {
-  return text.split("`").map((part, i) => (i % 2 === 1 ? el("code", {}, part) : part));
-}
-
-function capital(text: string): string {
-  return text.charAt(0).toUpperCase() + text.slice(1);
 }

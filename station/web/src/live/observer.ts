@@ -1,10 +1,10 @@
 // The page's state for tests and for the browser's console; every access makes a copy, so it is read-only.
 
-import { now } from "./base/clock";
-import type { Feed } from "./live/feed";
-import type { Fleet } from "./live/fleet";
-import { GONE_S, STALE_S } from "./base/contract";
-import { BOUNDS } from "./live/bounds";
+import { now } from "../base/clock";
+import type { Feed } from "./feed";
+import type { Fleet } from "./fleet";
+import { GONE_S, STALE_S } from "../base/contract";
+import { BOUNDS } from "./bounds";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

@@ -1,0 +1,108 @@
+"""The messages to the live page about the analysis: findings, drives and laps. They are sent as in `page`."""
+
+from __future__ import annotations
+
+from typing import Literal, TypedDict
+
+
+class Extent(TypedDict):
+    """From the first sample to the time just after the last one, in microseconds since the epoch."""
+
+    from_us: int
+    to_us: int
+
+
+class EstimateEntry(TypedDict):
+    """A value with its interval, which holds the truth in nine of ten cases."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+class ParameterEntry(TypedDict):
+    """A parameter of the catalogue."""
+
+    unit: str
+    meaning: str
+    worse: Literal["up", "down", "either"]
+
+
+class FindingEntry(Extent):
+    """A finding of the analysis, with its kind's entry in the catalogue.
+
+    ``start_us`` is the drive's start, the extent that of the evidence. ``effect`` is the change from
+    ``baseline``, or the size of an event. ``q`` is the false discovery rate; null if no test was made."""
+
+    id: str
+    robot: str
+    start_us: int
+    kind: str
+    severity: Literal["info", "warning", "serious"]
+    meaning: str
+    action: str
+    subject: str
+    stream: str
+    fields: list[str]
+    text: str
+    effect: EstimateEntry | None
+    baseline: EstimateEntry | None
+    q: float | None
+
+
+class DriveEntry(Extent):
+    """An analysed drive. ``failed`` is the reason if it could not be analysed, ``missing`` that of each
+    parameter that could not be computed, ``repairs`` counts what was cleaned."""
+
+    robot: str
+    samples: int
+    failed: str
+    repairs: dict[str, int]
+    estimates: dict[str, EstimateEntry]
+    missing: dict[str, str]
+
+
+class InsightsAnswer(TypedDict):
+    """Answers ``insights``: the findings and the drives of a robot or of the fleet, the newest first.
+    ``groups`` has the parameters in the order in which a person reads them."""
+
+    findings: list[FindingEntry]
+    drives: list[DriveEntry]
+    groups: dict[str, dict[str, ParameterEntry]]
+
+
+class Lap(Extent):
+    """A lap; null for what is not known. ``complete`` is false if it does not fit the others."""
+
+    lap: int
+    time_s: float
+    distance_m: float | None
+    energy_wh: float | None
+    energy_wh_per_km: float | None
+    mean_speed_mps: float | None
+    top_speed_mps: float | None
+    complete: bool
+    best: bool
+
+
+class LapsAnswer(TypedDict):
+    """Answers ``laps``: those of a robot in a range. ``method`` is "gate" or "pattern", and empty without
+    laps, for the ``reason`` given. ``estimates`` has the best and the mean."""
+
+    laps: list[Lap]
+    method: str
+    confidence: float
+    reason: str
+    estimates: dict[str, EstimateEntry]
+
+
+class DeltaAnswer(TypedDict):
+    """Answers ``delta``: how far lap ``other`` is behind lap ``one`` at each place, and their speeds. Places
+    are in metres; in shares of the lap if its length is not known, and then the speeds are null."""
+
+    places: list[float]
+    unit: Literal["m", "%"]
+    delta_s: list[float]
+    one_mps: list[float | None]
+    other_mps: list[float | None]

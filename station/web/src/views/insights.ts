@@ -1,0 +1,107 @@
+// What the analysis says of a car's drives, or of the fleet's.
+
+import type { Config, InsightsAnswer, RunsAnswer } from "../base/contract";
+import { el, Text } from "../base/dom";
+import { dayTime, zone } from "../base/format";
+import { readTime, writeTime, type Range } from "../base/range";
+import { route, setAddress, type Query } from "../base/route";
+import { drivesTable } from "../insights/drives_table";
+import { findingsList } from "../insights/findings_list";
+import { LapsPanel } from "../insights/laps_panel";
+import { Parameters } from "../insights/parameters";
+import { styles } from "../insights/styles";
+import { ask, AnswerError } from "../server/answers";
+
+/** Groups of the catalogue that are shown in a way of their own. */
+const STYLE_GROUP = "Driving style";
+
+export class InsightsView {
+  readonly node: HTMLElement;
+  private readonly title = new Text("car-name", "h2");
+  private readonly tools = el("p", { class: "tools" });
+  private readonly note = new Text("history-note", "p", { role: "status" });
+  private readonly found = el("div", { class: "insights-part" });
+  private readonly driven = el("div", { class: "insights-part" });
+  private readonly parameters = new Parameters();
+  private readonly laps = new LapsPanel((laps) => this.write(laps));
+  private loading: AbortController | undefined;
+  private robot: string | undefined;
+  private answer: InsightsAnswer | undefined;
+  private drive: Range | undefined;
+
+  constructor(private readonly config: Config) {
+    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
+    const served = [this.note.node, this.found, this.laps.node, this.parameters.node, this.driven];
+    this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
+  }
+
+  /** Show a robot's insights, or the fleet's if undefined. */
+  show(robot: string | undefined, query: Query<"insights"> = {}): void {
+    this.title.set(robot ?? "Fleet");
+    this.tools.replaceChildren(...(robot === undefined ? [] : [el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"), el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"), el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet")]));
+    if (!this.config.answers) return;
+    if (robot === this.robot && this.answer) void this.present(query);
+    else void this.load(robot, query);
+  }
+
+  leave(): void {
+    this.loading?.abort();
+    this.answer = undefined;
+    this.laps.clear();
+    this.parameters.clear();
+  }
+
+  private async load(robot: string | undefined, query: Query<"insights">): Promise<void> {
+    this.loading?.abort();
+    const loading = (this.loading = new AbortController());
+    this.robot = robot;
+    this.answer = undefined;
+    for (const part of [this.found, this.driven]) part.replaceChildren();
+    this.parameters.clear();
+    this.laps.clear();
+    this.laps.node.hidden = true;
+    this.note.set("Loading …");
+    try {
+      this.answer = await ask<InsightsAnswer>("insights", robot === undefined ? {} : { robot }, loading.signal);
+      if (!loading.signal.aborted) await this.present(query);
+    } catch (error) {
+      if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+    }
+  }
+
+  private async present(query: Query<"insights">): Promise<void> {
+    const { robot, loading } = this;
+    const answer = this.answer!;
+    const { findings, drives, groups } = answer;
+    const newest = drives[0];
+    const of = robot ?? "the fleet";
+    const state = newest ? `The newest analysed drive began ${dayTime(newest.from_us / 1e6)} ${zone(newest.from_us / 1e6)}.` : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
+    this.note.set(state);
+    const list = findingsList(findings, robot === undefined);
+    const nothing = el("p", { class: "unserved" }, newest ? `Nothing about ${of} differs from its earlier drives by more than chance.` : "There are no findings without analysed drives.");
+    this.found.replaceChildren(list.childElementCount > 0 ? list : nothing);
+    const wanted = readTime(query.drive);
+    const chosen = drives.find(({ from_us }) => Math.abs(from_us / 1e6 - wanted) < 0.01) ?? drives.find(({ failed }) => failed === "");
+    if (robot === undefined) {
+      this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, undefined)] : []));
+      return;
+    }
+    const bars = styles(drives, groups[STYLE_GROUP] ?? {});
+    this.driven.replaceChildren(...(bars ? [bars] : []), ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
+    this.parameters.show(answer, [STYLE_GROUP]);
+    this.drive = chosen ? [chosen.from_us / 1e6, chosen.to_us / 1e6] : await this.newestRun(robot, loading!.signal);
+    this.laps.node.hidden = this.drive === undefined;
+    if (this.drive && !loading!.signal.aborted) await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
+  }
+
+  /** Before anything is analysed, laps are those of the newest run. */
+  private async newestRun(robot: string, signal: AbortSignal): Promise<Range | undefined> {
+    const { runs } = await ask<RunsAnswer>("runs", { robot, count: "1" }, signal);
+    return runs[0] && [runs[0].from_us / 1e6, runs[0].to_us / 1e6];
+  }
+
+  private write(laps: readonly number[]): void {
+    const { robot, drive } = this;
+    if (robot !== undefined && drive) setAddress({ view: "insights", robot, query: { drive: writeTime(drive[0]), laps: laps.join(",") } });
+  }
+}
