@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from aws_cdk import App
-from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
-from aws_cdk import aws_scheduler as scheduler
-from aws_cdk import aws_scheduler_targets as targets
 
 from iort_contract.archive import ARCHIVE_PREFIX, DUE, SWEEP, TASK
 from iort_contract.catalog.environments import ArchiveEnvironment
@@ -15,6 +12,7 @@ from stacks.parts import layers
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import allow, function
 from stacks.parts.queue import queue
+from stacks.parts.schedule import schedules
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -30,7 +28,7 @@ class Archive(PlatformStack):
 
     def __init__(self, app: App, settings: Settings, *, storage: Storage, quarantine: Quarantine) -> None:
         super().__init__(app, "archive", settings, storage.encryption)
-        tasks = queue(self, "Tasks", reader_timeout_s=_TIMEOUT_S, failures=quarantine.rejected)
+        tasks = queue(self, "ArchiveTasks", reader_timeout_s=_TIMEOUT_S, failures=quarantine.rejected)
         archive = function(
             self,
             "Archive",
@@ -66,31 +64,15 @@ class Archive(PlatformStack):
         tasks.grant_consume_messages(archive)
         lambda_.EventSourceMapping(
             self,
-            "TasksOfArchive",
+            "Tasks",
             target=archive,
             event_source_arn=tasks.queue_arn,
             batch_size=1,
             max_concurrency=_AT_ONCE,
         )
-        self._schedule("Hourly", archive, scheduler.ScheduleExpression.cron(minute="15"), DUE)
-        self._schedule("Daily", archive, scheduler.ScheduleExpression.cron(minute="40", hour="2"), SWEEP)
-
-    def _schedule(
-        self, name: str, archive: lambda_.Function, when: scheduler.ScheduleExpression, task: str
-    ) -> None:
-        caller = iam.Role(
-            self,
-            f"{name}Role",
-            assumed_by=iam.ServicePrincipal(
-                "scheduler.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
-            ),
-        )
-        scheduler.Schedule(
-            self,
-            name,
-            schedule=when,
-            enabled=self.settings.archive,
-            target=targets.LambdaInvoke(
-                archive, role=caller, input=scheduler.ScheduleTargetInput.from_object({TASK: task})
-            ),
-        )
+        # Every hour at a quarter past, and at night.
+        when = {
+            "Hourly": ("cron(15 * * * ? *)", {TASK: DUE}),
+            "Daily": ("cron(40 2 * * ? *)", {TASK: SWEEP}),
+        }
+        schedules(self, archive, when, on=settings.archive)

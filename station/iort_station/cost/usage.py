@@ -52,9 +52,9 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 28
-    insights_metrics: int = 53
-    dashboards: tuple[int, ...] = (47, 13, 20)
+    alarms: int = 33
+    insights_metrics: int = 55
+    dashboards: tuple[int, ...] = (49, 20, 20)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False
