@@ -11,6 +11,7 @@ from boto3.dynamodb.types import TypeSerializer
 from botocore.exceptions import ClientError
 
 from functions.shared.tables import Tables
+from iort_contract.archive import HOUR
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.checks import json_object
 from iort_contract.codec.seconds import flat_second
@@ -21,10 +22,10 @@ from iort_contract.topics import RECORD, build_topic
 
 serialize = TypeSerializer().serialize
 
-TELEMETRY, SUMMARY, ROBOTS, QUARANTINE = "telemetry", "summary", "robots", "quarantine"
+TELEMETRY, SUMMARY, ROBOTS, QUARANTINE, ARCHIVE = "telemetry", "summary", "robots", "quarantine", "archive"
 # The arguments of Tables, as Lambda 2 gets them.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
-KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
+KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,), ARCHIVE: (TOPIC, HOUR)}
 TOPIC_OF_CAR = build_topic(RECORD, "car", VESC_STREAM)
 EXPIRES = 1_800_000_000
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining import anomalies, battery, laps, style
+from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style
 from iort_analysis.results import DriveResult, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
@@ -23,7 +23,14 @@ from iort_contract.messages.findings import DriveKey, Estimate
 Miner = Callable[[Drive], Mined]
 # By the name that a result gives as missing if the miner fails.
 MINERS: Mapping[str, Miner] = MappingProxyType(
-    {"anomalies": anomalies.mine, "battery": battery.mine, "laps": laps.mine, "style": style.mine}
+    {
+        "anomalies": anomalies.mine,
+        "battery": battery.mine,
+        "motor": motor.mine,
+        "drivetrain": drivetrain.mine,
+        "laps": laps.mine,
+        "style": style.mine,
+    }
 )
 
 

@@ -69,8 +69,6 @@ def _simulate(spec: DriveSpec) -> Simulated:
     times: dict[str, list[int]] = {VESC_STREAM: [], POSE_STREAM: []}
     names: dict[str, tuple[str, ...]] = {}
     heated = resistance = distance_m = slid_s = 0.0
-    battery = vehicle.battery
-    full_v = battery.open_v
     for i in range(count):
         vehicle.step(dt, None if stands <= i < count - stands else _STANDING)
         now_us = spec.key.start_us + i * 1_000_000 // RATE_HZ + round(abs(jitter.gauss(0, _JITTER_US)))
@@ -98,9 +96,7 @@ def _simulate(spec: DriveSpec) -> Simulated:
         "motor_resistance_now_ohm": resistance / heated,
         "distance_m": distance_m,
         "slid_s": slid_s,
-        "charge_left": battery.charge,
-        "open_voltage_v": battery.open_v,
-        "voltage_per_ah": (full_v - battery.open_v) / (battery.drawn_ah - battery.regen_ah),
+        "charge_left": vehicle.battery.charge,
         "motor_degc": vehicle.heat.motor_degc,
         "board_degc": vehicle.heat.board_degc,
     }

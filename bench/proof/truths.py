@@ -14,7 +14,4 @@ def _same(name: str) -> Truth:
 # By the names of `iort_contract.catalog.findings.PARAMETERS`.
 TRUTHS: dict[str, Truth] = {
     "battery_resistance_ohm": _same("battery_resistance_ohm"),
-    "battery_slow_resistance_ohm": _same("battery_slow_resistance_ohm"),
-    "battery_open_voltage_v": _same("open_voltage_v"),
-    "battery_voltage_per_ah": _same("voltage_per_ah"),
 }

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 # 2.5 on a recorded drive at 50 Hz.
 _HOLE = 3.0
 _SECOND_US = 1_000_000
+# The clocks of a stream's publishers may differ by this much before batches count as missing.
+ASIDE_US = 10_000_000
 _NUMBERS = {int, float}
 
 
@@ -68,7 +70,7 @@ def summarize_second(
     without, absences = without_absent(columns)
     if absences:
         counts[ABSENT] = sum(absences.values())
-    found = {name: _statistics(column) for name, column in {**without, **derive(without, vehicle)}.items()}
+    found = {name: statistics_of(column) for name, column in {**without, **derive(without, vehicle)}.items()}
     return packed_second(counts, {name: known for name, known in found.items() if known is not None})
 
 
@@ -126,7 +128,7 @@ def count_holes(times_us: Sequence[int]) -> int:
     return 0 if max(steps) <= limit else sum(step > limit for step in steps)
 
 
-def _statistics(column: Sequence[Value]) -> Statistics:
+def statistics_of(column: Sequence[Value]) -> Statistics:
     """Min, mean, max and last of a numeric column, or one value if all are equal; the last value of any other
     column; None for an empty one."""
     numbers = numbers_of(column)

@@ -7,6 +7,7 @@ from datetime import datetime, timedelta, timezone
 from typing import Any, TypeAlias
 
 from iort_contract.messages.insights import Extent
+from iort_contract.messages.page import Archived
 from iort_station.errors import UsageError
 
 Time: TypeAlias = int | str | datetime
@@ -93,6 +94,11 @@ def between(extent: Extent) -> dict[str, Any]:
         "to": iso(end_us),
         "to_ms": -(-end_us // 1000),
     }
+
+
+def between_hours(archived: Archived) -> dict[str, Any]:
+    """What came from the archive, for JSON."""
+    return {**between(archived), "hours": archived["hours"]}
 
 
 def _iso(t_us: int, to: str) -> str:

@@ -201,4 +201,4 @@ def history(asked: Mapping[str, str]) -> HistoryAnswer:
         for name, value in SAMPLE.items()
         if isinstance(value, (int, float))
     }
-    return {"times_s": times, "fields": fields, "samples": 200, "ros2": False, "row_s": 2}  # type: ignore[typeddict-item]  # means alone
+    return {"times_s": times, "fields": fields, "samples": 200, "ros2": False, "archive": None, "row_s": 2}  # type: ignore[typeddict-item]  # means alone

@@ -33,11 +33,25 @@ class Recorded:
         if asked["stream"] == LOG_STREAM:
             line = {"level": "warning", "logger": "iort_agent.mqtt", "text": "connection lost", "left_out": 0}
             fields = {name: {"mean": [value]} for name, value in line.items()}
-            return {"times_s": [last - 60], "fields": fields, "samples": 1, "ros2": False, "row_s": 0}
+            return {
+                "times_s": [last - 60],
+                "fields": fields,
+                "samples": 1,
+                "ros2": False,
+                "archive": None,
+                "row_s": 0,
+            }
         self.asked_s.append(last - first)
         times = [first + i / 10 for i in range(int((last - first) * 10))]
         fields = {"voltage_input": {"mean": [10.0] * len(times)}, "frame": {"mean": ["map"] * len(times)}}
-        return {"times_s": times, "fields": fields, "samples": len(times), "ros2": False, "row_s": 0.1}
+        return {
+            "times_s": times,
+            "fields": fields,
+            "samples": len(times),
+            "ros2": False,
+            "archive": None,
+            "row_s": 0.1,
+        }
 
 
 @pytest.fixture

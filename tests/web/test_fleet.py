@@ -37,7 +37,14 @@ def served(pubnub: PubNubStandIn, vehicles: dict[str, Any]) -> Iterator[str]:
         "tags": lambda _: {"tags": TAGS},
         "vehicles": lambda _: {"vehicles": vehicles},
         "streams": lambda _: {"streams": []},
-        "history": lambda _: {"times_s": [], "fields": {}, "samples": 0, "ros2": False, "row_s": 0},
+        "history": lambda _: {
+            "times_s": [],
+            "fields": {},
+            "samples": 0,
+            "ros2": False,
+            "archive": None,
+            "row_s": 0,
+        },
     }
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
     with PageServer(namespace="iort", answers=answers, **told) as server:

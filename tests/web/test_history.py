@@ -18,6 +18,7 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.page.answers import answers
 from iort_station.page.downloads import downloads
 from iort_station.page.server import PageServer
+from tests.archived import FakeS3, archive, expire
 from tests.browser import plain, until
 from tests.fakes import TELEMETRY, item_of
 from tests.unit.station.test_data import START, cloud_of
@@ -53,7 +54,7 @@ def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
 
 
 class Past:
-    """A car's two runs, and the requests for its history."""
+    """A car's two runs, and the requests for its history; `expire` archives them, and deletes them."""
 
     def __init__(self) -> None:
         self.asked: list[dict[str, str]] = []
@@ -61,6 +62,7 @@ class Past:
             *drive("00000001", START, FIRST_S), *drive("00000002", LATER_US, SECOND_S), page_items=100
         )
         agent = Batch("00000001", 0, [START, START + SECOND // 2], {"cpu_percent": [3.5, 4.5]})
+        self.cloud = cloud
         cloud.table.put(TELEMETRY, item_of(agent, build_topic(RECORD, "car", "agent")))
         served = answers(cloud)  # type: ignore[arg-type]  # a fake
         self.answers = {name: served[name] for name in ("streams", "runs", "history", "vehicles")}
@@ -72,6 +74,11 @@ class Past:
             return history(asked)
 
         self.answers["history"] = watched
+
+    def expire(self) -> None:
+        self.cloud.bucket = FakeS3()
+        archive(self.cloud.table, self.cloud.bucket)
+        expire(self.cloud.table)
 
 
 @pytest.fixture
@@ -140,6 +147,14 @@ def test_the_history_of_an_offline_car_opens_at_its_newest_run(page: Page) -> No
     assert address(page) == f"#/history/car?stream=vesc&{FIRST}"
     page.get_by_role("button", name="Last 1 min").click()
     loaded(page, "Nothing was stored in this range. vesc is stored from Tue 14 Nov 22:13:20")
+
+
+def test_what_has_expired_is_shown_from_the_archive(page: Page, past: Past) -> None:
+    past.expire()
+    page.reload()
+    loaded(page, "From the archive.")
+    loaded(page, "1500 samples")
+    assert page.locator("section.panel .u-over").count() > 0
 
 
 def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(

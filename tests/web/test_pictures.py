@@ -143,7 +143,14 @@ def test_the_history_shows_the_picture_of_the_selected_time(
     def history(asked: Any) -> dict[str, Any]:
         first = int(asked["from_us"]) / 1e6
         times = [first + 0.5 * i for i in range(len(rows))]
-        return {"times_s": times, "fields": fields, "samples": len(rows), "ros2": False, "row_s": 0}
+        return {
+            "times_s": times,
+            "fields": fields,
+            "samples": len(rows),
+            "ros2": False,
+            "archive": None,
+            "row_s": 0,
+        }
 
     answers = {"streams": lambda _: {"streams": [STREAM]}, "history": history}
     told = {"namespace": "iort", "subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}

@@ -30,7 +30,14 @@ def history(asked: Any) -> dict[str, Any]:
     """Return two samples, a second apart."""
     first = int(asked["from_us"]) / 1e6
     fields = {"speed": {"mean": list(SPEED_ERPM)}, "voltage_input": {"mean": [12.0, 11.5]}}
-    return {"times_s": [first, first + 1], "fields": fields, "samples": 2, "ros2": False, "row_s": 0}
+    return {
+        "times_s": [first, first + 1],
+        "fields": fields,
+        "samples": 2,
+        "ros2": False,
+        "archive": None,
+        "row_s": 0,
+    }
 
 
 @contextmanager

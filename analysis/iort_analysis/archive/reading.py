@@ -14,14 +14,15 @@ import pyarrow.parquet as pq
 from iort_analysis.archive import columns as names
 from iort_analysis.archive.columns import MIXED, column_name, named, runs, to_numpy
 from iort_analysis.samples.batches import Part, Wanted
-from iort_analysis.samples.blocks import Block, column_of
+from iort_analysis.samples.blocks import Block, Column, column_of
 from iort_contract.archive import Hour
-from iort_contract.dynamodb import Item
+from iort_contract.dynamodb import Item, Keys, starting_between
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, SAMPLES
 
 # In the file's metadata: the first row group and the number of them by hour, and the fields' kinds.
 HOURS, KINDS = b"iort:hours", b"iort:kinds"
+ALL = starting_between(None, None)
 _HEAD = (names.BATCH_ID, names.RECEIVED, names.NOT_FINITE, names.PREVIOUS_RUNS, names.HASH)
 
 
@@ -55,20 +56,24 @@ class ArchiveFile:
         hour: Hour | None = None,
         wanted: Wanted = lambda _name: True,
         *,
-        first_us: int | None = None,
-        last_us: int | None = None,
+        keys: Keys = ALL,
         messages: bool = True,
-        but: frozenset[str] = frozenset(),
     ) -> Iterator[Part]:
-        """The samples in the order of their batches, with the fields that are ``wanted``; `in_order` brings
-        them into the order of time.
-
-        Row groups without any sample between two times are left out, and the batches whose ids are in
-        ``but``; without ``messages`` those of ROS messages, too.
+        """The samples of the batches with these keys and the fields that are ``wanted``, in the order of the
+        batches; `in_order` brings them into the order of time. Without ``messages``, batches of ROS messages
+        are left out.
         """
         for group in self.groups(hour):
-            if self._overlaps(group, first_us, last_us):
-                yield self._block(group, wanted, messages=messages, but=but)
+            if self._overlaps(group, keys) and (part := self._part(group, wanted, keys, messages=messages)):
+                yield part
+
+    def has_messages(self, hour: Hour | None = None) -> bool:
+        """Whether batches hold ROS messages as they were published."""
+        return any(
+            self._read(group, (names.LAYOUT,))[names.LAYOUT].null_count
+            < self._file.metadata.row_group(group).num_rows
+            for group in self.groups(hour)
+        )
 
     def headers(self, hour: Hour | None = None) -> Iterator[Item]:
         """The batches as stored items without their samples: id, count of samples, and what else is small."""
@@ -92,41 +97,39 @@ class ArchiveFile:
         fields = {column_name(name): named(name) for name in self.kinds}
         return table.rename_columns([fields.get(name, name) for name in table.column_names])
 
-    def _block(self, group: int, wanted: Wanted, *, messages: bool, but: frozenset[str]) -> Part:
+    def _part(self, group: int, wanted: Wanted, keys: Keys, *, messages: bool) -> Part | None:
         chosen = {name: column_name(name) for name in self.kinds if wanted(name)}
         own = (names.TIME, names.BATCH_ID, names.FIELDS, names.ABOUT, names.LAYOUT, names.OTHER)
         table = self._read(group, (*own, *chosen.values()))
         ids, rows = runs(table[names.BATCH_ID])
-        last_us = batch_id(ids[-1]).t_us
-        kept = [each not in but for each in ids]
+        kept = [keys.first["S"] <= each <= keys.last["S"] for each in ids]
         if not messages:
             heads = table.select([names.ABOUT, names.LAYOUT]).take(pa.array(rows[:-1])).to_pylist()
             kept = [keep and set(head.values()) == {None} for keep, head in zip(kept, heads, strict=True)]
+        if not any(kept):
+            return None
         if not all(kept):
             table = table.filter(pa.array(np.repeat(kept, np.diff(rows))))
         times = table[names.TIME].cast(pa.int64()).to_numpy()
-        present = {
-            name for text in runs(table[names.FIELDS])[0] for name in text.replace("|", ",").split(",")
+        # In the order in which the batches name them, as in their own decoding.
+        of_batches = runs(table[names.FIELDS])[0]
+        present = dict.fromkeys(name for text in of_batches for name in text.replace("|", ",").split(","))
+        columns = {
+            name: to_numpy(table[chosen[name]], is_json=self.kinds[name] == MIXED)
+            if name in chosen
+            else others(table[names.OTHER], name)
+            for name in present
+            if name and wanted(name)
         }
-        block = Block(times, {})
-        for name, column in chosen.items():
-            if name in present:
-                block.columns[name] = to_numpy(table[column], is_json=self.kinds[name] == MIXED)
-        self._add_others(block, table[names.OTHER], present, wanted)
-        return Part(block, last_us)
+        last = next(each for each, keep in zip(reversed(ids), reversed(kept), strict=True) if keep)
+        return Part(Block(times, columns), batch_id(last).t_us)
 
-    def _add_others(self, block: Block, others: Any, present: set[str], wanted: Wanted) -> None:
-        """Add the fields that have no column."""
-        missing = sorted(name for name in present - block.columns.keys() if name and wanted(name))
-        if missing:
-            rows = [json.loads(text or "{}") for text in others.to_pylist()]
-            block.columns.update({name: column_of([row.get(name) for row in rows]) for name in missing})
-
-    def _overlaps(self, group: int, first_us: int | None, last_us: int | None) -> bool:
-        if first_us is None and last_us is None:
+    def _overlaps(self, group: int, keys: Keys) -> bool:
+        if keys is ALL:
             return True
         low, high = self._spans[group]
-        return (last_us is None or low <= last_us) and (first_us is None or high >= first_us)
+        # A key begins with the time of its batch's first sample.
+        return low <= int(keys.last["S"][:16]) and high >= int(keys.first["S"][:16])
 
     @cached_property
     def _spans(self) -> list[tuple[int, int]]:
@@ -145,6 +148,11 @@ class ArchiveFile:
         table = self._file.read_row_group(group, columns=list(columns), use_threads=False)
         # Parquet takes a name with dots for a path, and reads what else begins like it.
         return table.select(list(columns)).combine_chunks().to_batches()[0]
+
+
+def others(texts: Any, name: str) -> Column:
+    """A field that has no column."""
+    return column_of([json.loads(text or "{}").get(name) for text in texts.to_pylist()])
 
 
 def head_of(table: Any, row: int) -> Item:

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.fitting import Fit, Prior, fit
-from iort_analysis.mining.intervals import mean_of
 from iort_analysis.mining.signals import binned, bridged, lagged, resolution, smooth_basis
-from iort_analysis.results import Event, Mined, Table
+from iort_analysis.results import Mined, Table
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
 from iort_contract.messages.findings import Estimate
 
@@ -36,8 +35,6 @@ _PIECE_S = 450.0
 # Shorter drives, and such with a steadier current, say too little.
 _LEAST_S, _LEAST_A = 60.0, 0.5
 _MOST_ROWS = 30_000
-# A cell that drops out lowers the voltage by at least this for at least so long.
-_DROP_V, _DROP_S = 0.2, 0.3
 _CURVE_POINTS = 21
 _NAMES = (
     "battery_resistance_ohm",
@@ -45,8 +42,6 @@ _NAMES = (
     "battery_open_voltage_v",
     "battery_voltage_per_ah",
 )
-# The chance of a fall that no load explains.
-_LEAST_P = 1e-9
 
 
 class Battery(NamedTuple):
@@ -55,7 +50,6 @@ class Battery(NamedTuple):
     fit: Fit
     open_columns: Array
     charge_ah: Array
-    voltage_v: Array
 
     def open_at(self, index: int) -> Estimate:
         """The open voltage at a row of the fit."""
@@ -71,7 +65,7 @@ class Battery(NamedTuple):
 
 
 def mine(drive: Drive) -> Mined:
-    """The battery's resistances, its open voltage against the charge drawn, and a cell that drops out."""
+    """The battery's resistances, and its open voltage against the charge drawn."""
     battery = fit_battery(drive)
     if isinstance(battery, str):
         return Mined(missing=dict.fromkeys(_NAMES, battery))
@@ -84,7 +78,7 @@ def mine(drive: Drive) -> Mined:
         "battery_open_voltage_v": battery.open_at(-1),
         "battery_voltage_per_ah": battery.slope(),
     }
-    return Mined(estimates, events=dropouts(drive, battery), tables={"battery": _curve(battery)})
+    return Mined(estimates, tables={"battery": _curve(battery)})
 
 
 def fit_battery(drive: Drive) -> Battery | str:
@@ -107,49 +101,7 @@ def fit_battery(drive: Drive) -> Battery | str:
     fitted = _with_slow(design[rows], voltage_v[rows], open_columns.shape[1])
     if fitted is None:
         return "the drive's currents do not tell the resistance from the open voltage"
-    return Battery(fitted, open_columns, charge_ah, design @ fitted.coefficients)
-
-
-def dropouts(drive: Drive, battery: Battery) -> list[Event]:
-    """The times when the voltage was lower than the circuit's by a good part of a cell's."""
-    measured_v = drive.of(drive.vesc, VOLTAGE_FIELD)
-    if measured_v is None:
-        return []
-    off_v = measured_v - battery.voltage_v
-    least_v = max(_DROP_V, 5 * battery.fit.sigma + resolution(measured_v) / 2)
-    low = np.concatenate([[False], off_v < -least_v, [False]])
-    edges = np.flatnonzero(low[1:] != low[:-1])
-    seconds = drive.seconds
-    found = [
-        (first, last - 1)
-        for first, last in zip(edges[::2], edges[1::2], strict=True)
-        if seconds[last - 1] - seconds[first] >= _DROP_S
-    ]
-    if not found:
-        return []
-    depths_v = np.array([-np.nanmean(off_v[first : last + 1]) for first, last in found])
-    worst = int(depths_v.argmax())
-    first, last = found[worst]
-    times_us = drive.samples.times_us
-    either_v = 2 * battery.fit.sigma
-    mean_v, low_v, high_v = (
-        mean_of(depths_v)
-        if len(found) > 1
-        else (float(depths_v[0]), float(depths_v[0]) - either_v, float(depths_v[0]) + either_v)
-    )
-    return [
-        Event(
-            "cell_dropout",
-            int(times_us[first]),
-            int(times_us[last]),
-            str(drive.vesc),
-            _FIELDS,
-            f"for {seconds[last] - seconds[first]:.1f} s the voltage was {depths_v[worst]:.2f} V below what"
-            f" the load explains; {len(found)} time{'s' * (len(found) > 1)} in this drive",
-            Estimate(mean_v, low_v, high_v, "V"),
-            _LEAST_P,
-        )
-    ]
+    return Battery(fitted, open_columns, charge_ah)
 
 
 def _with_slow(design: Array, voltage_v: Array, resistance: int) -> Fit | None:

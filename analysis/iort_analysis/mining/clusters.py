@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-# The silhouette needs every distance, so it is of this many points at most.
-_MOST_COMPARED = 600
+# The centres are of this many points at most. The silhouette needs every distance, so it is of fewer.
+_MOST_FITTED, _MOST_COMPARED = 1500, 600
 _ROUNDS = 60
 _STARTS = 3
 
@@ -32,19 +32,20 @@ def scaled(features: Floats) -> Floats:
 def cluster(points: Floats, most: int, seed: int = 0) -> Clusters:
     """The clusters of points, 2 to ``most``, that are best apart. The same points give the same clusters."""
     chance = np.random.default_rng(seed)
-    sample = chance.choice(len(points), min(_MOST_COMPARED, len(points)), replace=False)
-    apart = np.linalg.norm(points[sample, None] - points[sample], axis=2)
-    best = Clusters(np.zeros(len(points), dtype=np.intp), -1.0)
+    fitted = chance.permutation(points)[:_MOST_FITTED]
+    compared = fitted[:_MOST_COMPARED]
+    apart = np.sqrt(_squares(compared, compared))
+    centres, best = fitted[:1], -1.0
     for k in range(2, min(most, len(points)) + 1):
-        labels = min((_k_means(points, k, chance) for _ in range(_STARTS)), key=lambda found: found[1])[0]
-        silhouette = _silhouette(apart, labels[sample])
-        if silhouette > best.silhouette:
-            best = Clusters(labels, silhouette)
-    return best
+        found = min((_k_means(fitted, k, chance) for _ in range(_STARTS)), key=lambda tried: tried[1])[0]
+        silhouette = _silhouette(apart, _squares(compared, found).argmin(axis=1))
+        if silhouette > best:
+            centres, best = found, silhouette
+    return Clusters(_squares(points, centres).argmin(axis=1), best)
 
 
-def _k_means(points: Floats, k: int, chance: np.random.Generator) -> tuple[NDArray[np.intp], float]:
-    """Lloyd's rounds from far-apart points (k-means++): labels, and the sum of squared distances."""
+def _k_means(points: Floats, k: int, chance: np.random.Generator) -> tuple[Floats, float]:
+    """Lloyd's rounds from far-apart points (k-means++): centres, and the sum of squared distances."""
     centres = points[chance.integers(len(points))][None]
     while len(centres) < k:
         nearest = _squares(points, centres).min(axis=1)
@@ -62,7 +63,7 @@ def _k_means(points: Floats, k: int, chance: np.random.Generator) -> tuple[NDArr
         filled = np.unique(labels)
         centres = np.array([points[labels == each].mean(axis=0) for each in filled])
         labels = np.searchsorted(filled, labels)
-    return labels, float(_squares(points, centres).min(axis=1).sum())
+    return centres, float(_squares(points, centres).min(axis=1).sum())
 
 
 def _squares(points: Floats, centres: Floats) -> Floats:

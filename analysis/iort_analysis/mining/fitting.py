@@ -8,7 +8,7 @@ jackknife (Künsch 1989), which is the cluster-robust covariance CR3 (Bell and M
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +93,7 @@ def fit(
     return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma)
 
 
-def propagated(function: Callable[[Array], float], *parts: tuple[Array, Array], unit: str) -> Estimate:
+def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], unit: str) -> Estimate:
     """A function of the coefficients of independent fits, given with their covariances."""
     at = np.concatenate([coefficients for coefficients, _ in parts])
     deviations = np.concatenate([np.sqrt(np.diag(covariance)) for _, covariance in parts])
@@ -104,7 +104,7 @@ def propagated(function: Callable[[Array], float], *parts: tuple[Array, Array], 
         own = slopes[first : first + len(coefficients)]
         variance += float(own @ covariance @ own)
         first += len(coefficients)
-    return estimate(function(at), float(np.sqrt(variance)), unit)
+    return estimate(float(function(at)), float(np.sqrt(variance)), unit)
 
 
 def estimate(value: float, deviation: float, unit: str, blocks: int = BLOCKS) -> Estimate:
@@ -131,20 +131,21 @@ class _Problem(NamedTuple):
     def solve(self) -> tuple[Array, Array, float] | None:
         """The coefficients, their covariance and sigma."""
         sigma = max(float(np.std(self.y)), 1e-12)
-        score_weights, gram_weights = np.ones(len(self.y)), np.ones(len(self.y))
+        weights = np.ones(len(self.y))
         coefficients = np.zeros(self.rows.shape[1])
         for _ in range(_ROUNDS):
-            gram = self._gram(gram_weights / sigma**2)
+            gram = self._gram(weights / sigma**2)
             total = gram.sum(axis=0) + self.precision
-            # The outliers of the first rounds are no reason to give up; columns that are alike are.
             if np.linalg.cond(total) > _CONDITION:
                 return None
-            wanted = self.rows.T @ (score_weights * self.y) / sigma**2 + self.precision @ self.mean
+            wanted = self.rows.T @ (weights * self.y) / sigma**2 + self.precision @ self.mean
             coefficients = np.linalg.solve(total, wanted)
             residuals = self.y - self.rows @ coefficients
             sigma = max(1.4826 * float(np.median(np.abs(residuals))), 1e-9, self.resolution / 5)
-            score_weights = gram_weights = _biweight(residuals / sigma)
-        score = score_weights * residuals / sigma**2
+            weights = _biweight(residuals / sigma)
+        score = weights * residuals / sigma**2
+        # How fast the scores change with the coefficients: less than the weights, since those change too.
+        gram = self._gram(weights / sigma**2) * (_biweight_slope(residuals / sigma) / weights.mean())
         if self.resolution:
             refined = self._refined(coefficients, max(sigma / 2, self.resolution / 4))
             if refined is None:
@@ -206,3 +207,8 @@ def _starts(rows: int, blocks: int) -> NDArray[np.int64]:
 def _biweight(share: Array) -> Array:
     share = share / _TUKEY
     return np.asarray(np.where(np.abs(share) < 1, (1 - share**2) ** 2, 0.0), dtype=np.float64)
+
+
+def _biweight_slope(share: Array) -> float:
+    square = np.minimum((share / _TUKEY) ** 2, 1.0)
+    return float(((1 - square) * (1 - 5 * square)).mean())

@@ -5,10 +5,9 @@ A miner's estimate is an entry of `PARAMETERS`, a finding's kind one of `KINDS`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
+from iort_contract.catalog.car import BATTERY, FORCES, HEAT, MOTOR
 from iort_contract.catalog.kinds import KINDS
+from iort_contract.catalog.parameter import Parameter
 
 __all__ = [
     "GROUPS",
@@ -20,63 +19,6 @@ __all__ = [
     "STYLE_TABLE",
     "Parameter",
 ]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number that is estimated from a drive, with its unit.
-
-    ``worse`` is the direction of a change for the worse; ``kind`` names the finding about such a change,
-    empty if a change is no finding. A change counts from ``least`` in the unit and from ``least_share`` of
-    the baseline on: less means nothing on a car, and healthy drives differ by a quarter. ``fields`` are
-    those of the VESC that it was estimated from.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    worse: Literal["up", "down", "either"] = "either"
-    kind: str = ""
-    fields: tuple[str, ...] = ()
-    least: float = 0.0
-    least_share: float = 0.2
-
-    def least_change(self, baseline: float) -> float:
-        """The smallest change from a baseline that means something, in the unit."""
-        return max(self.least, self.least_share * abs(baseline))
-
-
-# One group a miner of analysis/iort_analysis/mining.
-_BATTERY_FIELDS = ("voltage_input", "current_input")
-_BATTERY = (
-    Parameter(
-        "battery_resistance_ohm",
-        "ohm",
-        "resistance of the battery and its wires at once",
-        worse="up",
-        kind="battery_worn",
-        fields=_BATTERY_FIELDS,
-    ),
-    Parameter(
-        "battery_slow_resistance_ohm",
-        "ohm",
-        "what the battery's resistance grows by within minutes of load",
-        worse="up",
-        fields=_BATTERY_FIELDS,
-    ),
-    Parameter(
-        "battery_open_voltage_v",
-        "V",
-        "open-circuit voltage at the drive's end, as after a long rest",
-        fields=_BATTERY_FIELDS,
-    ),
-    Parameter(
-        "battery_voltage_per_ah",
-        "V/Ah",
-        "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
-        fields=_BATTERY_FIELDS,
-    ),
-)
 
 _LAPS = (
     Parameter("lap_best_s", "s", "time of the best lap", worse="up"),
@@ -195,8 +137,10 @@ _SENSORS = (
 
 # The groups in the order in which a person reads them.
 GROUPS = {
-    "Battery": _BATTERY,
-    "Drivetrain": _DRIVETRAIN,
+    "Battery": BATTERY,
+    "Motor": MOTOR,
+    "Drivetrain": _DRIVETRAIN + FORCES,
+    "Heat": HEAT,
     "Sensors": _SENSORS,
     "Laps": _LAPS,
     "Driving style": _STYLES,

@@ -158,15 +158,24 @@ class Column(_Mean, total=False):
     most: list[Value]
 
 
+class Archived(Extent):
+    """The part of an answer that comes from the archive: the number of its hours, and the first and last of
+    their times."""
+
+    hours: int
+
+
 class HistoryAnswer(TypedDict):
     """Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0
-    if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units."""
+    if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units.
+    ``archive`` is null if all comes from the table."""
 
     times_s: list[float]
     fields: dict[str, Column]
     samples: int
     ros2: bool
     row_s: float
+    archive: Archived | None
 
 
 class Series(TypedDict):

@@ -10,19 +10,17 @@ from typing import Any, NamedTuple
 from functions.shared.tables import Tables
 from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_COLUMNS_BYTES, ContractError
 from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_item
-from iort_contract.statistics import missing_before
+from iort_contract.statistics import ASIDE_US, missing_before
 from iort_contract.tables import BATCH, EXPIRES_S
 
 _SECOND_US = 1_000_000
-# The clocks of a stream's publishers may differ by this much before batches count as missing.
-_ASIDE_US = 10_000_000
 # The limits of batches and column bytes per second and stream: a robot beyond them must not delay others. AWS
 # takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
 # Seconds are read together until they are as much as one may be.
 _TOGETHER_BYTES = _SECOND_BYTES
 # The number of a second's neighbours to read: as many as the seconds beside it may hold.
-_NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
+_NUMBERS = SECOND_BATCHES * (2 * ASIDE_US // _SECOND_US + 1)
 # Beside those of the event: the one before and the one after.
 _BESIDE = 2
 # An undecodable neighbour is skipped; this many of them end the search.
@@ -94,7 +92,7 @@ class Reader:
         """The batches of a second and to its sides, read once for all holes of the second."""
         if self._near[0] != second:
             start_us = second * _SECOND_US
-            near = self.tables.numbers(self.topic, start_us - _ASIDE_US, start_us + _SECOND_US + _ASIDE_US)
+            near = self.tables.numbers(self.topic, start_us - ASIDE_US, start_us + _SECOND_US + ASIDE_US)
             self._near = second, list(islice(near, _NUMBERS))
         return self._near[1]
 

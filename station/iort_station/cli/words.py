@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 
+from iort_contract.messages.page import Archived
 from iort_station.texts import visible
+from iort_station.times import iso_s
 
 
 def say(text: str) -> None:
@@ -16,3 +18,10 @@ def examples(*commands: str) -> str:
     """The end of a verb's help: commands that work as they are. Tests run them."""
     # The first line keeps click from joining the others.
     return "\n".join(["\b", "Examples:", *(f"  iort {command}" for command in commands)])
+
+
+def say_archived(archived: Archived | None) -> None:
+    """Say what came from the archive, if something did."""
+    if archived is not None:
+        hours = "an hour" if archived["hours"] == 1 else f"{archived['hours']:,} hours"
+        say(f"{hours} from the archive, {iso_s(archived['from_us'])} to {iso_s(archived['to_us'])}")

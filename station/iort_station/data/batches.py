@@ -1,18 +1,15 @@
-"""The stored batches of a stream, read from the telemetry table."""
+"""The tables of recorded batches and of their seconds."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
-from iort_analysis.samples.batches import ATTRIBUTES, Item, start_us
-from iort_contract.dynamodb import SummaryTable, TelemetryTable, with_samples_between
-from iort_contract.tables import BATCH
+from iort_contract.dynamodb import SummaryTable, TelemetryTable
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.selection import Selection
 
 # Receives the number of items in a page, and the start time of its last item in microseconds.
 PageProgress = Callable[[int, int], None]
@@ -34,28 +31,6 @@ def topic_of(cloud: Cloud, robot: str, stream: str) -> str:
     return build_topic(RECORD, robot, stream, cloud.namespace)
 
 
-def stored(
-    cloud: Cloud,
-    selection: Selection,
-    attributes: Sequence[str] = ATTRIBUTES,
-    *,
-    scan: bool = False,
-    progress: PageProgress | None = None,
-) -> Iterator[Sequence[Item]]:
-    """Pages of the stored items that may hold samples of the selection, in order of time."""
-    topic = topic_of(cloud, selection.robot, selection.stream)
-    keys = with_samples_between(selection.start_us, selection.end_us)
-    pages = telemetry_table(cloud).pages(topic, keys, attributes=attributes, scan=scan)
-    found: Iterator[Sequence[Item]] = (page.items for page in pages)
-    if scan:
-        # A scan has no order.
-        found = iter([sorted(chain.from_iterable(found), key=lambda item: str(item[BATCH]["S"]))])
-    for items in ahead(found):
-        if progress is not None and items:
-            progress(len(items), start_us(items[-1]))
-        yield items
-
-
 def ahead(items: Iterable[_T]) -> Iterator[_T]:
     """The items; while the caller uses one, a thread reads the next."""
     iterator, end = iter(items), object()
@@ -64,3 +39,22 @@ def ahead(items: Iterable[_T]) -> Iterator[_T]:
         while (item := coming.result()) is not end:
             coming = reader.submit(next, iterator, end)
             yield item  # type: ignore[misc]  # it is not `end`
+
+
+class Pages(Generic[_T]):
+    """Pages of a table's items in the order of their keys, to be taken up to some key."""
+
+    def __init__(self, pages: Iterator[Sequence[_T]], key: Callable[[_T], Any]) -> None:
+        self._pages, self._key = filter(None, pages), key
+        self._rest = next(self._pages, ())
+
+    def until(self, key: Any) -> Iterator[Sequence[_T]]:
+        """The items before a key; None is all."""
+        while self._rest:
+            end = len(self._rest) if key is None else bisect_left(self._rest, key, key=self._key)
+            if end:
+                yield self._rest[:end]
+            if end < len(self._rest):
+                self._rest = self._rest[end:]
+                return
+            self._rest = next(self._pages, ())

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
-from dataclasses import replace
 
-from iort_analysis.samples.batches import RefusedItems, blocks
-from iort_analysis.samples.blocks import Block, join, values
+from iort_analysis.samples.batches import RefusedItems, in_order
+from iort_analysis.samples.blocks import EMPTY, Block, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import batch_id
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.tables import BATCH, STREAMS
+from iort_contract.tables import STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data.batches import stored, telemetry_table, topic_of
+from iort_station.data.recorded import Recorded
 from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown
@@ -131,10 +130,10 @@ def _announced(cloud: Cloud, robot: str, *, newest: bool) -> set[str]:
     for own in (TYPES_STREAM, ACCOUNT_STREAM):
         start_us = None
         if newest:
-            item = telemetry_table(cloud).first(topic_of(cloud, robot, own), newest=True, attributes=(BATCH,))
-            if item is None:
+            last = Recorded(cloud, robot, own).before(None)
+            if last is None:
                 continue
-            start_us = batch_id(item[BATCH]["S"]).t_us
+            start_us = last.t_us
         for block in _blocks(cloud, robot, own, start_us):
             names |= {name for name in block.columns.get("stream", ()) if isinstance(name, str)}
     return names
@@ -142,28 +141,30 @@ def _announced(cloud: Cloud, robot: str, *, newest: bool) -> set[str]:
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:
     """The start times of a stream's oldest and newest batches as ISO 8601; None if it has none."""
-    table, topic = telemetry_table(cloud), topic_of(cloud, robot, stream)
-    ends = [table.first(topic, newest=newest, attributes=(BATCH,)) for newest in (False, True)]
-    first, last = ("" if item is None else iso(batch_id(item[BATCH]["S"]).t_us) for item in ends)
-    return (first, last) if first and last else None
+    recorded = Recorded(cloud, robot, stream)
+    first, last = recorded.after(None), recorded.before(None)
+    return None if first is None or last is None else (iso(first.t_us), iso(last.t_us))
 
 
 def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
-    return telemetry_table(cloud).first(topic_of(cloud, robot, stream), attributes=(BATCH,)) is not None
+    return Recorded(cloud, robot, stream).after(None) is not None
 
 
 def _blocks(cloud: Cloud, robot: str, stream: str, start_us: int | None = None) -> Iterator[Block]:
-    selection = Selection(robot=robot, stream=stream, start_us=start_us)
-    return blocks(stored(cloud, selection), RefusedItems())
+    parts = Recorded(cloud, robot, stream).parts(with_samples_between(start_us, None), RefusedItems())
+    return in_order(parts)
 
 
 def newest_block(cloud: Cloud, robot: str, stream: str) -> Block:
     """The samples of a stream's newest batch."""
-    item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
-    return join(list(blocks([[item]] if item else [], RefusedItems())))
+    recorded = Recorded(cloud, robot, stream)
+    last = recorded.before(None)
+    return EMPTY if last is None else recorded.block(last)
 
 
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:
     """The fields of the first stored samples in the selection's range."""
-    page = next(stored(cloud, replace(selection, fields=None, condition=None)), ())
-    return {name for block in blocks([page], RefusedItems()) for name in block.columns}
+    keys = with_samples_between(selection.start_us, selection.end_us)
+    parts = Recorded(cloud, selection.robot, selection.stream).parts(keys, RefusedItems())
+    page = next(parts, None)
+    return set() if page is None else set(page.block.columns)

@@ -11,21 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.samples.batches import RefusedItems, blocks
+from iort_analysis.samples.batches import RefusedItems, in_order
 from iort_analysis.samples.blocks import Block, Column, join, resample
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
+from iort_contract.dynamodb import with_samples_between
 from iort_contract.messages.message_type import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
-from iort_station.data.batches import PageProgress, stored
+from iort_station.data.batches import PageProgress
 from iort_station.data.conditions import derive, holds
+from iort_station.data.recorded import AUTO, TABLE, Origin, Recorded, Source
 from iort_station.data.selection import Selection, select
-from iort_station.data.summary import seconds
+from iort_station.data.summary import in_column_order, seconds
 from iort_station.data.units import unit
 from iort_station.errors import StationError
-from iort_station.times import Time, duration_us
+from iort_station.times import Time, duration_us, iso_s
 
 # Where samples are selected: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
@@ -40,8 +42,8 @@ class Result:
     ``times_us`` are int64 microseconds since the epoch. ``columns`` has an array per field: float64 with NaN
     for null, bool for flags, objects for texts. ``refused`` counts stored items that are not batches;
     ``reason`` is the first one's error. ``absent`` counts values by field that became null because their
-    sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units. ``kind_of``
-    returns the type of the stream's messages, if known.
+    sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units. ``origin``
+    tells what came from the archive. ``kind_of`` returns the type of the stream's messages, if known.
     """
 
     robot: str
@@ -52,6 +54,7 @@ class Result:
     reason: str = ""
     ros2: bool = False
     absent: Mapping[str, int] = field(default_factory=dict)
+    origin: Origin = field(default_factory=Origin)
     kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -82,6 +85,7 @@ def query(
     every: str | None = None,
     summary: bool = False,
     on: str = CLIENT,
+    source: Source = AUTO,
     scan: bool = False,
     progress: PageProgress | None = None,
     most: int | None = None,
@@ -93,24 +97,35 @@ def query(
     `iort_contract.expression`, may name the derived fields ``speed_mps`` and ``power_w``. ``every`` (such as
     ``"1s"``) averages samples, see `iort_analysis.samples.blocks.resample`. ``summary`` reads the seconds
     that Lambda 2 has written; a field then stands for its ``_min``, ``_mean``, ``_max`` and ``_last``.
-    ``on="lambda"`` selects the samples in the cloud. ``scan`` reads by Scan instead of Query.
+    ``on="lambda"`` selects the samples in the cloud. ``source`` is "table" or "archive" to read only there.
+    ``scan`` reads by Scan instead of Query.
 
     Raises `StationError` for an unknown robot, stream or field, naming the known ones; for an invalid time or
     condition; and for more values than ``most``.
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
-    refused, absent_values = RefusedItems(), Counter[str]()
+    refused, absent_values, origin = RefusedItems(), Counter[str](), Origin()
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; query the summary without --on lambda")
+        _check_in_table(cloud, selection, source)
         found = query_function.samples(
             cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress
         )
     elif summary:
-        found = seconds(cloud, selection, scan=scan, progress=progress)
+        found = seconds(cloud, selection, source=source, origin=origin, scan=scan, progress=progress)
     else:
-        found = samples(cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress)
+        found = samples(
+            cloud,
+            selection,
+            refused=refused,
+            absent=absent_values,
+            source=source,
+            origin=origin,
+            scan=scan,
+            progress=progress,
+        )
     ros2 = False
 
     def watched() -> Iterator[Block]:
@@ -126,6 +141,8 @@ def query(
             yield block
 
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
+    if summary and fields is None:
+        block = in_column_order(block)
     if not len(block.times_us):
         inventory.check_there(cloud, robot, stream)
     return Result(
@@ -137,6 +154,7 @@ def query(
         refused.reason,
         ros2,
         absent_values,
+        origin.within(selection.start_us, selection.end_us),
         cache(partial(inventory.kind_of, cloud, selection)),
     )
 
@@ -147,6 +165,8 @@ def samples(
     *,
     refused: RefusedItems | None = None,
     absent: Counter[str] | None = None,
+    source: Source = AUTO,
+    origin: Origin | None = None,
     scan: bool = False,
     progress: PageProgress | None = None,
     messages: bool = True,
@@ -154,11 +174,15 @@ def samples(
     """The selection's samples block by block, for ranges that do not fit in memory.
 
     ``absent`` counts values of sensors that are not fitted, which become null; without it they stay as
-    recorded. Without ``messages``, samples of ROS messages are skipped. Raises `StationError` at the end for
-    a named field that no sample has.
+    recorded. Without ``messages``, samples of ROS messages are skipped. ``origin`` grows by what comes from
+    the archive. Raises `StationError` at the end for a named field that no sample has.
     """
-    pages = stored(cloud, selection, scan=scan, progress=progress)
-    found = blocks(pages, refused or RefusedItems(), selection.needs, messages=messages)
+    recorded = Recorded(cloud, selection.robot, selection.stream, source=source, origin=origin)
+    keys = with_samples_between(selection.start_us, selection.end_us)
+    parts = recorded.parts(
+        keys, refused or RefusedItems(), selection.needs, messages=messages, scan=scan, progress=progress
+    )
+    found = in_order(parts)
     named = selection.named()
     derived = sorted(named & DERIVED.keys())
     vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None
@@ -183,6 +207,19 @@ def samples(
             yield chosen
     if some and not named <= there:
         raise inventory.unknown_fields(cloud, selection, there)
+
+
+def _check_in_table(cloud: Cloud, selection: Selection, source: Source) -> None:
+    """Raise `StationError` if the query function, which reads the table only, would leave something out."""
+    if source == TABLE:
+        return
+    recorded = Recorded(cloud, selection.robot, selection.stream, source=source)
+    hours = recorded.archived(with_samples_between(selection.start_us, selection.end_us))
+    if told := Origin(hours).within(selection.start_us, selection.end_us).told():
+        raise StationError(
+            f"the query function reads the table only, from which {told['hours']:,} hours of this range have "
+            f"expired, or soon will: leave out --on lambda, or start at {iso_s(told['to_us'])}"
+        )
 
 
 def has_fraction(block: Block) -> bool:

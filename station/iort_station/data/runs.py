@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 from iort_analysis.samples.batches import ATTRIBUTES
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
-from iort_contract.dynamodb import Keys, plain, starting_between
+from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
-from iort_contract.messages.batch import BatchId, batch_id, decode_batch, open_batch
+from iort_contract.messages.batch import BatchId, decode_batch
 from iort_contract.messages.insights import Extent
 from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
-from iort_contract.tables import BATCH, RECEIVED_MS
+from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.recorded import Recorded
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
@@ -145,16 +145,16 @@ class _Reader:
     """Reads single batches of a stream."""
 
     def __init__(self, cloud: Cloud, robot: str, stream: str) -> None:
-        self._table, self._topic = telemetry_table(cloud), topic_of(cloud, robot, stream)
+        self._recorded = Recorded(cloud, robot, stream)
 
     def whole(self) -> Part | None:
         """All that is stored of the stream; None if nothing is."""
-        first, last = self._from(None), self._before(None)
+        first, last = self._recorded.after(None), self._recorded.before(None)
         return None if first is None or last is None else Part(first, last, self._end_us(last))
 
     def parts(self, start_us: int | None, end_us: int | None) -> Iterator[Part]:
         """What each run recorded in a range, newest first; the first one may begin before the range."""
-        last = self._before(end_us)
+        last = self._recorded.before(end_us)
         while last is not None and (start_us is None or last.t_us + MAX_BATCH_SPAN_US > start_us):
             first, before = self._first_of(last)
             yield Part(first, last, self._end_us(last))
@@ -162,7 +162,7 @@ class _Reader:
 
     def boot_from(self, t_us: int) -> str | None:
         """The run of the first batch from a time on."""
-        found = self._from(t_us)
+        found = self._recorded.after(t_us)
         return None if found is None else found.boot
 
     def account(self, part: Part) -> _Account:
@@ -172,8 +172,8 @@ class _Reader:
         received_us = 0
         # An agent that does not batch sends a report in several messages.
         keys = starting_between(part.last.t_us - MAX_BATCH_SPAN_US, part.last.t_us)
-        for page in self._table.pages(self._topic, keys):
-            for item in page.items:
+        for items in self._recorded.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
+            for item in items:
                 with suppress(ContractError):
                     batch = decode_batch(plain(item))
                     if batch.boot != part.last.boot:
@@ -197,36 +197,16 @@ class _Reader:
                 at_us, jump_us = known.t_us - jump_us, 2 * jump_us
             else:
                 at_us = (other_us + known.t_us + 1) // 2
-            found = self._from(max(0, at_us)) or known
+            found = self._recorded.after(max(0, at_us)) or known
             if found.boot != last.boot:
                 other_us = found.t_us
                 continue
-            before = self._before(found.t_us)
+            before = self._recorded.before(found.t_us)
             if before is None or before.boot != last.boot:
                 return found, before
             known = before
-        return known, self._before(known.t_us)
+        return known, self._recorded.before(known.t_us)
 
     def _end_us(self, last: BatchId) -> int:
-        item = self._table.get(self._topic, str(last), ATTRIBUTES)
-        try:
-            return last.t_us + 1 if item is None else open_batch(plain(item)).times_us[-1] + 1
-        except ContractError:
-            return last.t_us + 1
-
-    def _from(self, t_us: int | None) -> BatchId | None:
-        """The first batch from a time on."""
-        return self._next(starting_between(t_us, None), newest=False)
-
-    def _before(self, t_us: int | None) -> BatchId | None:
-        """The last batch before a time."""
-        return self._next(starting_between(None, None if t_us is None else t_us - 1), newest=True)
-
-    def _next(self, keys: Keys, *, newest: bool) -> BatchId | None:
-        pages = self._table.pages(self._topic, keys, attributes=(BATCH,), page_items=1, newest_first=newest)
-        for page in pages:
-            for item in page.items:
-                # What is not a batch has no time.
-                with suppress(ContractError):
-                    return batch_id(item[BATCH]["S"])
-        return None
+        times_us = self._recorded.block(last, lambda _name: False).times_us
+        return int(times_us[-1] if len(times_us) else last.t_us) + 1

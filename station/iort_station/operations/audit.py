@@ -18,7 +18,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.recorded import Origin, Recorded, only
 
 # A batch is late if it took this much longer to arrive than the run's fastest one. It spans a second, and
 # arrives within milliseconds if nothing delays it.
@@ -230,15 +230,19 @@ def _first(previous: RunAudit | None, run: RunAudit) -> int:
 
 
 def headers(
-    cloud: Cloud, robot: str, stream: str, first_us: int | None = None, last_us: int | None = None
+    cloud: Cloud,
+    robot: str,
+    stream: str,
+    first_us: int | None = None,
+    last_us: int | None = None,
+    *,
+    origin: Origin | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """The stored batches that start between two times, both inclusive, without their samples."""
-    keys = starting_between(first_us, last_us)
-    attributes = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
-    for page in telemetry_table(cloud).pages(topic_of(cloud, robot, stream), keys, attributes=attributes):
-        for item in page.items:
-            # Strings and numbers only, so no deserializer is needed.
-            yield {name: next(iter(value.values())) for name, value in item.items()}
+    """The stored batches that start between two times, both inclusive, without their samples. ``origin``
+    grows by what comes from the archive."""
+    for item in Recorded(cloud, robot, stream, origin=origin).headers(starting_between(first_us, last_us)):
+        # Strings and numbers only, so no deserializer is needed.
+        yield {name: next(iter(value.values())) for name, value in item.items()}
 
 
 def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:
@@ -252,8 +256,10 @@ def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:
 
 def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
     """The newest stored batch of a stream; None if it has none, or an invalid one."""
-    item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
+    recorded = Recorded(cloud, robot, stream)
+    last = recorded.before(None)
     try:
-        return None if item is None else decode_batch(plain(item))
+        found = None if last is None else next(recorded.items(only(last)), None)
+        return decode_batch(plain(found[0])) if found else None
     except ContractError:
         return None

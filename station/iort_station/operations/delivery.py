@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract.dynamodb import plain
+from iort_contract.dynamodb import plain, starting_between
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.batches import summary_table, telemetry_table, topic_of
+from iort_station.data.batches import summary_table, topic_of
+from iort_station.data.recorded import Recorded
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ def batches(cloud: Cloud, robot: str, stream: str) -> Iterator[Batch]:
 
 def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:
     """Every stored item of a stream, in order of time."""
-    for page in telemetry_table(cloud).pages(topic_of(cloud, robot, stream)):
-        yield from map(plain, page.items)
+    for found in Recorded(cloud, robot, stream).items(starting_between(None, None), ()):
+        yield from map(plain, found)
 
 
 def delivery(cloud: Cloud, robot: str, stream: str) -> Delivery:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from iort_analysis.samples.batches import Item
 from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.dynamodb import with_samples_between
 from iort_contract.tables import (
     ENVELOPE,
     EXPIRES_S,
@@ -22,7 +23,8 @@ from iort_contract.tables import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
-from iort_station.data.batches import PageProgress, stored
+from iort_station.data.batches import PageProgress
+from iort_station.data.recorded import TABLE, Recorded
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
@@ -62,7 +64,9 @@ def recompute(
     """
     selection = _from(robot, stream, since_us)
     event = {RECOMPUTE_FROM_S: 0 if selection.start_us is None else selection.start_us // 1_000_000}
-    pages = stored(cloud, selection, _IMAGE, progress=progress)
+    # Seconds expire with their batches, so those of the archive's batches have nothing to be corrected.
+    recorded = Recorded(cloud, robot, stream, source=TABLE)
+    pages = recorded.items(with_samples_between(selection.start_us, None), _IMAGE, progress=progress)
     # Neighbouring events may write the same second, with the same content.
     seconds: set[int] = set()
     left_out = 0

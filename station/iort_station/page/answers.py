@@ -121,6 +121,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
         "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
         "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
+        "archive": found.origin.told(),
     }
 
 

@@ -17,7 +17,7 @@ from iort_contract.messages.insights import (
 )
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.data.findings import findings_table
+from iort_station.data import findings as stored
 from iort_station.fleet import registry
 
 FAILED = "analysis_failed"
@@ -31,7 +31,7 @@ def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
     """The newest findings and drives of ``robot``; without one, of all robots."""
     robots = [check_robot(asked["robot"])] if asked.get("robot") else sorted(registry.presence(cloud))
     drives, findings = (_DRIVES, _FINDINGS) if asked.get("robot") else (_FLEET_DRIVES, _FLEET_FINDINGS)
-    table = findings_table(cloud)
+    table = stored.table(cloud)
 
     def of(robot: str) -> tuple[list[Finding], list[AnalysedDrive]]:
         return list(islice(table.findings(robot), findings)), list(table.drives(robot, most=drives))

@@ -11,6 +11,7 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.batches import PageProgress
+from iort_station.data.recorded import Origin
 from iort_station.data.selection import Selection
 from iort_station.fleet import files
 from iort_station.recordings import messages
@@ -25,17 +26,19 @@ def write(
     selection: Selection,
     file: Recording,
     *,
+    origin: Origin | None = None,
     say: Say = lambda _line: None,
     progress: PageProgress = lambda _more, _last_us: None,
 ) -> int:
-    """Write the messages of a selection and return their number; ``say`` takes lines about the result.
+    """Write the messages of a selection and return their number; ``say`` takes lines about the result, and
+    ``origin`` grows by what comes from the archive.
 
     ROS messages are written as they were published. Other samples become messages of the type that their
     source gave, or of their fields.
     """
     robot, stream = selection.robot, selection.stream
     known = {name: kind for name, (_, kind) in messages.types(cloud, robot, stream).items()}
-    export = Export(cloud, selection, known, lambda key: files.content(cloud, key))
+    export = Export(cloud, selection, known, lambda key: files.content(cloud, key), origin)
     counts: dict[str, int] = {}
     writers: dict[str, Write] = {}
     for t_us, name, raw in export.messages(progress):

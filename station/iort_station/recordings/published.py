@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from iort_analysis.samples.batches import RefusedItems
-from iort_contract.dynamodb import plain
+from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data.batches import PageProgress, stored
+from iort_station.data.batches import PageProgress
+from iort_station.data.recorded import Origin, Recorded
 from iort_station.data.selection import Selection
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
@@ -37,17 +38,24 @@ class Export:
     """
 
     def __init__(
-        self, cloud: Cloud, selection: Selection, types: Mapping[str, MessageType], content: Content
+        self,
+        cloud: Cloud,
+        selection: Selection,
+        types: Mapping[str, MessageType],
+        content: Content,
+        origin: Origin | None = None,
     ) -> None:
         self.types = dict(types)
         self.others = self.empty = 0
         self.refused = RefusedItems()
-        self._cloud, self._selection, self._content = cloud, selection, content
+        self._recorded = Recorded(cloud, selection.robot, selection.stream, origin=origin)
+        self._selection, self._content = selection, content
         self._layouts = {name: kind.layout for name, kind in types.items()}
 
     def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
-        for items in stored(self._cloud, self._selection, progress=progress):
+        keys = with_samples_between(self._selection.start_us, self._selection.end_us)
+        for items in self._recorded.items(keys, progress=progress):
             for item in items:
                 yield from self._of(plain(item))
 

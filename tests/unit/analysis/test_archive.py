@@ -17,7 +17,7 @@ from iort_analysis.archive.writing import Written, write_day, write_hour
 from iort_analysis.samples.batches import RefusedItems, blocks, in_order
 from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import HASH, Hour, content_hash, hour_of, item_hash, parse_hour
-from iort_contract.dynamodb import plain
+from iort_contract.dynamodb import plain, starting_between
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.ros1.message import Messages, RosType
 from iort_contract.tables import BATCH
@@ -155,10 +155,10 @@ def test_what_is_not_wanted_is_not_read():
     assert part.start_us == HOUR.start_us + 5_000_000
     (part,) = file.pages(messages=False)
     assert part.block.columns.keys() == {"speed", "rpm"}
-    (part,) = file.pages(but=frozenset({items[1][BATCH]["S"]}))
+    (part,) = file.pages(keys=starting_between(None, HOUR.start_us))
     assert part.block.columns.keys() == {"mode"}
-    assert not list(file.pages(first_us=HOUR.end_us))
-    assert not list(file.pages(last_us=HOUR.start_us - 1))
+    assert not list(file.pages(keys=starting_between(HOUR.end_us, None)))
+    assert not list(file.pages(keys=starting_between(None, HOUR.start_us - 1)))
 
 
 def test_other_tools_find_names_units_and_a_sample_a_row():

@@ -15,7 +15,7 @@ from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station import data
 from iort_station.errors import StationError
-from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
+from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 
 START = 1_700_000_000_000_000
 ENOUGH_MS = 60_000
@@ -144,7 +144,8 @@ class Cloud:
         self._client, self._left_ms = client, left_ms
 
     def output(self, _noun, name):
-        return {"TelemetryTable": TELEMETRY, "RobotsTable": ROBOTS}.get(name, name)
+        tables = {"TelemetryTable": TELEMETRY, "RobotsTable": ROBOTS, "ArchiveTable": ARCHIVE}
+        return tables.get(name, name)
 
     def client(self, service):
         return {"dynamodb": self._client, "lambda": self}[service]

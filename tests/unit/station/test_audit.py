@@ -7,9 +7,12 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.messages.batch import Batch, BatchId
+from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.audit import audit, last_figures
-from tests.fakes import item_of
+from tests.fakes import TELEMETRY, item_of
+from tests.unit.station.test_data import cloud_of
 
 T_US = 1_750_000_000_000_000
 
@@ -152,25 +155,10 @@ def test_expected_is_stored_and_missing_in_any_order(seqs, seed):
     assert missing == set(range(min(seqs), max(seqs) + 1)) - seqs
 
 
-class Newest:
-    """A fake `iort_station.cloud.Cloud` and table client with one item."""
-
-    namespace = "iort"
-
-    def __init__(self, item):
-        self._item = item
-
-    def output(self, _noun, name):
-        return name
-
-    def client(self, _service):
-        return self
-
-    def query(self, **_):
-        return {"Items": [self._item]}
-
-
 def test_the_agents_figures_come_from_its_newest_valid_batch():
-    item = item_of(Batch("0badcafe", 0, [T_US], {"backlog_batches": [3]}))
-    assert last_figures(Newest(item), "car") == {"backlog_batches": 3.0}
-    assert last_figures(Newest({**item, "batch": {"S": "1.5"}}), "car") == {}
+    cloud, topic = cloud_of(), build_topic(RECORD, "car", AGENT_STREAM)
+    cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", 0, [T_US], {"backlog_batches": [3]}), topic))
+    assert last_figures(cloud, "car") == {"backlog_batches": 3.0}
+    invalid = item_of(Batch("0badcafe", 1, [T_US + 1], {"backlog_batches": [4]}), topic)
+    cloud.table.put(TELEMETRY, {**invalid, "codec": {"S": "none"}})
+    assert last_figures(cloud, "car") == {}

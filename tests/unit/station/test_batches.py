@@ -17,13 +17,13 @@ from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, dec
 from iort_analysis.samples.blocks import join
 from iort_contract.checks import wire_column
 from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
+from iort_contract.dynamodb import starting_between
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
-from iort_station.data.batches import stored
-from iort_station.data.selection import Selection
+from iort_station.data.recorded import Recorded
 from tests.examples import examples
-from tests.fakes import item_of_message
+from tests.fakes import TELEMETRY, item_of_message
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import text, u32
 from tests.unit.contract.test_columns import BOOT, WRONG, columns, message_of, plain_message
@@ -94,9 +94,10 @@ def test_an_item_with_an_invalid_key_is_refused_and_its_neighbours_are_read(key)
     items[1]["batch"] = {"S": key}
     refused, told = RefusedItems(), []
     cloud = cloud_of()
-    cloud.table.query = lambda **_: {"Items": items}
-    pages = stored(cloud, Selection(robot="car", stream="vesc"), progress=lambda *seen: told.append(seen))
-    (block,) = blocks(pages, refused)
+    cloud.table.query = lambda **how: {"Items": items if how["TableName"] == TELEMETRY else []}
+    recorded, keys = Recorded(cloud, "car", "vesc"), starting_between(None, None)
+    (part,) = recorded.parts(keys, refused, progress=lambda *seen: told.append(seen))
+    block = part.block
     # The start of an item without a valid key is unknown, so no time is reported as read.
     assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])
 

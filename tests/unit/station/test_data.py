@@ -21,7 +21,7 @@ from iort_contract.topics import build_topic
 from iort_station import data
 from iort_station.data import conditions, select
 from iort_station.errors import StationError
-from tests.fakes import ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
+from tests.fakes import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
 
 TOPIC = build_topic("dt", "car", "vesc")
 START = 1_700_000_000_000_000
@@ -33,14 +33,14 @@ class FakeCloud:
     namespace = "iort"
 
     def __init__(self, client):
-        self.table = client
+        self.table, self.bucket = client, None
 
     def client(self, service):
-        assert service == "dynamodb"
-        return self.table
+        return {"dynamodb": self.table, "s3": self.bucket}[service]
 
     def output(self, _noun, name):
-        return {"TelemetryTable": TELEMETRY, "SummaryTable": SUMMARY, "RobotsTable": ROBOTS}[name]
+        tables = {"TelemetryTable": TELEMETRY, "SummaryTable": SUMMARY, "RobotsTable": ROBOTS}
+        return (tables | {"ArchiveTable": ARCHIVE, "FilesBucket": "files"})[name]
 
 
 def cloud_of(*batches, page_items=2, robot="car", gain=None):

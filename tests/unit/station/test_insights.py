@@ -45,7 +45,7 @@ class Table:
 
 @pytest.fixture(autouse=True)
 def _table(monkeypatch):
-    monkeypatch.setattr(insights, "findings_table", lambda _cloud: Table())
+    monkeypatch.setattr(insights.stored, "table", lambda _cloud: Table())
     monkeypatch.setattr(insights.registry, "presence", lambda _cloud: {"car": {}, "other": {}})
 
 

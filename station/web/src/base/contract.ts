@@ -528,13 +528,21 @@ export interface Column {
   readonly most?: readonly Value[];
 }
 
-/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. */
+/** The part of an answer that comes from the archive: the number of its hours, and the first and last of their times. */
+export interface Archived {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly hours: number;
+}
+
+/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. ``archive`` is null if all comes from the table. */
 export interface HistoryAnswer {
   readonly times_s: readonly number[];
   readonly fields: Readonly<Record<string, Column>>;
   readonly samples: number;
   readonly ros2: boolean;
   readonly row_s: number;
+  readonly archive: Archived | null;
 }
 
 /** A line of a chart; ``right`` for the right axis. */

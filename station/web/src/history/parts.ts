@@ -36,8 +36,8 @@ export class Parts {
     private readonly fleet: Fleet,
   ) {}
 
-  /** The number of samples, the whole range of x, and the values in the range `zoom` of it. Throws `NoDistance`. */
-  async load(parts: readonly Part[], stream: string, axis: Axis, zoom: Range | undefined, signal: AbortSignal): Promise<{ readonly samples: number; readonly extent: Range; readonly compared: Compared }> {
+  /** The number of samples, whether some come from the archive, the whole range of x, and the values in the range `zoom` of it. Throws `NoDistance`. */
+  async load(parts: readonly Part[], stream: string, axis: Axis, zoom: Range | undefined, signal: AbortSignal): Promise<{ readonly samples: number; readonly archived: boolean; readonly extent: Range; readonly compared: Compared }> {
     const wholes = await Promise.all(parts.map(async (part) => this.placed(part, await this.read(part, stream), axis)));
     const extent: Range = [0, Math.max(1e-3, ...wholes.map(({ x }) => x.at(-1) ?? 0))];
     const range = zoom ?? extent;
@@ -45,7 +45,8 @@ export class Parts {
     const step = (range[1] - range[0]) / ROWS;
     const grid = Array.from({ length: ROWS + 1 }, (_, i) => range[0] + i * step);
     const samples = wholes.reduce((sum, { drive }) => sum + drive.samples, 0);
-    return { samples, extent, compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) } };
+    const archived = wholes.some(({ drive }) => drive.archive !== null);
+    return { samples, archived, extent, compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) } };
   }
 
   /** The format of a field: the speed of the cars, if it is known of all of them. */

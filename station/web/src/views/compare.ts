@@ -156,12 +156,12 @@ export class CompareView {
     this.out.hidden = zoom === undefined;
     this.note.set(parts.length < 2 ? `Add ${parts.length === 0 ? "two runs" : "another run"} to compare.` : "Loading …");
     try {
-      const { samples, extent, compared } = await this.loader.load(parts, stream, this.axis.value as Axis, zoom, loading.signal);
+      const { samples, archived, extent, compared } = await this.loader.load(parts, stream, this.axis.value as Axis, zoom, loading.signal);
       if (loading.signal.aborted) return;
       this.extent = extent;
       [this.grid, this.unit] = [compared.grid, compared.unit];
       this.charts.set(compared, parts.map(named), zoom ?? extent, this.wanted);
-      if (parts.length >= 2) this.note.set(samples === 0 ? "Nothing was stored in these ranges." : `${number(samples)} samples.`);
+      if (parts.length >= 2) this.note.set(samples === 0 ? "Nothing was stored in these ranges." : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`);
       this.read(0);
     } catch (error) {
       if (loading.signal.aborted) return;

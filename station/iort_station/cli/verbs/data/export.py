@@ -10,9 +10,10 @@ import typer
 from iort_station.cli.console import tell
 from iort_station.cli.options import SHORT, AsJson, Force, Robot, When, ranged, to_file
 from iort_station.cli.progress import reading
-from iort_station.cli.words import examples, say
+from iort_station.cli.words import examples, say, say_archived
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
+from iort_station.times import between_hours
 
 commands = typer.Typer()
 
@@ -36,6 +37,7 @@ def export(
     """
     # numpy takes longer to load than most commands to run.
     from iort_station.data.inventory import check_there  # noqa: PLC0415 - see above
+    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.data.selection import select  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
     from iort_station.recordings.export import write  # noqa: PLC0415 - as above
@@ -46,14 +48,17 @@ def export(
     check_free(out, force=force)
     within = when.range(SHORT)
     cloud = context.obj.cloud()
-    written = 0
+    written, origin = 0, Origin()
     with kind(out, force=force) as file:
         for stream in dict.fromkeys(streams):
             selection = select(robot, stream, within.start_us, within.end_us)
             with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
-                written += write(cloud, selection, file, say=say, progress=progress)
+                written += write(cloud, selection, file, origin=origin, say=say, progress=progress)
         if not written:
             for stream in streams:
                 check_there(cloud, robot, stream)
             raise StationError(f"there are no samples to export; {out} is not written")
-    tell({"file": str(out), "messages": written}, f"{out}: {written:,} messages", as_json=as_json)
+    archived = origin.within(within.start_us, within.end_us).told()
+    told = {"file": str(out), "messages": written, "archive": archived and between_hours(archived)}
+    tell(told, f"{out}: {written:,} messages", as_json=as_json)
+    say_archived(archived)

@@ -25,10 +25,11 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import examples, say
+from iort_station.cli.words import examples, say, say_archived
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
+from iort_station.times import between_hours
 
 commands = typer.Typer()
 
@@ -72,6 +73,7 @@ def plot(
     """
     # Together they take longer to load than most commands to run.
     from iort_station.cli import plots  # noqa: PLC0415 - see above
+    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
 
     plots.check_ending(out)
     check_free(out, force=force)
@@ -100,7 +102,10 @@ def plot(
         figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
     plots.save(figure, out, force=force)
     count = sum(len(run.result) for run in drawn)
-    tell({"file": str(out), "samples": count}, f"{out}: {count:,} samples", as_json=as_json)
+    archived = Origin([hour for run in drawn for hour in run.result.origin.hours]).told()
+    told = {"file": str(out), "samples": count, "archive": archived and between_hours(archived)}
+    tell(told, f"{out}: {count:,} samples", as_json=as_json)
+    say_archived(archived)
 
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:

@@ -25,7 +25,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import examples, say
+from iort_station.cli.words import examples, say, say_archived
 from iort_station.errors import UsageError
 from iort_station.output import check_free, whole
 
@@ -69,6 +69,10 @@ def query(
         Literal["client", "lambda"],
         typer.Option(help="Select samples on this machine, or in the cloud's query function."),
     ] = "client",
+    source: Annotated[
+        Literal["auto", "table", "archive"],
+        typer.Option(help="Read the table and, of what expires, the archive; or only one of them."),
+    ] = "auto",
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Scan the whole table, which is slow; for comparison."),
@@ -101,6 +105,7 @@ def query(
             every=every,
             summary=summary,
             on=on,
+            source=source,
             scan=scan,
             progress=progress,
         )
@@ -117,6 +122,7 @@ def query(
         counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
         say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")
     say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
+    say_archived(result.origin.told())
     if not len(result) and (extent := inventory.extent(cloud, robot, stream)):
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
 

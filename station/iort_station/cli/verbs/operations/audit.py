@@ -15,9 +15,9 @@ from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Range, Robot, When, ranged
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say_archived
 from iort_station.errors import UsageError
-from iort_station.times import duration_us, iso, iso_s, stamped
+from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
     from iort_station.operations.audit import Audit
@@ -57,6 +57,7 @@ def audit_(
     """
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
+    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
 
     within, late_us = when.range(), duration_us(late)
@@ -67,19 +68,20 @@ def audit_(
     except ContractError as error:
         raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
-    found, now_us = [], time.time_ns() // 1000
+    found, archived, now_us = [], Origin(), time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
-            counted = _counting(
-                audit.headers(cloud, robot, name, within.start_us, within.end_us), name, status
-            )
+            origin = Origin()
+            headers = audit.headers(cloud, robot, name, within.start_us, within.end_us, origin=origin)
+            counted = _counting(headers, name, status)
             one = audit.audit(name, counted, late_ms=late_us // 1000, from_start=from_start)
             # The agent counts a whole run, so a part of one cannot be compared.
             if within == Range(None, None):
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
                 found.append(one)
+                archived.hours += origin.within(within.start_us, within.end_us).hours
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
@@ -89,7 +91,14 @@ def audit_(
     if not found:
         inventory.check_recorded(cloud, robot)
     if as_json:
-        print_json({"streams": [_as_json(one) for one in found], "not_recorded": causes})
+        of_archive = archived.told()
+        print_json(
+            {
+                "streams": [_as_json(one) for one in found],
+                "not_recorded": causes,
+                "archive": of_archive and between_hours(of_archive),
+            }
+        )
     elif not found:
         errors.print(f"this range holds nothing of {robot}")
     else:
@@ -100,6 +109,7 @@ def audit_(
                 out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
                 for cause, count in counts.items():
                     out.print(f"  {count:,} {cause}")
+    say_archived(archived.told())
     complete = found and not causes and all(one.complete for one in found)
     raise typer.Exit(0 if complete else 1)
 

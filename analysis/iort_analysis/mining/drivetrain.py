@@ -1,0 +1,178 @@
+"""What the motor moves: mass, friction, drag and the losses of the gears, by Newton's law.
+
+    mass dv/dt = force * efficiency^(+-1) - friction - drag v^2 - brake
+
+The force at the tyres is the motor's: 1.5 * flux linkage * (electrical rad/s per m/s) newtons an ampere, so
+that the mass follows from the electrical fit, without a scale. The gears' losses work against the motion:
+they divide the current's effect when the motor brakes, which tells them from the mass. ``brake`` is a force
+that stays when braking is over, and falls within seconds: none on a healthy car. Without flux linkage or gain
+only the ratios to the force of an ampere and to the mass are known.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iort_analysis.drives.cleaning import pause_us
+from iort_analysis.drives.drive import Drive
+from iort_analysis.mining.fitting import Fit, fit, propagated
+from iort_analysis.mining.gain import fit_gain
+from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
+from iort_analysis.results import Mined
+
+Array = NDArray[np.float64]
+
+_WINDOW_S = 0.5
+# Slower, friction is not constant, and a stand hides forces.
+_LEAST_MPS = 0.3
+# The motor brakes with more than this; a brake that drags lets go in this time.
+_BRAKES_A, _RELEASE_S = 2.0, 4.0
+_LEAST_A = 1.0
+# The share of the friction that the tyres carry, about half of it: no field tells. Mean and variance.
+_BEYOND = (np.array([0.5]), np.array([[0.12**2]]))
+_GAIN = "speed_to_erpm_gain"
+_FORCES = (
+    "motor_force_n_per_a",
+    "effective_mass_kg",
+    "friction_n",
+    "drag_n_s2_per_m2",
+    "drivetrain_efficiency",
+    "brake_drag_n",
+)
+_RATIOS = ("acceleration_per_a_mps2", "friction_per_mass_mps2")
+
+
+def mine(drive: Drive) -> Mined:
+    """The gain, the mass that the motor moves, and what holds the car back."""
+    gain, motor = fit_gain(drive), fit_motor(drive)
+    estimates, missing = {}, {}
+    if isinstance(gain, str):
+        missing[_GAIN] = gain
+        registered = None if drive.vehicle is None else drive.vehicle.speed_to_erpm_gain
+    else:
+        estimates[_GAIN] = gain.of(0, "erpm per m/s")
+        registered = float(gain.coefficients[0])
+    if registered is None:
+        reason = f"needs the gain: {missing[_GAIN]}; or register it with the robot's vehicle"
+        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), reason)})
+    motion = _fit_motion(drive, registered)
+    if isinstance(motion, str):
+        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), motion)})
+    found = (
+        Mined(missing=dict.fromkeys(_FORCES, motor))
+        if isinstance(motor, str)
+        else _forces(drive, motion, motor, gain, registered)
+    )
+    ratios = {
+        "acceleration_per_a_mps2": propagated(
+            lambda c: math.sqrt(max(c[0] * c[1], 0.0)),
+            (motion.coefficients, motion.covariance),
+            unit="m/s2/A",
+        ),
+        "friction_per_mass_mps2": motion.of(2, "m/s2"),
+    }
+    return Mined({**estimates, **ratios, **found.estimates}, {**missing, **found.missing})
+
+
+def _fit_motion(drive: Drive, gain: float) -> Fit | str:
+    """Coefficients: driving and braking acceleration an ampere, friction, drag and brake for each kg."""
+    speed = drive.of(drive.vesc, "speed")
+    current = drive.of(drive.vesc, "current_motor")
+    if speed is None or current is None:
+        return "needs the motor's speed and current_motor"
+    if np.nanstd(current) < _LEAST_A:
+        return "the motor's current hardly changes"
+    offset = 0.0 if drive.vehicle is None else drive.vehicle.speed_to_erpm_offset
+    speed = (speed - offset) / gain
+    seconds, way = drive.seconds, np.sign(speed)
+    drives = current * way >= 0
+    rates = [
+        np.where(drives, current, 0.0),
+        np.where(drives, 0.0, current),
+        -way,
+        -speed * np.abs(speed),
+        -way * _dragging(seconds, ~drives & (np.abs(current) > _BRAKES_A)),
+    ]
+    usable = np.isfinite(speed) & np.isfinite(current) & (np.abs(speed) > _LEAST_MPS)
+    edges, whole = _windows(drive, usable)
+    columns = [np.where(whole, _integrals(seconds, rate, edges), np.nan) for rate in rates]
+    # Tyres slip in proportion to their force, so the wheels are faster than the car while it accelerates.
+    slips = [speed * np.where(drives, current, 0.0), speed * np.where(drives, 0.0, current)]
+    columns += [np.diff(slip[edges]) for slip in (*slips, *(slip * current for slip in slips))]
+    # Speed and current are not measured at quite the same time.
+    columns += [np.diff(np.where(way, current, 0.0)[edges]) for way in (drives, ~drives)]
+    found = fit(columns, np.where(whole, np.diff(speed[edges]), np.nan))
+    if found is None or min(found.coefficients[:2]) <= 0:
+        return "the drive's accelerations do not tell mass from friction"
+    return found
+
+
+def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain: float) -> Mined:
+    """The forces, which the motor's flux linkage scales."""
+    flux = (motor.fit.coefficients[:1], motor.fit.covariance[:1, :1])
+    gains = (
+        (np.array([used_gain]), np.zeros((1, 1)))
+        if isinstance(gain, str)
+        else (gain.coefficients[:1], gain.covariance[:1, :1])
+    )
+    moved = (motion.coefficients, motion.covariance)
+
+    def per_amp(flux_wb: float, erpm_per_mps: float) -> float:
+        return 1.5 * flux_wb * RAD_S_PER_ERPM * erpm_per_mps
+
+    def slipped(c: Array) -> Any:
+        # How much the wheels are faster than the car while they roll, compared with coasting.
+        return c[7] * c[4] / max(c[2], 1e-12)
+
+    def mass_kg(c: Array) -> Any:
+        # The accelerations were found with the gain, too. Both are of wheels that slip.
+        seen = per_amp(c[0], c[1]) / math.sqrt(max(c[2] * c[3], 1e-12)) * c[1] / used_gain
+        return seen / (1 + slipped(c) * (1 + c[-1]))
+
+    def force_n(c: Array, index: int) -> Any:
+        return mass_kg(c) * c[index] * (1 + slipped(c))
+
+    parts = (flux, gains, moved, _BEYOND)
+    estimates = {
+        "motor_force_n_per_a": propagated(lambda c: per_amp(c[0], c[1]), flux, gains, unit="N/A"),
+        "effective_mass_kg": propagated(mass_kg, *parts, unit="kg"),
+        "friction_n": propagated(lambda c: force_n(c, 4), *parts, unit="N"),
+        "drag_n_s2_per_m2": propagated(lambda c: force_n(c, 5), *parts, unit="N s2/m2"),
+        "drivetrain_efficiency": propagated(lambda c: math.sqrt(max(c[0] / c[1], 0.0)), moved, unit="1"),
+        "brake_drag_n": propagated(lambda c: force_n(c, 6), *parts, unit="N"),
+    }
+    missing = {}
+    known_kg = drive.known.get("mass_kg")
+    if known_kg is None:
+        missing["rotating_mass_kg"] = "needs the car's mass: the motor moves both"
+    else:
+        moved_kg = estimates["effective_mass_kg"]
+        estimates["rotating_mass_kg"] = moved_kg._replace(
+            value=moved_kg.value - known_kg, low=moved_kg.low - known_kg, high=moved_kg.high - known_kg
+        )
+    return Mined(estimates, missing)
+
+
+def _dragging(seconds: Array, brakes: NDArray[np.bool_]) -> Array:
+    """1 while the motor brakes, and falling after it."""
+    last = np.maximum.accumulate(np.where(brakes, seconds, -np.inf))
+    return np.asarray(np.exp((last - seconds) / _RELEASE_S), dtype=np.float64)
+
+
+def _windows(drive: Drive, usable: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The samples between the windows, and which windows are without a pause and usable as a whole."""
+    times = drive.samples.times_us
+    edges = np.searchsorted(times, np.arange(times[0], times[-1], round(_WINDOW_S * 1e6)))
+    edges = np.unique(np.append(edges, len(times) - 1))
+    paused = np.append(0, np.cumsum((np.diff(times) > pause_us(times)) | ~usable[1:]))
+    return edges, (np.diff(paused[edges]) == 0) & usable[edges[:-1]]
+
+
+def _integrals(seconds: Array, rate: Array, edges: NDArray[np.int64]) -> Array:
+    rate = np.nan_to_num(rate)
+    total = np.append(0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(seconds)))
+    return np.asarray(np.diff(total[edges]), dtype=np.float64)

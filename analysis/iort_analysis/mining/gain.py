@@ -1,0 +1,86 @@
+"""The motor's speed for each m/s of the car, where the car's position is measured too.
+
+The way between two positions is the chord, along the mean of both headings, and longer by the arc of the turn
+between them. Noise of a position adds nothing to it, unlike to the length of the path.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iort_analysis.drives.cleaning import pause_us
+from iort_analysis.drives.drive import Drive
+from iort_analysis.mining.fitting import Fit, fit
+
+Array = NDArray[np.float64]
+
+# Windows in which motor and car are compared, and the distance that both need at least.
+_WINDOW_S, _LEAST_M, _LEAST_DRIVE_M = 1.0, 0.3, 20.0
+# A position that is this close to the motor's distance was calculated from it.
+_SAME_M = 5e-4
+
+
+def fit_gain(drive: Drive) -> Fit | str:
+    """The fit whose first coefficient is the gain in erpm per m/s, over the drive; or the reason for none.
+
+    The second one is its growth with the car's acceleration in m/s2: the tyres' slip.
+    """
+    speed = drive.of(drive.vesc, "speed")
+    if drive.pose is None or speed is None:
+        return "needs the motor's speed and a second source of speed, such as a stream with the car's pose"
+    pose = drive.streams[drive.pose]
+    if "heading" not in pose.columns:
+        return f"needs the heading in the stream {drive.pose}"
+    known = np.isfinite(pose.columns["x"] + pose.columns["y"] + pose.columns["heading"])
+    times_us = pose.times_us[known]
+    if len(times_us) < 2:
+        return f"the stream {drive.pose} has no positions"
+    steps_m = _steps(*(pose.columns[name][known] for name in ("x", "y", "heading")))
+    # The motor's way in erpm seconds: what the gain turns metres into.
+    turned = _turned(drive, speed, times_us)
+    steps_m[np.diff(times_us) > pause_us(times_us)] = np.nan
+    window = (times_us[:-1] - times_us[0]) // round(_WINDOW_S * 1e6)
+    starts = np.flatnonzero(np.append(True, window[1:] != window[:-1]))
+    way_m = np.add.reduceat(steps_m, starts)
+    motor = np.add.reduceat(turned, starts)
+    took_s = np.add.reduceat(np.diff(times_us), starts) / 1e6
+    way_m[(np.abs(way_m) < _LEAST_M) | (took_s < _WINDOW_S / 2)] = np.nan
+    if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
+        return f"needs {_LEAST_DRIVE_M:g} m of driving with a pose"
+    acceleration = _slope(way_m / took_s, took_s)
+    acceleration -= np.nansum(way_m * acceleration) / np.nansum(np.where(np.isfinite(acceleration), way_m, 0))
+    found = fit([way_m, way_m * acceleration], motor)
+    if found is None:
+        return "the drive is too short for the gain"
+    if found.sigma < _SAME_M * abs(float(found.coefficients[0])):
+        return f"the positions of {drive.pose} are calculated from the motor's speed, so they say nothing new"
+    return found
+
+
+def _steps(x: Array, y: Array, heading: Array) -> Array:
+    """The way from each position to the next, negative in reverse."""
+    turn = np.remainder(np.diff(heading) + np.pi, 2 * np.pi) - np.pi
+    middle = heading[:-1] + turn / 2
+    chord = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
+    return np.asarray(chord / np.sinc(turn / (2 * np.pi)), dtype=np.float64)
+
+
+def _turned(drive: Drive, speed: Array, times_us: NDArray[np.int64]) -> Array:
+    """The integral of the motor's speed between each two times; NaN where it is not known."""
+    samples_us = drive.samples.times_us
+    took_s = np.diff(samples_us) / 1e6
+    parts = (speed[1:] + speed[:-1]) / 2 * took_s
+    parts[np.diff(samples_us) > pause_us(samples_us)] = np.nan
+    unknown = np.append(0.0, np.cumsum(np.isnan(parts)))
+    total = np.append(0.0, np.cumsum(np.nan_to_num(parts)))
+    since = times_us - samples_us[0]
+    at, lost = (np.interp(since, samples_us - samples_us[0], column) for column in (total, unknown))
+    return np.where(np.diff(lost) > 0, np.nan, np.diff(at))
+
+
+def _slope(speeds: Array, took_s: Array) -> Array:
+    """The acceleration in each window, from the windows before and after it."""
+    made = np.full(len(speeds), np.nan)
+    made[1:-1] = (speeds[2:] - speeds[:-2]) / (took_s[1:-1] * 2)
+    return made

@@ -1,0 +1,175 @@
+"""The motor's electrical parameters, by the equations of a synchronous motor that VESC's controller uses too.
+
+    vq = R iq + w L id + w flux        vd = R id - w L iq        (w in electrical rad/s, amplitudes a phase)
+
+A driver that reports vq and iq gives R, L and the flux linkage. With the basic fields only, duty cycle times
+battery voltage is sqrt(3) times the length of (vd, vq) in field-oriented control, so that
+
+    duty * voltage / sqrt(3) = R i + w flux + (w L i)^2 / (2 duty * voltage / sqrt(3)),
+
+whose last part is small. With six-step control the same product is the voltage across two phases. The mode is
+known from the battery's current: the firmware calculates it as duty * current * sqrt(3)/2 in the first mode,
+as duty * current in the second. So the battery's power is no second measurement of the motor's losses.
+Torque for each ampere needs the number of pole pairs; the force at the tyres does not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iort_analysis.drives.drive import Drive
+from iort_analysis.mining.fitting import Fit, Prior, fit, propagated
+from iort_analysis.mining.signals import binned, bridged, lagged
+from iort_analysis.results import Mined
+from iort_contract.catalog.vesc import VOLTAGE_FIELD
+from iort_contract.messages.findings import Estimate
+
+Array = NDArray[np.float64]
+
+RAD_S_PER_ERPM = 2 * math.pi / 60
+# Copper's resistance grows by this share a kelvin; the resistance is given at this temperature.
+COPPER_PER_K, REFERENCE_DEGC = 0.0039, 25.0
+# The share of the resistance that is the winding's, and so grows with the motor's temperature; the MOSFETs
+# and wires have the rest.
+_WINDING, _WINDING_DEVIATION = 0.8, 0.15
+# Battery current for duty cycle times motor current in field-oriented and in six-step control.
+_FOC, _SIX_STEP = math.sqrt(3) / 2, 1.0
+# Slower, the modulation is mostly the controller's dead time; faster, it is cut off.
+_LEAST_ERPM, _MOST_DUTY = 500.0, 0.94
+_LEAST_A = 1.0
+_MOST_ROWS = 60_000
+# The time in which a motor warms, where no sensor tells.
+_HEAT_S, _HEAT_STEP_S = 300.0, 1.0
+_NAMES = ("motor_resistance_ohm", "motor_flux_linkage_wb", "motor_inductance_h", "motor_torque_nm_per_a")
+
+
+class Motor(NamedTuple):
+    """The fit of a motor: its first coefficients are the flux linkage in Wb and the resistance in ohm."""
+
+    fit: Fit
+    at_reference: bool
+    inductance: Estimate | None
+
+    @property
+    def flux_linkage(self) -> Estimate:
+        """The flux linkage."""
+        return self.fit.of(0, "Wb")
+
+    @property
+    def resistance(self) -> Estimate:
+        """The resistance of a phase with its MOSFETs and wires: at 25 degC, or as it was in the drive."""
+        return self.fit.of(1, "ohm")
+
+
+def mine(drive: Drive) -> Mined:
+    """The motor's resistance, flux linkage and inductance."""
+    motor = fit_motor(drive)
+    if isinstance(motor, str):
+        return Mined(missing=dict.fromkeys(_NAMES, motor))
+    estimates = {
+        "motor_resistance_25_ohm" if motor.at_reference else "motor_resistance_ohm": motor.resistance,
+        "motor_flux_linkage_wb": motor.flux_linkage,
+    }
+    missing = {}
+    if not motor.at_reference:
+        missing["motor_resistance_25_ohm"] = (
+            "needs temp_motor: the resistance is that of the drive's mean heat"
+        )
+    if motor.inductance is None:
+        missing["motor_inductance_h"] = "needs avg_vd and avg_iq: duty_cycle hardly depends on it"
+    else:
+        estimates["motor_inductance_h"] = motor.inductance
+    pairs = drive.known.get("pole_pairs")
+    if pairs is None:
+        missing["motor_torque_nm_per_a"] = "needs the motor's number of pole pairs, which no field depends on"
+    else:
+        torque = (motor.fit.coefficients[:1], motor.fit.covariance[:1, :1])
+        estimates["motor_torque_nm_per_a"] = propagated(
+            lambda flux: 1.5 * pairs * float(flux[0]), torque, unit="Nm/A"
+        )
+    return Mined(estimates, missing)
+
+
+def fit_motor(drive: Drive) -> Motor | str:
+    """Fit the motor's equations to a drive; or the reason why that cannot be done."""
+    speed, vq, iq = (drive.of(drive.vesc, name) for name in ("speed", "avg_vq", "avg_iq"))
+    if speed is None:
+        return "needs the motor's speed"
+    rows = slice(None, None, -(-len(speed) // _MOST_ROWS))
+    if vq is not None and iq is not None and np.nanstd(vq) and np.nanstd(iq):
+        return _from_axes(drive, speed[rows], vq[rows], iq[rows], rows)
+    return _from_duty(drive, speed[rows], rows)
+
+
+def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) -> Motor | str:
+    omega = np.where(np.abs(speed) > _LEAST_ERPM, speed, np.nan) * RAD_S_PER_ERPM
+    if np.nanstd(iq) < _LEAST_A:
+        return "the motor's current hardly changes"
+    found = _with_winding(drive, [omega, iq], vq, rows)
+    if found is None:
+        return "the drive's speeds and currents do not tell resistance from flux linkage"
+    vd = drive.of(drive.vesc, "avg_vd")
+    inductance = None if vd is None else fit([-omega * iq], vd[rows])
+    return Motor(*found, None if inductance is None else inductance.of(0, "H"))
+
+
+def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor | str:
+    names = ("duty_cycle", VOLTAGE_FIELD, "current_motor", "current_input")
+    duty, voltage, current, battery = (drive.of(drive.vesc, name) for name in names)
+    if duty is None or voltage is None or current is None:
+        return "needs avg_vq and avg_iq, or duty_cycle, voltage_input and current_motor"
+    duty, voltage, current = duty[rows], voltage[rows], current[rows]
+    if np.nanstd(current) < _LEAST_A:
+        return "the motor's current hardly changes"
+    if battery is None:
+        return "needs current_input: without it the control mode, and so the scale, is not known"
+    usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
+    mode = fit([np.where(usable, duty * current, np.nan), np.ones(len(duty))], battery[rows])
+    if mode is None:
+        return "the drive's currents do not tell the control mode"
+    ratio = float(mode.coefficients[0])
+    if abs(ratio - _FOC) > (_SIX_STEP - _FOC) / 2:
+        return (
+            f"current_input is {ratio:.2f} of duty_cycle times current_motor, field-oriented control gives"
+            f" {_FOC:.2f}: only sums of phases are known"
+        )
+    omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
+    volts = duty * voltage / math.sqrt(3)
+    squares = (omega * current) ** 2 / (2 * np.where(np.abs(volts) > 0.1, volts, np.nan))
+    found = _with_winding(drive, [omega, current], volts, rows, squares)
+    if found is None:
+        return "the drive's speeds and currents do not tell resistance from flux linkage"
+    return Motor(*found, None)
+
+
+def _with_winding(
+    drive: Drive, columns: list[Array], volts: Array, rows: slice, *more: Array
+) -> tuple[Fit, bool] | None:
+    """The fit, whose resistance grows with the motor's temperature where that is known; and if so."""
+    degc = drive.of(drive.vesc, "temp_motor")
+    if degc is None or not np.nanstd(degc):
+        # The winding warms with the current's square, some minutes late.
+        squares = columns[1] ** 2
+        heat = _late(drive.seconds[rows], squares)
+        heat -= np.nansum(squares * heat) / np.nansum(squares)
+        found = fit([*columns, columns[1] * heat, *more], volts)
+        return None if found is None else (found, False)
+    warmer = columns[1] * COPPER_PER_K * (degc[rows] - REFERENCE_DEGC)
+    rough = fit([*columns, *more], volts)
+    if rough is None:
+        return None
+    size = abs(float(rough.coefficients[1]))
+    prior = Prior(_WINDING * size, _WINDING_DEVIATION * size)
+    found = fit([*columns, warmer, *more], volts, priors={2: prior})
+    return None if found is None else (found, True)
+
+
+def _late(seconds: Array, values: Array) -> Array:
+    """The values as a body of some minutes' heat capacity follows them."""
+    steps = bridged(binned(seconds, values, _HEAT_STEP_S))
+    ends_s = (np.arange(len(steps)) + 1) * _HEAT_STEP_S
+    return np.interp(seconds, ends_s, lagged(steps, _HEAT_S / _HEAT_STEP_S))

@@ -1,0 +1,122 @@
+"""The parameters of a car's parts: battery, motor, what the motor moves, and heat."""
+
+from __future__ import annotations
+
+from iort_contract.catalog.parameter import Parameter
+
+_BATTERY = ("voltage_input", "current_input")
+BATTERY = (
+    Parameter(
+        "battery_resistance_ohm",
+        "ohm",
+        "resistance of the battery and its wires at once",
+        worse="up",
+        kind="battery_worn",
+        fields=_BATTERY,
+    ),
+    Parameter(
+        "battery_slow_resistance_ohm",
+        "ohm",
+        "what the battery's resistance grows by within minutes of load",
+        worse="up",
+        fields=_BATTERY,
+    ),
+    Parameter(
+        "battery_open_voltage_v",
+        "V",
+        "open-circuit voltage at the drive's end, as after a long rest",
+        fields=_BATTERY,
+    ),
+    Parameter(
+        "battery_voltage_per_ah",
+        "V/Ah",
+        "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
+        fields=_BATTERY,
+    ),
+)
+
+_MOTOR = ("duty_cycle", "voltage_input", "current_motor", "avg_vq", "avg_iq", "speed")
+MOTOR = (
+    Parameter(
+        "motor_resistance_25_ohm",
+        "ohm",
+        "resistance of a motor's phase with MOSFETs and wires, at 25 degC",
+        worse="up",
+        kind="motor_resistance_grown",
+        fields=_MOTOR,
+        least_share=0.1,
+    ),
+    Parameter(
+        "motor_resistance_ohm",
+        "ohm",
+        "resistance of a motor's phase with MOSFETs and wires, as warm as it was in the drive",
+        worse="up",
+        kind="motor_resistance_grown",
+        fields=_MOTOR,
+        least_share=0.15,
+    ),
+    Parameter(
+        "motor_flux_linkage_wb",
+        "Wb",
+        "flux linkage of the motor's magnets: voltage of a phase for an electrical rad/s",
+        fields=_MOTOR,
+    ),
+    Parameter(
+        "motor_inductance_h", "H", "inductance of a motor's phase", fields=("avg_vd", "avg_iq", "speed")
+    ),
+    Parameter(
+        "motor_torque_nm_per_a", "Nm/A", "torque of the motor for an ampere, with its number of pole pairs"
+    ),
+)
+
+_MOTION = ("current_motor", "speed")
+FORCES = (
+    Parameter(
+        "speed_to_erpm_gain",
+        "erpm per m/s",
+        "motor speed for a speed of the car, over the drive; as in vesc.yaml",
+        fields=("speed",),
+    ),
+    Parameter("motor_force_n_per_a", "N/A", "force at the tyres for an ampere of the motor, without losses"),
+    Parameter(
+        "effective_mass_kg", "kg", "mass that the motor moves, with that of what turns", fields=_MOTION
+    ),
+    Parameter(
+        "rotating_mass_kg",
+        "kg",
+        "inertia of motor, gears and wheels, as a mass at the tyres; with the car's known mass",
+        fields=_MOTION,
+    ),
+    Parameter("friction_n", "N", "force that rolling takes at any speed", worse="up", fields=_MOTION),
+    Parameter("drag_n_s2_per_m2", "N s2/m2", "force of the air, by the square of the speed", fields=_MOTION),
+    Parameter(
+        "drivetrain_efficiency",
+        "1",
+        "share of the motor's force that the gears pass on",
+        worse="down",
+        fields=_MOTION,
+    ),
+    Parameter(
+        "brake_drag_n",
+        "N",
+        "force of a brake that still holds, just after braking",
+        worse="up",
+        fields=_MOTION,
+    ),
+    Parameter(
+        "acceleration_per_a_mps2",
+        "m/s2/A",
+        "acceleration for an ampere of the motor, without friction",
+        worse="down",
+        fields=_MOTION,
+    ),
+    Parameter(
+        "friction_per_mass_mps2",
+        "m/s2",
+        "how fast the car slows down as it rolls",
+        worse="up",
+        fields=_MOTION,
+    ),
+)
+
+HEAT = ()

@@ -1,0 +1,13 @@
+// Says which part of an answer comes from the archive.
+
+import type { Archived } from "../base/contract";
+import { dayTime, zone } from "../base/format";
+import type { Range } from "../base/range";
+
+/** A sentence, with a space before it; nothing if all comes from the table. */
+export function fromArchive(archive: Archived | null, [start, end]: Range): string {
+  if (archive === null) return "";
+  const [from, to] = [Math.max(start, archive.from_us / 1e6), Math.min(end, archive.to_us / 1e6)];
+  if (from <= start && to >= end) return " From the archive.";
+  return ` From the archive: ${dayTime(from)} to ${dayTime(to)} ${zone(to)}.`;
+}

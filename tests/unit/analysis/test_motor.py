@@ -1,0 +1,85 @@
+"""The motor's parameters and what it moves, from a drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from iort_analysis.mining import drivetrain, motor
+from tests.unit.analysis.proven import proven
+
+
+def test_a_controller_that_reports_its_axes_gives_resistance_flux_and_inductance() -> None:
+    drive, truth = proven(1)
+    found = motor.mine(replace(drive, known={"pole_pairs": truth["pole_pairs"]})).estimates
+
+    phase = truth["motor_resistance_ohm"] + truth["fet_resistance_ohm"]
+    assert found["motor_resistance_25_ohm"].value == pytest.approx(phase, rel=0.01)
+    assert found["motor_flux_linkage_wb"].value == pytest.approx(truth["flux_linkage_wb"], rel=0.001)
+    assert found["motor_inductance_h"].value == pytest.approx(truth["motor_inductance_h"], rel=0.01)
+    # A motor of so many rpm for a volt has so many newton metres for an ampere.
+    torque = 60 / (2 * np.pi * truth["motor_kv"]) * np.sqrt(3) / 2
+    assert found["motor_torque_nm_per_a"].value == pytest.approx(torque, rel=0.001)
+
+
+def test_the_basic_fields_give_the_warm_resistance_and_the_flux() -> None:
+    drive, truth = proven(0)
+    mined = motor.mine(drive)
+
+    resistance = mined.estimates["motor_resistance_ohm"]
+    assert resistance.value == pytest.approx(truth["motor_resistance_now_ohm"], rel=0.01)
+    assert mined.estimates["motor_flux_linkage_wb"].value == pytest.approx(
+        truth["flux_linkage_wb"], rel=0.001
+    )
+    assert "pole pairs" in mined.missing["motor_torque_nm_per_a"]
+    assert "avg_vd" in mined.missing["motor_inductance_h"]
+
+
+def test_a_motor_in_six_step_control_is_not_taken_for_one_in_field_oriented_control() -> None:
+    drive = proven(0).drive
+    columns = dict(drive.samples.columns)
+    columns["vesc.current_input"] = columns["vesc.duty_cycle"] * columns["vesc.current_motor"]
+    mined = motor.mine(replace(drive, samples=drive.samples._replace(columns=columns)))
+
+    assert not mined.estimates
+    assert "1.00 of duty_cycle times current_motor" in mined.missing["motor_resistance_ohm"]
+
+
+def test_mass_and_forces_follow_from_the_pose_and_the_electrical_fit() -> None:
+    drive, truth = proven(0)
+    found = drivetrain.mine(replace(drive, known={"mass_kg": truth["mass_kg"]})).estimates
+
+    friction = truth["drivetrain_friction_n"] + truth["rolling_resistance"] * truth["mass_kg"] * 9.81
+    assert found["speed_to_erpm_gain"].value == pytest.approx(truth["speed_to_erpm_gain"], rel=0.005)
+    assert found["rotating_mass_kg"].value == pytest.approx(truth["rotating_mass_kg"], rel=0.05)
+    assert found["friction_n"].value == pytest.approx(friction, rel=0.1)
+    assert found["drivetrain_efficiency"].value == pytest.approx(truth["drivetrain_efficiency"], rel=0.01)
+    assert found["brake_drag_n"].low < 0.05
+    assert found["brake_drag_n"].high > -0.05
+
+
+def test_a_payload_and_a_brake_that_drags_are_told_apart() -> None:
+    healthy, heavier, braked = (
+        drivetrain.mine(proven(0, fault, "middle").drive).estimates
+        for fault in ("", "payload", "dragging_brake")
+    )
+
+    assert heavier["effective_mass_kg"].value - healthy["effective_mass_kg"].value == pytest.approx(
+        0.9, abs=0.05
+    )
+    assert heavier["brake_drag_n"].value == pytest.approx(0, abs=0.2)
+    assert braked["brake_drag_n"].value == pytest.approx(2.5, abs=0.3)
+    assert braked["effective_mass_kg"].value == pytest.approx(healthy["effective_mass_kg"].value, rel=0.02)
+
+
+def test_a_position_that_comes_from_the_motors_speed_is_no_second_source() -> None:
+    drive = proven(0).drive
+    seconds, speed = drive.seconds, drive.of("vesc", "speed")
+    assert speed is not None
+    way = np.append(0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(seconds))) / 4614.0
+    odometry = drive.samples._replace(columns={"x": way, "y": 0 * way, "heading": 0 * way})
+    mined = drivetrain.mine(replace(drive, streams={**drive.streams, "pose": odometry}))
+
+    assert "calculated from the motor's speed" in mined.missing["speed_to_erpm_gain"]
