@@ -16,6 +16,7 @@ from iort_analysis.archive.columns import (
     NOTHING,
     OWN,
     TYPES,
+    VARIED,
     cast,
     column_name,
     joined_kind,
@@ -116,9 +117,17 @@ def _write(
     """Write each table, whose fields have these kinds, as a row group."""
     of_columns = dict(list(kinds.items())[: names.MAX_COLUMNS])
     schema = _schema(of_columns, places, describe)
-    # Dictionaries also suit numbers: a sensor has few different values.
-    options = {"compression": "zstd", "compression_level": _LEVEL}
-    with pq.ParquetWriter(into, schema, **options) as writer:
+    varied = [column_name(name) for name, kind in of_columns.items() if kind == VARIED]
+    # Of a number with many values the bytes of one place are similar; of regular times, the steps.
+    encodings = {**dict.fromkeys(varied, "BYTE_STREAM_SPLIT"), names.TIME: "DELTA_BINARY_PACKED"}
+    with pq.ParquetWriter(
+        into,
+        schema,
+        compression="zstd",
+        compression_level=_LEVEL,
+        column_encoding=encodings,
+        use_dictionary=[name for name in schema.names if name not in {*encodings, names.MESSAGE}],
+    ) as writer:
         for table, local in tables:
             arrays = {name: table[name] for name in OWN}
             arrays[names.OTHER] = _with_others(
