@@ -20,9 +20,6 @@ from typing import Any, NoReturn
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 
-from iort_agent.clock import SystemClock
-from iort_agent.errors import SourceError
-from iort_agent.sources.recording.bag import BagConfig, BagSource
 from iort_agent.sources.sim.circuit import HALL
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
@@ -36,7 +33,8 @@ from iort_station.page.answers import actions, answers
 from iort_station.page.downloads import downloads
 from iort_station.page.listener import Listener
 from iort_station.page.server import PageServer
-from local.cloud import FOLDER, EmbeddedCloud
+from local import demo_options
+from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.figures import Figures, Spread, round_trips
@@ -61,7 +59,7 @@ _STATUS_S = 1.0
 
 def main() -> None:
     """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
-    options = _options()
+    options = demo_options.read()
     stopped = threading.Event()
 
     def interrupt(_signal: int, _frame: object) -> NoReturn:
@@ -87,53 +85,6 @@ def main() -> None:
     if stopped.is_set():
         console.print("stopped; nothing is left running")
     sys.exit(1 if figures.samples_lost else 0)
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="make demo",
-        usage="make demo [DURATION=20] [BAG=drive.bag] [REPORT=report.json] [PORT=8080]",
-        description=(__doc__ or "").splitlines()[0],
-    )
-    parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
-    parser.add_argument(
-        "--bag", type=Path, metavar="FILE", help="drive a recording instead of a simulated car"
-    )
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write the figures as JSON")
-    parser.add_argument("--port", type=int, default=0, help="the page's port (default: a free one)")
-    parser.add_argument(
-        "--folder", type=Path, default=FOLDER, help="where the embedded cloud keeps its state"
-    )
-    options = parser.parse_args()
-    if options.bag is not None and not options.bag.exists():
-        parser.error(f"BAG must exist, got {options.bag}")
-    if options.bag is not None:
-        try:
-            with BagSource(BagConfig(path=options.bag), SystemClock()).open() as messages:
-                next(messages, None)
-        except SourceError as error:
-            parser.error(f"BAG={error}")
-    if options.report is not None and not options.report.absolute().parent.is_dir():
-        parser.error(f"REPORT must be in an existing folder, got {options.report}")
-    if options.report is not None and options.report.is_dir():
-        parser.error(f"REPORT must be a file, got the folder {options.report}")
-    if not 0 <= options.port <= 65535:
-        parser.error(f"PORT must be 1 to 65535, got {options.port}")
-    try:
-        socket.create_server(("127.0.0.1", options.port)).close()
-    except OSError as error:
-        parser.error(f"PORT must be free, got {options.port}: {error.strerror}; give none for a free one")
-    return options
-
-
-def _positive(value: str) -> float:
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds <= 86_400:
-        raise argparse.ArgumentTypeError(f"DURATION must be over 0 and at most 86400 s, got {value}")
-    return seconds
 
 
 class _Demo:
@@ -191,7 +142,8 @@ class _Demo:
         if self._options.bag is not None:
             source = {"type": "bag", "path": str(self._options.bag.resolve())}
         else:
-            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ}
+            faults = {"faults": self._options.faults} if self._options.faults else {}
+            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ, **faults}
         duration_s = self._options.duration
         if duration_s is None and self._options.bag is None:
             duration_s = 60.0

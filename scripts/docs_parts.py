@@ -24,6 +24,7 @@ from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.findings import KINDS, PARAMETERS, Parameter
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
@@ -46,6 +47,8 @@ __all__ = [
     "example",
     "faults",
     "fields",
+    "finding_kinds",
+    "finding_parameters",
     "headline",
     "manual",
     "measured",
@@ -66,6 +69,7 @@ FILES = tuple(
         "README.md",
         "docs/decisions/index.md",
         "docs/explanation/benchmark.md",
+        "docs/explanation/findings.md",
         "docs/how-to/alarms.md",
         "docs/how-to/simulated-car.md",
         "docs/reference/car-yaml.md",
@@ -114,6 +118,37 @@ def faults() -> None:
         told = "; ".join(f"{of} ({field})" if field else of for of, field in strengths.items())
         rows.append((f"`{name}`", kind.meaning, told, kind.unit))
     _table(("fault", "what it does", "weak, middle, strong", "unit"), rows, right=False)
+
+
+def finding_kinds() -> None:
+    """The kinds of findings, from the catalogue."""
+    rows = [
+        (
+            f"`{kind.name}`",
+            kind.meaning,
+            kind.action,
+            "; ".join(kind.alternatives) or "-",
+            ", ".join(f"`{name}`" for name in kind.explains) or "-",
+        )
+        for kind in KINDS.values()
+    ]
+    _table(("kind", "meaning", "what to do", "cannot be told from", "explains"), rows, right=False)
+
+
+def finding_parameters() -> None:
+    """The parameters whose changes are findings, from the catalogue."""
+    rows = [
+        (f"`{one.name}`", one.meaning, one.worse, f"`{one.kind}`", _least_change(one))
+        for one in PARAMETERS.values()
+        if one.kind
+    ]
+    _table(("parameter", "meaning", "worse", "kind", "smallest change"), rows, right=False)
+
+
+def _least_change(parameter: Parameter) -> str:
+    parts = [f"{parameter.least_share:.0%}"] if parameter.least_share else []
+    parts += [f"{parameter.least:g} {parameter.unit}".removesuffix(" 1")] if parameter.least else []
+    return " and ".join(parts)
 
 
 def derived() -> None:

@@ -51,8 +51,9 @@ def analysed(spec: DriveSpec) -> Analysed:
         return found
     streams, truth = simulated(spec)
     began = time.process_time()
-    # What the owner of a car knows: its weight without payload, its cells, and the gain of its vesc.yaml.
-    known = {"mass_kg": spec.vehicle.mass_kg, "cells": float(spec.vehicle.cells)}
+    # What the owner of a car knows: its weight, cells and pole pairs, and the gain of its vesc.yaml.
+    car = spec.vehicle
+    known = {"mass_kg": car.mass_kg, "cells": float(car.cells), "pole_pairs": float(car.pole_pairs)}
     result = analyse(spec.key, streams, F1TENTH, known)
     made = Analysed(
         replace(result, mined=replace(result.mined, tables={})), truth, time.process_time() - began

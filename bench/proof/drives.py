@@ -23,7 +23,7 @@ from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.streams import POSE_STREAM
-from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import TACHOMETER_COUNTS, VESC_STREAM
 
 KEPT = ROOT / "build" / "bench-analysis" / "drives"
 RATE_HZ, POSE_RATE_HZ = 50, 20
@@ -69,6 +69,8 @@ def _simulate(spec: DriveSpec) -> Simulated:
     times: dict[str, list[int]] = {VESC_STREAM: [], POSE_STREAM: []}
     names: dict[str, tuple[str, ...]] = {}
     heated = resistance = distance_m = slid_s = 0.0
+    battery = vehicle.battery
+    full_v = battery.open_v
     for i in range(count):
         vehicle.step(dt, None if stands <= i < count - stands else _STANDING)
         now_us = spec.key.start_us + i * 1_000_000 // RATE_HZ + round(abs(jitter.gauss(0, _JITTER_US)))
@@ -94,9 +96,14 @@ def _simulate(spec: DriveSpec) -> Simulated:
     seen = {
         # Weighted by the heat that it makes, as a fit over the drive does.
         "motor_resistance_now_ohm": resistance / heated,
+        "motor_a2_mean": heated / count,
         "distance_m": distance_m,
+        # With the tyres' creep, as distances give it.
+        "driven_erpm_per_mps": vehicle.counts_abs * 60 / TACHOMETER_COUNTS / distance_m,
         "slid_s": slid_s,
-        "charge_left": vehicle.battery.charge,
+        "charge_left": battery.charge,
+        "open_voltage_v": battery.open_v,
+        "voltage_per_ah": (full_v - battery.open_v) / (battery.drawn_ah - battery.regen_ah),
         "motor_degc": vehicle.heat.motor_degc,
         "board_degc": vehicle.heat.board_degc,
     }

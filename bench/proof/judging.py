@@ -84,8 +84,8 @@ def detection(judged: Sequence[Judged]) -> dict[Case, Detected]:
 
 @dataclass
 class Coverage:
-    """How often a parameter's interval holds the truth, how wide it is, and how far off its value, as shares
-    of the truth."""
+    """How often a parameter's interval holds the truth, how wide it is, and how far off its value: as shares
+    of the truth, or in its unit where the truth is 0."""
 
     drives: int = 0
     held: int = 0
@@ -108,6 +108,7 @@ def coverage(drives: Sequence[Analysed]) -> dict[str, Coverage]:
             truth, one = TRUTHS[name](drive.truth), made.setdefault(name, Coverage())
             one.drives += 1
             one.held += estimate.low <= truth <= estimate.high
-            one.widths.append((estimate.high - estimate.low) / abs(truth))
-            one.off.append(estimate.value / truth - 1)
+            unit = abs(truth) or 1.0
+            one.widths.append((estimate.high - estimate.low) / unit)
+            one.off.append((estimate.value - truth) / unit)
     return made

@@ -36,10 +36,6 @@ ABSENT = "absent"
 # In a second over DynamoDB's 400 KB: the number of attributes left out, the largest first.
 OMITTED = "omitted"
 
-# The findings table, by robot: findings by their ids, and after `PARAMETERS_OF` a drive's text the parameters
-# of that drive, as an object in JSON under `CONTENT`.
-FINDING, CONTENT, PARAMETERS_OF = "finding", "content", "parameters#"
-
 # The quarantine table: every refused message, by robot (`NO_ROBOT` if unknown) and an id made from its
 # content, so that a repeated message is one entry.
 ENTRY, SOURCE, REASON, PAYLOAD = "id", "source", "reason", "payload"

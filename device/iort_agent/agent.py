@@ -10,6 +10,7 @@ from iort_agent.common.version import agent_version
 from iort_agent.config import Config
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.shadow import Shadow
+from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
 from iort_agent.lanes.attachment import make_attachments
 from iort_agent.lanes.clock_offset import OffsetEstimator
@@ -73,6 +74,10 @@ class Agent:
             version=agent_version(),
         )
         self.sources = [SourceRun(source, clock) for source in config.sources]
+        # Folders and questions share it: the broker's answers have one handler.
+        uploader = None
+        if config.files.folder or config.files.large_folder or config.downlink.ask:
+            uploader = make_uploader(link, root_ca=config.root_ca, rate_kb_s=config.files.rate_kb_s)
         self.downlink = make_downlink(
             config.downlink,
             config.share,
@@ -82,8 +87,10 @@ class Agent:
             graph=next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None),
             offset=self.offset.known,
             answer=self.shadow.answer,
+            uploader=uploader,
+            root_ca=config.root_ca,
         )
-        self.uploads = make_uploads(config.files, link, root_ca=config.root_ca)
+        self.uploads = make_uploads(config.files, uploader, clock)
         self.attachments = make_attachments(
             config.files, robot=config.robot, clock=clock, uploads=self.uploads
         )

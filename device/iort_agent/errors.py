@@ -44,3 +44,11 @@ class UploadError(AgentError):
     def __init__(self, text: str, *, again_s: float | None) -> None:
         super().__init__(text)
         self.again_s = again_s
+
+
+class AskError(AgentError):
+    """A question to the cloud has no answer; ``reason`` is the cloud's word for why, or the agent's."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason

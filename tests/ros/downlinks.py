@@ -19,10 +19,14 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
+from iort_agent.control.questions import Questions
+from iort_agent.files.http import downloader
+from iort_agent.files.upload import make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.node import DEFAULT_NODE, shared
+from iort_contract.messages.ask import Answer, Refusal, decode_ask, encode_answer
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
-from tests.agent_fakes import Loopback, link_of
+from tests.agent_fakes import Loopback, Published, link_of
 
 
 def say(line: str) -> None:
@@ -35,15 +39,31 @@ logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(mes
 file = Path(sys.argv[1])
 settings, where, clock = json.loads(file.read_text()), Place(file), SystemClock()
 uplink = Loopback(clock, Dispatcher())
-graph = shared(DEFAULT_NODE, clock)
+
+
+def cloud(message: Published) -> None:
+    """Answer a question with its body, if it has one."""
+    if message.topic.startswith("ask/"):
+        ask = decode_ask(message.payload)
+        body = {"asked": ask.body} if ask.body else Refusal("no_data", "nothing yet")
+        uplink.deliver(message.topic.replace("ask/", "answer/", 1), encode_answer(Answer(ask.id, body)))
+
+
+uplink.verdict = cloud
+link, graph = link_of(uplink, clock), shared(DEFAULT_NODE, clock)
+questions = None
+if "ask" in settings.get("downlink", {}):
+    uploader = make_uploader(link, root_ca=None, rate_kb_s=0)
+    questions = Questions(link, uploader, download=downloader(None), offset=lambda: None)
 downlink = Downlink(
     load(DownlinkConfig, settings.get("downlink", {}), where),
     share_rule()(settings["share"], where) if "share" in settings else (),
-    link=link_of(uplink, clock),
+    link=link,
     graph=graph,
     boot="0badcafe",
     offset=lambda: ClockOffset(0.0, 0.0),
     answer=lambda *_: None,
+    questions=questions,
 )
 uplink.start()
 downlink.start()

@@ -174,24 +174,28 @@ def _weak(finding: Finding) -> bool:
 
 
 def _explained(findings: Iterable[Finding]) -> list[Finding]:
-    """One finding a cause: those that another finding of the drive explains are told in its text."""
+    """One finding a cause: what else the same cause changed in the drive is told in its text."""
     kept: list[Finding] = []
     by_drive = sorted(findings, key=lambda finding: finding.id)
     for _, group in groupby(by_drive, key=lambda finding: str(finding.drive)):
-        drive = list(group)
-        kinds = {finding.kind for finding in drive}
+        kinds: dict[str, list[Finding]] = {}
+        for finding in group:
+            kinds.setdefault(finding.kind, []).append(finding)
         explained = {kind for found in kinds for kind in KINDS[found].explains}
-        beside = [finding for finding in drive if finding.kind in explained]
-        kept += [
-            replace(finding, text=texts.complete(finding, [one for one in beside if _explains(finding, one)]))
-            for finding in drive
-            if finding.kind not in explained
-        ]
-    return kept
+        for kind in kinds.keys() - explained:
+            changes = [finding for finding in kinds[kind] if _is_change(finding)]
+            events = [finding for finding in kinds[kind] if not _is_change(finding)]
+            # Several parameters that changed are one cause; events have their own times.
+            first, *beside = sorted(changes, key=lambda finding: finding.p or 0.0) or events
+            beside = [] if first in events else beside
+            beside += [other for name in KINDS[kind].explains for other in kinds.get(name, ())]
+            kept += [replace(first, text=texts.complete(first, beside))]
+            kept += [event for event in events if event is not first]
+    return sorted(kept, key=lambda finding: finding.id)
 
 
-def _explains(finding: Finding, other: Finding) -> bool:
-    return other.kind in KINDS[finding.kind].explains
+def _is_change(finding: Finding) -> bool:
+    return finding.subject.removesuffix("_trend") in PARAMETERS
 
 
 def _before(measured: Iterable[Measured], drive: DriveKey) -> list[Measured]:

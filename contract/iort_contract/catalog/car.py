@@ -75,7 +75,10 @@ FORCES = (
         "speed_to_erpm_gain",
         "erpm per m/s",
         "motor speed for a speed of the car, over the drive; as in vesc.yaml",
+        worse="up",
+        kind="tyre_flat",
         fields=("speed",),
+        least_share=0.03,
     ),
     Parameter("motor_force_n_per_a", "N/A", "force at the tyres for an ampere of the motor, without losses"),
     Parameter(

@@ -77,15 +77,6 @@ _DRIVETRAIN = (
         least_share=0.0,
     ),
     Parameter(
-        "erpm_per_mps",
-        "erpm per m/s",
-        "motor speed for a speed of the car, without torque",
-        worse="up",
-        kind="tyre_flat",
-        fields=("speed",),
-        least_share=0.03,
-    ),
-    Parameter(
         "slip_under_torque",
         "1",
         "share that the motor turns further under much torque than without",

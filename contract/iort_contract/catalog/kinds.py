@@ -51,7 +51,7 @@ KINDS = {
             "tyre_flat",
             "the wheels turn more often for the same way",
             "look for a flat or worn tyre, and a wheel that turns on its rim; after new tyres or gears"
-            " run `iort calibrate`",
+            " calibrate the car",
             explains=("friction_added", "payload_added", "brake_dragging"),
             alternatives=("smaller wheels or another gear than before",),
         ),
@@ -92,6 +92,7 @@ KINDS = {
             "sensor_stuck",
             "a field kept exactly the same value while the car moved",
             "check the sensor and its wires; the analysis leaves out the samples in between",
+            explains=("pattern_unusual",),
         ),
         Kind(
             "sensor_drift",
@@ -110,6 +111,7 @@ KINDS = {
             "can_intermittent",
             "samples of the motor controller are missing again and again",
             "check the cable and plugs between computer and controller, and the CAN bus' terminators",
+            explains=("pattern_unusual",),
         ),
         Kind(
             "pattern_unusual",
@@ -120,7 +122,7 @@ KINDS = {
         Kind(
             "analysis_failed",
             "a drive could not be analysed",
-            "the text has the reason; the samples are kept, and `iort analyse` tries again",
+            "the text has the reason; the samples are kept, so analyse it again",
         ),
     )
 }

@@ -95,29 +95,6 @@ def decode_finding(content: Mapping[str, Any]) -> Finding:
     )
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """The parameters of a drive, by the names of the catalogue."""
-
-    drive: DriveKey
-    estimates: Mapping[str, Estimate]
-
-
-def encode_parameters(parameters: Parameters) -> dict[str, Any]:
-    """The parameters as an object for JSON."""
-    estimates = {name: encode_estimate(one) for name, one in parameters.estimates.items()}
-    return {**vars(parameters.drive), "estimates": estimates}
-
-
-def decode_parameters(content: Mapping[str, Any]) -> Parameters:
-    """Decode parameters; raises `ContractError`."""
-    estimates = content.get("estimates")
-    if not isinstance(estimates, Mapping):
-        raise ContractError(f"estimates must be an object, got {shown(estimates)}")
-    drive = DriveKey(text(content, "robot"), integer(content, "start_us"), text(content, "run"))
-    return Parameters(drive, {str(name): decode_estimate(one) for name, one in estimates.items()})
-
-
 def encode_estimate(estimate: Estimate) -> dict[str, Any]:
     """The estimate as an object for JSON."""
     return estimate._asdict()

@@ -22,9 +22,13 @@ class Bridge:
 
     def offset_us(self) -> int | None:
         """The offset in microseconds."""
-        offset = self.offset()
-        return round(offset.offset_ms * 1000) if offset is not None else None
+        return offset_us(self.offset())
 
     def reject(self, what: str, reason: str, why: str) -> None:
         """Count a rejected message, and log it unless one like it was logged less than a minute ago."""
         self.rejections.warn(f"{what} {reason}", f"{what}: rejected: {why}")
+
+
+def offset_us(offset: ClockOffset | None) -> int | None:
+    """A clock offset in microseconds, if it is known."""
+    return round(offset.offset_ms * 1000) if offset is not None else None

@@ -6,6 +6,8 @@ downlink:
       topic: /drive
       type: ackermann_msgs/AckermannDriveStamped
       motion: {lease_s: 0.5, stop: {drive: {speed: 0.0}}}
+  ask:                                    # the service /iort/ask/calibration, and topics of that name
+    calibration: {}
   fleet:                                  # fleet/<namespace>/+/<name>, of all other robots
     pose: {topic: "/fleet/{robot}/pose", type: geometry_msgs/PoseStamped}
 share:                                    # to fleet/<namespace>/<robot>/<name>
@@ -16,11 +18,15 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Mapping
 
-from iort_agent.common.schema import Place, Rule, flag, number, pairs, section, setting, text
+from iort_agent.common.schema import Place, Rule, existing_path, flag, number, pairs, section, setting, text
+from iort_agent.errors import AskError
 from iort_agent.sources.ros1 import ros_name
+from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
+from iort_contract.messages.ask import INVALID, MAX_ASK_MS
 from iort_contract.messages.commands import FLEET_MAX_AGE_MS, MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.topics import check_stream
 
@@ -37,6 +43,12 @@ def _fleet_topic(value: str) -> str:
     if value.count(ROBOT_IN_TOPIC) != 1:
         raise ContractError(f"must be a ROS topic with one {ROBOT_IN_TOPIC} in it, got {value!r}")
     ros_name(value.replace(ROBOT_IN_TOPIC, "robot"))
+    return value
+
+
+def _question(value: str) -> str:
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", value):
+        raise ContractError(f"question must be a name such as calibration, got {value!r}")
     return value
 
 
@@ -78,6 +90,25 @@ class FleetConfig:
 
 
 @dataclass(frozen=True)
+class AskConfig:
+    """A question to the cloud that ROS nodes may ask. The service waits for an answer for ``timeout_s``. It
+    asks with the ``body``, or with the object in the JSON file ``body_file``, which is read for each call."""
+
+    timeout_s: float = setting(number(0.1, MAX_ASK_MS / 1000, unit="s"), 15.0)
+    body: Mapping[str, Any] | None = setting(_object, default=None)
+    body_file: Path | None = setting(existing_path(), default=None)
+
+    def question(self) -> Mapping[str, Any]:
+        """The body of a question without one of its own. Raises `AskError`."""
+        if self.body_file is None:
+            return self.body or {}
+        try:
+            return json_object(self.body_file.read_bytes(), str(self.body_file))
+        except (OSError, ContractError) as error:
+            raise AskError(INVALID, str(error)) from error
+
+
+@dataclass(frozen=True)
 class ShareConfig:
     """The name under which a ROS topic's newest message is sent to other robots, and the highest rate."""
 
@@ -99,6 +130,9 @@ class DownlinkConfig:
     )
     fleet: tuple[tuple[str, FleetConfig], ...] = setting(
         pairs(section(FleetConfig), what=_FLEET, key=_STREAM), ()
+    )
+    ask: tuple[tuple[str, AskConfig], ...] = setting(
+        pairs(section(AskConfig), what="a mapping of question to its settings", key=text(_question)), ()
     )
     clock_skew_s: float = setting(number(0, 60, unit="s"), 1.0)
 

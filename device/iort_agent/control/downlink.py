@@ -1,18 +1,23 @@
-"""The thread and the lifecycle of all that passes between the broker and ROS: commands, peers and shares."""
+"""The thread and the lifecycle of what passes between the broker and ROS: commands, peers, shares, asks."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from pathlib import Path
 from typing import Any, Callable, Iterable, Sequence
 
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.control.asks import Asks
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.commands import Answer, Commands
 from iort_agent.control.config import DownlinkConfig, ShareConfig
 from iort_agent.control.peers import Peers
+from iort_agent.control.questions import Questions
 from iort_agent.control.shares import Shares
+from iort_agent.files.http import downloader
+from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros1.graph import Graph
 from iort_agent.ros1.node import DEFAULT_NODE, shared
@@ -40,6 +45,7 @@ class Downlink:
         graph: Graph,
         offset: Callable[[], ClockOffset | None],
         answer: Answer,
+        questions: Questions | None = None,
     ) -> None:
         self._clock, self._graph = link.clock, graph
         self._wake, self._end = threading.Event(), threading.Event()
@@ -49,15 +55,20 @@ class Downlink:
         self._commands = Commands(config, bridge, answer=answer, wake=self._wake.set)
         self._peers = Peers(config, bridge)
         self._shares = Shares(share, bridge, boot=boot, wake=self._wake.set)
+        self._asks = Asks(config.ask, bridge, questions) if questions is not None else None
 
     def start(self) -> None:
         """Join the ROS graph and begin."""
         self._graph.start()
         self._thread.start()
+        if self._asks is not None:
+            self._asks.start()
 
     def halt(self) -> None:
         """Stop all motion, and let no further command pass. Stops are repeated until `close`."""
         self._commands.halt()
+        if self._asks is not None:
+            self._asks.halt()
         self._wake.set()
 
     def close(self) -> None:
@@ -67,6 +78,8 @@ class Downlink:
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
+        if self._asks is not None:
+            self._asks.close()
         while (due := self._commands.tick()) is not None:
             self._clock.wait(threading.Event(), max(0.0, due - self._clock.monotonic()))
         self._graph.close()
@@ -83,6 +96,7 @@ class Downlink:
             "commands": self._commands.report(),
             "fleet": self._peers.report(),
             "shared": self._shares.report(),
+            **({"asked": self._asks.report()} if self._asks is not None else {}),
             "refused": self._rejections.counts(),
             "waits": self.waits(),
         }
@@ -109,15 +123,29 @@ def make_downlink(
     graph: Graph | None,
     offset: Callable[[], ClockOffset | None],
     answer: Answer,
+    uploader: Uploader | None = None,
+    root_ca: Path | None = None,
 ) -> Downlink | None:
     """The downlink of a configuration that has one: in the ROS node of the sources, or in a ``graph`` that is
     no ROS graph if they need no node.
 
     Raises as `Downlink`, and `SourceError` without rospy.
     """
-    if not (config.cmd or config.fleet or share):
+    if not (config.cmd or config.fleet or config.ask or share):
         return None
     node = next((source.node for source in sources if isinstance(source, Ros1Config)), None)
     if graph is None or node is not None:
         graph = shared(node or DEFAULT_NODE, link.clock)
-    return Downlink(config, share, link=link, boot=boot, graph=graph, offset=offset, answer=answer)
+    questions = None
+    if config.ask and uploader is not None:
+        questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)
+    return Downlink(
+        config,
+        share,
+        link=link,
+        boot=boot,
+        graph=graph,
+        offset=offset,
+        answer=answer,
+        questions=questions,
+    )

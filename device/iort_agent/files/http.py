@@ -9,7 +9,7 @@ import re
 import ssl
 import threading
 from pathlib import Path
-from typing import Iterator, NamedTuple
+from typing import Callable, Iterator, NamedTuple
 from urllib.parse import urlsplit
 
 from iort_agent.clock import Clock
@@ -150,6 +150,25 @@ def _answer(connection: http.client.HTTPSConnection) -> Put | None:
     ):
         return Put(Outcome.STALE, text)
     return Put(Outcome.FAILED, text)
+
+
+def downloader(root_ca: Path | None) -> Callable[[str, int], bytes]:
+    """Gets a file of a known size from an address. Raises `OSError`, `HTTPException` or `ValueError`."""
+    trust = trusting(root_ca)
+
+    def download(address: str, size: int) -> bytes:
+        url = urlsplit(address)
+        if url.scheme != "https" or not url.hostname:
+            raise ValueError(f"the cloud's address must be https with a host, got {url.scheme}")
+        connection = http.client.HTTPSConnection(url.hostname, url.port, timeout=_TIMEOUT_S, context=trust)
+        with contextlib.closing(connection):
+            connection.request("GET", f"{url.path}?{url.query}")
+            response = connection.getresponse()
+            if response.status != http.client.OK:
+                raise OSError(f"the server says {response.status} {response.reason}")
+            return response.read(size)
+
+    return download
 
 
 def trusting(root_ca: Path | None) -> ssl.SSLContext:

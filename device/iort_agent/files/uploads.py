@@ -13,8 +13,7 @@ from iort_agent.errors import UploadError
 from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import unreadable
 from iort_agent.files.folder import HELD_S, Folder
-from iort_agent.files.upload import Uploader, make_uploader
-from iort_agent.mqtt.uplink import Link
+from iort_agent.files.upload import Uploader
 
 _log = logging.getLogger(__name__)
 
@@ -97,10 +96,10 @@ class Uploads:
         self._current_bytes = there
 
 
-def make_uploads(files: FilesConfig, link: Link, *, root_ca: Path | None) -> Uploads | None:
+def make_uploads(files: FilesConfig, uploader: Uploader | None, clock: Clock) -> Uploads | None:
     """The uploads of a configuration that names a folder. Raises `UploadError` if ``large_folder`` cannot be
     created."""
-    clock, folders = link.clock, []
+    folders = []
     if files.large_folder is not None:
         try:
             files.large_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -111,7 +110,6 @@ def make_uploads(files: FilesConfig, link: Link, *, root_ca: Path | None) -> Upl
         folders.append(
             Folder(files.folder, clock=clock, settle_s=files.settle_s, remove_after_s=files.remove_after_s)
         )
-    if not folders:
+    if not folders or uploader is None:
         return None
-    uploader = make_uploader(link, root_ca=root_ca, rate_kb_s=files.rate_kb_s)
     return Uploads(folders=folders, uploader=uploader, clock=clock)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Callable, Mapping, Protocol
 
+from iort_agent.ros1.trigger import OnTrigger
 from iort_contract.ros1.definition import Definition
 
 # Takes a message: the publisher's connection header, and the message's bytes.
@@ -27,6 +28,9 @@ class Graph(Protocol):
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in another thread."""
+
+    def offer(self, service: str, handler: OnTrigger) -> None:
+        """Answer calls of a service of the type std_srvs/Trigger, each in a thread of its own."""
 
     def waits(self) -> str | None:
         """Why the graph cannot be joined, for a person."""

@@ -9,6 +9,7 @@ one of two. The users of the node wait for none of this.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import logging
 import random
@@ -21,6 +22,7 @@ from iort_agent.clock import Clock, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import master
 from iort_agent.ros1.graph import OnBytes
+from iort_agent.ros1.trigger import OnTrigger, trigger
 from iort_agent.ros1.types import Installed, installed, rospy
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
@@ -83,6 +85,8 @@ class Node:
         self._subscribers: dict[str, Any] = {}
         self._wanted: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
+        self._offered: dict[str, OnTrigger] = {}
+        self._services: dict[str, Any] = {}
         self._types: dict[str, tuple[Installed, Definition]] = {}
         self._absent = False
         self._displaced = False
@@ -169,6 +173,12 @@ class Node:
             self._wanted.setdefault(self.resolve(topic), self._types[kind][0].message_class)
         self._wake.set()
 
+    def offer(self, service: str, handler: OnTrigger) -> None:
+        """Answer calls of a service, in rospy's threads."""
+        with self._lock:
+            self._offered[self.resolve(service)] = handler
+        self._wake.set()
+
     def release(self, topic: str) -> None:
         """Nothing to do: a joystick or a planner on board drives on by itself."""
 
@@ -237,7 +247,7 @@ class Node:
         self.ready.clear()
         self._rospy.signal_shutdown("another node took the name")
         with self._lock:
-            self._subscribers, self._publishers = {}, {}
+            self._subscribers, self._publishers, self._services = {}, {}, {}
         self._rospy = rospy()
         self._displaced = False
         self._losses += 1
@@ -316,7 +326,7 @@ class Node:
         """Give rospy the wanted subscriptions and publishers."""
         with self._lock:
             handlers = {topic: tuple(handlers) for topic, handlers in self._handlers.items()}
-            wanted = dict(self._wanted)
+            wanted, offered = dict(self._wanted), dict(self._offered)
         for topic, those in handlers.items():
             subscriber = self._subscribers.get(topic)
             if those and subscriber is None:
@@ -332,6 +342,12 @@ class Node:
                     topic, _bytes_of(self._rospy.AnyMsg, message_class), queue_size=_QUEUE, tcp_nodelay=True
                 )
 
+        for service, handler in offered.items():
+            if service not in self._services:
+                self._services[service] = self._rospy.Service(
+                    service, trigger(), functools.partial(_answered, handler)
+                )
+
     def _deliver(self, message: Any, topic: str) -> None:
         for handler in self._handlers[topic]:
             handler(message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names for them
@@ -343,7 +359,9 @@ class Node:
             questions.getSystemState(self._me)
             questions.getParam(self._me, "/use_sim_time")
             questions.lookupNode(self._me, self._me)
-            (_, _, (publishers, subscribers, _)), (status, _, sim_time), (_, _, uri) = tuple(questions())
+            (_, _, (publishers, subscribers, services)), (status, _, sim_time), (_, _, uri) = tuple(
+                questions()
+            )
             self.sim_time = status == 1 and bool(sim_time)
             if self._absent:
                 _log.info("the ROS master at %s answers again", self._uri)
@@ -352,7 +370,7 @@ class Node:
                 # To register again would end the other one.
                 self._displaced = True
                 return
-            forgotten = self._register_again(dict(publishers), dict(subscribers))
+            forgotten = self._register_again(dict(publishers), dict(subscribers), dict(services))
             self._connect(dict(publishers))
         except master.ERRORS as error:
             if not self._absent:
@@ -362,7 +380,9 @@ class Node:
             if forgotten:
                 _log.warning("the ROS master had forgotten %s: registered again", ", ".join(forgotten))
 
-    def _register_again(self, publishers: Mapping[str, Any], subscribers: Mapping[str, Any]) -> list[str]:
+    def _register_again(
+        self, publishers: Mapping[str, Any], subscribers: Mapping[str, Any], services: Mapping[str, Any]
+    ) -> list[str]:
         me, api = self._me, self._rospy.get_node_uri()
         unheard = [topic for topic in self._subscribers if me not in subscribers.get(topic, ())]
         unpublished = [topic for topic in self._publishers if me not in publishers.get(topic, ())]
@@ -371,7 +391,10 @@ class Node:
         for topic in unpublished:
             kind = self._wanted[topic]._type  # noqa: SLF001 - genpy's own name for it
             self._master.ask("registerPublisher", topic, kind, api)
-        return unheard + unpublished
+        unoffered = [service for service in self._services if me not in services.get(service, ())]
+        for service in unoffered:
+            self._master.ask("registerService", service, self._services[service].uri, api)
+        return unheard + unpublished + unoffered
 
     def _connect(self, publishers: Mapping[str, Any]) -> None:
         """Try again if there are more publishers than connections, because rospy tries each only once."""
@@ -389,6 +412,12 @@ class Node:
 
 def _connections(endpoint: Any) -> int:
     return int(endpoint.get_num_connections()) if endpoint is not None else 0
+
+
+def _answered(handler: OnTrigger, _request: Any) -> dict[str, Any]:
+    """A response as rospy makes one, by its fields."""
+    success, message = handler()
+    return {"success": success, "message": message}
 
 
 def _bytes_of(any_message: Any, message_class: Any) -> Any:

@@ -112,6 +112,8 @@ def test_the_demo_runs_until_ctrl_c_and_leaves_no_process(tmp_path):
         (("--bag", "no/such.bag"), "BAG must exist, got no/such.bag"),
         (("--report", "no/such/folder/r.json"), "REPORT must be in an existing folder"),
         (("--report", "."), "REPORT must be a file, got the folder ."),
+        (("--faults", "flat_tire"), "FAULTS: kind: must be one of worn_battery"),
+        (("--faults", "payload:huge"), "FAULTS: strength: must be weak, middle, strong or a number"),
         (("--port", "70000"), "PORT must be 1 to 65535, got 70000"),
     ],
 )

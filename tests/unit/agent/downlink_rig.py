@@ -15,6 +15,7 @@ from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.ros1.trigger import OnTrigger
 from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
 from tests.agent_fakes import Loopback, ManualClock, link_of
@@ -61,6 +62,8 @@ class FakeGraph:
         self.up = True
         self.closed = False
         self.stopped = threading.Event()
+        self.services: dict[str, OnTrigger] = {}
+        self._news = threading.Condition()
         self._handlers: dict[str, Callable[[Mapping[str, str], bytes], None]] = {}
 
     def definition(self, kind: str) -> Definition:
@@ -74,10 +77,20 @@ class FakeGraph:
     def publish(self, topic: str, data: bytes) -> bool:
         assert topic in self.kinds
         if self.up:
-            self.published.append((topic, data))
+            with self._news:
+                self.published.append((topic, data))
+                self._news.notify_all()
         if data == doubles(0):
             self.stopped.set()
         return self.up
+
+    def await_published(self, count: int) -> None:
+        """Wait for so many messages."""
+        with self._news:
+            assert self._news.wait_for(lambda: len(self.published) >= count, 30), self.published
+
+    def offer(self, service: str, handler: OnTrigger) -> None:
+        self.services[service] = handler
 
     def release(self, topic: str) -> None:
         self.released.append(topic)

@@ -18,7 +18,9 @@ from functions.shared.quota import HOUR, Quota
 from functions.shared.work import RefusedError, work_of
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, Question
+from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
+from iort_contract.messages.analysis import AnalysedDrive
 from iort_contract.messages.ask import (
     FAILED,
     INVALID,
@@ -40,13 +42,8 @@ from iort_contract.messages.ask import (
 )
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import File, file_key
-from iort_contract.messages.findings import (
-    DriveKey,
-    Estimate,
-    Parameters,
-    encode_parameters,
-)
-from iort_contract.tables import CONTENT, FINDING, PARAMETERS_OF, ROBOT
+from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.tables import FINDING, ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
 
 NOW_S = 1_700_000_000.0
@@ -287,19 +284,13 @@ def deployed(aws, s3, dynamodb, monkeypatch):
 def parameters(dynamodb, start_us, **values):
     drive = DriveKey("car", start_us, "00c0ffee")
     estimates = {name: Estimate(value, value - 1, value + 1, "ohm") for name, value in values.items()}
-    item = {
-        ROBOT: {"S": "car"},
-        FINDING: {"S": f"{PARAMETERS_OF}{drive}"},
-        CONTENT: {"S": json.dumps(encode_parameters(Parameters(drive, estimates)))},
-    }
-    dynamodb.put_item(TableName=FINDINGS, Item=item)
+    analysed = AnalysedDrive(drive, start_us + 1, "nightly", 100, estimates, {}, {})
+    FindingsTable(dynamodb, FINDINGS).put_drive(analysed)
 
 
 def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
     parameters(deployed, 1_000_000, old=1.0, both=1.0)
     parameters(deployed, 2_000_000, both=2.0)
-    broken = {ROBOT: {"S": "car"}, FINDING: {"S": f"{PARAMETERS_OF}9"}, CONTENT: {"S": "{}"}}
-    deployed.put_item(TableName=FINDINGS, Item=broken)
     asked = {"robot": "car", "question": CALIBRATION.name, "body": {}}
     found = answer.handler(asked, Context)["body"]["parameters"]
     assert {name: (one["value"], one["drive"][:16]) for name, one in found.items()} == {

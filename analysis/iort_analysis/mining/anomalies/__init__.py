@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.balance import mine_balance
+from iort_analysis.mining.anomalies.discords import mine_discords
 from iort_analysis.mining.anomalies.drift import mine_drift
 from iort_analysis.mining.anomalies.dropouts import mine_dropouts
 from iort_analysis.mining.anomalies.frozen import mine_frozen
 from iort_analysis.mining.anomalies.gaps import mine_gaps
 from iort_analysis.mining.anomalies.readings import readings
 from iort_analysis.mining.anomalies.slip import mine_slip
+from iort_analysis.mining.anomalies.underway import mine_underway
 from iort_analysis.mining.anomalies.warming import mine_warming
 from iort_analysis.results import Mined
 
@@ -22,7 +24,10 @@ def mine(drive: Drive) -> Mined:
         parts.append(Mined(missing={"anomalies": samples}))
     else:
         parts += [mine_balance(samples), mine_drift(samples)]
-        parts += [test(drive, samples) for test in (mine_warming, mine_slip, mine_dropouts)]
+        parts += [
+            test(drive, samples)
+            for test in (mine_warming, mine_slip, mine_dropouts, mine_underway, mine_discords)
+        ]
     return Mined(
         estimates={name: estimate for part in parts for name, estimate in part.estimates.items()},
         missing={name: reason for part in parts for name, reason in part.missing.items()},

@@ -33,15 +33,16 @@ def mine_balance(samples: Readings) -> Mined:
     if fitted is None:
         reason = "the motor must drive the car for a minute at several speeds and accelerations"
         return Mined(missing=dict.fromkeys((INERTIA, ROLLING, BRAKE), reason))
-    found, _ = fitted
+    found, _, _ = fitted
     inertia = found.of(0, "A s/krpm")
     return Mined(
         estimates={INERTIA: inertia, ROLLING: found.of(1, "A"), BRAKE: found.of(3, "A")},
     )
 
 
-def balance(samples: Readings) -> tuple[Fit, Array] | None:
-    """The fit of the current with inertia, rolling, drag and brake, and the times of its rows in seconds."""
+def balance(samples: Readings) -> tuple[Fit, Array, float] | None:
+    """The fit of the current with inertia, rolling, drag and brake; the times of its rows, and the time that
+    each of them spans, in seconds."""
     t, speed, amps = samples.seconds, np.abs(samples.krpm), samples.motor_a * np.sign(samples.krpm)
     brakes = amps < -_BRAKES_A
     last = np.maximum.accumulate(np.where(brakes, t, -np.inf))
@@ -74,4 +75,4 @@ def balance(samples: Readings) -> tuple[Fit, Array] | None:
         ],
         wanted,
     )
-    return None if fitted is None else (fitted, grid[:-_OVER] + took / 2)
+    return None if fitted is None else (fitted, grid[:-_OVER] + took / 2, _OVER * _STEP_S)

@@ -26,7 +26,7 @@ _MOST_KNOTS, _KNOT_S = 8, 60.0
 
 def mine_drift(samples: Readings) -> Mined:
     """The drifts that the drive's fields allow."""
-    steady = (np.abs(samples.duty) < FULL_DUTY) & (np.abs(samples.krpm) > MOVING_KRPM)
+    steady = _steady(samples)
     fits = {VOLTAGE_DRIFT: _voltage(samples, steady), CURRENT_DRIFT: _current(samples, steady)}
     estimates = {name: found for name, found in fits.items() if found is not None}
     missing = {
@@ -37,11 +37,27 @@ def mine_drift(samples: Readings) -> Mined:
     return Mined(estimates=estimates, missing=missing)
 
 
-def _voltage(samples: Readings, steady: Mask) -> Estimate | None:
+def voltage_residuals(samples: Readings) -> Array | None:
+    """What the battery's voltage reads more than speed, current and duty cycle say, for each sample."""
+    columns = [np.where(_steady(samples), column, np.nan) for column in _motor(samples)]
+    found = fit(columns, samples.duty * samples.voltage_v)
+    return None if found is None else found.residuals / samples.duty
+
+
+def _steady(samples: Readings) -> Mask:
+    return (np.abs(samples.duty) < FULL_DUTY) & (np.abs(samples.krpm) > MOVING_KRPM)
+
+
+def _motor(samples: Readings) -> list[Array]:
+    """What the motor's voltage is made of. The winding warms up, and with it its resistance; the inductance
+    adds to the voltage at speed."""
     t, krpm, amps = samples.seconds, samples.krpm, samples.motor_a
-    # The winding warms up, and with it its resistance; the inductance adds to the voltage at speed; and an
-    # error of the current is one of the voltage, which does not follow the duty cycle.
-    columns = [krpm, amps, amps * t / t[-1], krpm * np.abs(amps), *_along(t)]
+    return [krpm, amps, amps * t / t[-1], krpm * np.abs(amps)]
+
+
+def _voltage(samples: Readings, steady: Mask) -> Estimate | None:
+    # An error of the current is one of the motor's voltage, which does not follow the duty cycle.
+    columns = [*_motor(samples), *_along(samples.seconds)]
     found = _with_error(samples, samples.duty * samples.voltage_v, columns, steady)
     return None if found is None else found.of(len(found.coefficients) - 1, "V")
 

@@ -1,24 +1,27 @@
-"""Two speeds: the motor's beside that of the car's pose. Their ratio tells the wheels' size, and slip."""
+"""Slip: the motor's speed beside that of the car's pose, with torque and without."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.anomalies.readings import KRPM, MOVING_KRPM, Array, Readings
+from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
 from iort_analysis.mining.intervals import mean_of
 from iort_analysis.results import Mined
 from iort_contract.messages.findings import Estimate
 
-GAIN, SLIP = "erpm_per_mps", "slip_under_torque"
+SLIP = "slip_under_torque"
 # Distances over this time are compared: long enough for a pose with a centimetre's noise.
 _OVER_S = 0.25
 # Nearly no torque is below this share of the high currents, and much torque is above that one.
 _HIGH, _IDLE, _TORQUE = 0.95, 0.25, 0.6
-# The drive in so many parts gives the interval.
-_PARTS, _LEAST = 20, 200
+# The drive in so many parts gives the gain's interval.
+_PARTS, _LEAST, _LEAST_PULLS = 20, 200, 20
+# The 95 % quantile of the normal distribution: 90 % lie within, either way.
+_Z = 1.645
 
 
 class _Ways(NamedTuple):
@@ -30,7 +33,7 @@ class _Ways(NamedTuple):
 
 
 def mine_slip(drive: Drive, samples: Readings) -> Mined:
-    """The wheels' turns for a metre without torque, and how many more with much torque."""
+    """How much further the wheels turn with much torque than without."""
     pose = None if drive.pose in {None, drive.vesc} else drive.streams[drive.pose or ""]
     if pose is None or len(pose.times_us) < _LEAST:
         return _missing("the drive has no second source of speed, such as a pose")
@@ -40,22 +43,18 @@ def mine_slip(drive: Drive, samples: Readings) -> Mined:
     if len(ways.turns) < _LEAST:
         return _missing("the car hardly moves")
     high = float(np.quantile(ways.amps, _HIGH))
-    parts = np.array_split(np.arange(len(ways.turns)), _PARTS)
-    gains, slips = [], []
-    for part in parts:
-        turns, moved_m, amps = (values[part] for values in ways)
-        idle, pulls = np.abs(amps) < _IDLE * high, amps > _TORQUE * high
-        if not moved_m[idle].sum() > 0:
-            continue
-        gains.append(float(turns[idle].sum() / moved_m[idle].sum()))
-        if moved_m[pulls].sum() > 0:
-            slips.append(1 - float(moved_m[pulls].sum() / turns[pulls].sum()) * gains[-1])
-    found = {GAIN: (KRPM * np.array(gains), "erpm per m/s"), SLIP: (np.array(slips), "1")}
-    known = {name: one for name, one in found.items() if len(one[0]) >= _PARTS / 2}
-    return Mined(
-        estimates={name: Estimate(*mean_of(values), unit) for name, (values, unit) in known.items()},
-        missing=dict.fromkeys(found.keys() - known.keys(), "the car hardly drives with and without torque"),
-    )
+    idle, pulls = np.abs(ways.amps) < _IDLE * high, ways.amps > _TORQUE * high
+    if idle.sum() < _LEAST / 2 or pulls.sum() < _LEAST_PULLS:
+        return _missing("the car hardly drives with and without torque")
+    parts = np.array_split(np.flatnonzero(idle), _PARTS)
+    gains = np.array([float(ways.turns[part].sum() / ways.moved_m[part].sum()) for part in parts])
+    gain, low, high = mean_of(gains)
+    # What the wheels turned further in this drive; the pose's noise is the error, as it is without torque.
+    noise_m = float(np.std(ways.moved_m[idle] - ways.turns[idle] / gain))
+    turned_m = float(ways.turns[pulls].sum()) / gain
+    slip = 1 - float(ways.moved_m[pulls].sum()) / turned_m
+    half = math.hypot(_Z * noise_m * math.sqrt(float(pulls.sum())) / turned_m, (high - low) / 2 / gain)
+    return Mined(estimates={SLIP: Estimate(slip, slip - half, slip + half, "1")})
 
 
 def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
@@ -63,7 +62,7 @@ def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
     step = max(1, round(_OVER_S / float(np.median(np.diff(seconds)))))
 
     def over(values: Array) -> Array:
-        return np.asarray(values[step:] - values[:-step])
+        return np.asarray(np.diff(values[::step]))
 
     def summed(values: Array) -> Array:
         return over(np.interp(seconds, samples.seconds, samples.summed(values)))
@@ -76,4 +75,4 @@ def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
 
 
 def _missing(reason: str) -> Mined:
-    return Mined(missing={GAIN: reason, SLIP: reason})
+    return Mined(missing={SLIP: reason})

@@ -8,6 +8,7 @@ from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1.graph import Graph, OnBytes
 from iort_agent.ros1.json_message import decode
+from iort_agent.ros1.trigger import OnTrigger
 from iort_agent.sources.sim.driver import Wish
 from iort_contract.messages.commands import MAX_LEASE_MS
 from iort_contract.ros1.definition import Definition, parse
@@ -74,6 +75,9 @@ class SimGraph(Graph):
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:  # noqa: ARG002 - as the graph has it
         raise SourceError(f"a simulated car publishes no ROS topics, so it cannot share {topic}")
+
+    def offer(self, service: str, handler: OnTrigger) -> None:  # noqa: ARG002 - as the graph has it
+        raise SourceError(f"a simulated car has no ROS nodes, so nobody could call {service}")
 
     def waits(self) -> str | None:
         return None

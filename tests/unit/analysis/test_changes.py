@@ -1,0 +1,125 @@
+"""Changes within a drive, and stretches that are like no other: against brute force and known truths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iort_analysis.drives.building import build
+from iort_analysis.mining import anomalies
+from iort_analysis.mining.anomalies.cusum import changed
+from iort_analysis.mining.anomalies.profile import mass, matrix_profile
+from iort_analysis.samples.blocks import Block
+from tests.unit.analysis.simulated import KEY, START_US, streams
+
+
+def alike(rho: float, n: int, seed: int) -> np.ndarray:
+    """Noise whose neighbours are alike."""
+    made = np.random.default_rng(seed).normal(size=n)
+    for i in range(1, n):
+        made[i] = rho * made[i - 1] + np.sqrt(1 - rho**2) * made[i]
+    return made
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5])
+def test_noise_changes_no_more_often_than_by_chance(rho: float) -> None:
+    p_values = [found.p for seed in range(300) if (found := changed(alike(rho, 120, seed), "V")) is not None]
+    assert len(p_values) == 300
+    assert np.mean(np.array(p_values) < 0.1) < 0.15
+    assert min(p_values) > 1e-5
+
+
+def test_a_change_is_found_with_its_place_and_size() -> None:
+    held = 0
+    for seed in range(100):
+        values = alike(0.3, 120, seed)
+        values[80:] += 3.0
+        found = changed(values, "V")
+        assert found is not None
+        assert found.p < 1e-3
+        assert abs(found.place - 80) < 8
+        held += found.effect.low < 3.0 < found.effect.high
+    assert held >= 80
+
+
+@given(st.floats(0.01, 100), st.floats(-100, 100))
+def test_a_change_follows_the_scale(scale: float, shift: float) -> None:
+    values = alike(0.3, 60, 1)
+    one, other = changed(values, "V"), changed(scale * values + shift, "V")
+    assert one is not None
+    assert other is not None
+    assert other.place == one.place
+    assert other.p == pytest.approx(one.p, rel=1e-6)
+    assert other.effect.value == pytest.approx(scale * one.effect.value, rel=1e-6)
+
+
+def test_what_is_constant_or_short_has_no_change() -> None:
+    assert changed(np.ones(100), "V") is None
+    assert changed(np.arange(10.0), "V") is None
+
+
+def normalised(values: np.ndarray) -> np.ndarray:
+    return (values - values.mean()) / values.std()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.integers(4, 12))
+def test_the_profile_is_that_of_every_pair(seed: int, m: int) -> None:
+    series = np.random.default_rng(seed).normal(size=60)
+    places = range(len(series) - m + 1)
+    shapes = [normalised(series[i : i + m]) for i in places]
+    far = np.array([[np.linalg.norm(a - b) for b in shapes] for a in shapes])
+    assert mass(np.array([series[i : i + m] for i in places]), series) == pytest.approx(far, abs=1e-4)
+    far[np.abs(np.subtract.outer(places, places)) <= m // 2] = np.inf
+    assert matrix_profile(series, m) == pytest.approx(far.min(axis=1), abs=1e-4)
+
+
+def test_flat_stretches_have_no_profile() -> None:
+    series = np.sin(np.arange(200) / 3)
+    series[80:120] = 0.5
+    profile = matrix_profile(series, 10)
+    assert np.isnan(profile[80:110]).all()
+    assert np.isfinite(profile[:80]).all()
+    assert np.isnan(matrix_profile(np.ones(100), 10)).all()
+    assert len(matrix_profile(np.ones(5), 10)) == 0
+
+
+def test_a_stretch_like_no_other_is_found() -> None:
+    # Laps of the same current, and a driver who once plays with the throttle.
+    made = dict(streams(120))
+    times, columns = made["vesc"]
+    n = 15_000
+    seconds = np.arange(n) / 50
+    times = START_US + np.arange(n) * 20_000
+    chance = np.random.default_rng(1)
+    lap = np.interp(seconds % 11, np.arange(12), [5, 20, 8, -6, 12, 25, 3, -8, 15, 6, 18, 5])
+    current = lap + chance.normal(0, 0.5, n)
+    speed = 15_000 + 300 * lap
+    quiet = {name: np.resize(column, n) for name, column in columns.items()}
+    usual = {"vesc": Block(times, {**quiet, "current_motor": current, "speed": speed})}
+    kinds = [event.kind for event in anomalies.mine(build(KEY, usual)).events]
+    assert "pattern_unusual" not in kinds
+
+    odd = (seconds > 151) & (seconds < 159)
+    current = np.where(odd, 12 + 12 * np.sign(np.sin(2 * np.pi * seconds / 1.7)), current)
+    strange = {"vesc": Block(times, {**quiet, "current_motor": current, "speed": speed})}
+    found = [event for event in anomalies.mine(build(KEY, strange)).events if event.kind == "pattern_unusual"]
+    assert len(found) == 1
+    assert found[0].start_us < START_US + 155_000_000 < found[0].end_us
+    assert found[0].p is not None
+    assert found[0].p < 1e-3
+
+
+def test_friction_that_begins_on_the_way_is_found_at_its_time() -> None:
+    from bench.proof.cars import drive_of
+    from bench.proof.drives import simulated
+    from iort_agent.sources.sim.faults import FaultConfig
+
+    spec = drive_of(300, 1, [FaultConfig("added_friction", "strong", 180.0)], seconds=300.0)
+    found = anomalies.mine(build(spec.key, simulated(spec, None).streams)).events
+    (event,) = [one for one in found if one.kind == "friction_added"]
+    assert (event.start_us - spec.key.start_us) / 1e6 == pytest.approx(180, abs=15)
+    assert event.p is not None
+    assert event.p < 1e-4
