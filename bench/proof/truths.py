@@ -37,7 +37,10 @@ TRUTHS: dict[str, Truth] = {
     "motor_inductance_h": _same("motor_inductance_h"),
     "motor_torque_nm_per_a": lambda truth: 1.5 * truth["pole_pairs"] * truth["flux_linkage_wb"],
     "speed_to_erpm_gain": _same("driven_erpm_per_mps"),
-    "motor_force_n_per_a": _same("newtons_per_amp"),
+    # By the tyres' effective radius, which their creep is part of.
+    "motor_force_n_per_a": lambda truth: (
+        truth["newtons_per_amp"] * truth["driven_erpm_per_mps"] / truth["speed_to_erpm_gain"]
+    ),
     "effective_mass_kg": _moved_kg,
     "rotating_mass_kg": _same("rotating_mass_kg"),
     "friction_n": _friction_n,

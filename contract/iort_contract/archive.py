@@ -94,8 +94,9 @@ def day_key(topic: Topic, hour: Hour) -> str:
 
 
 def refused_key(topic: Topic, hour: Hour) -> str:
-    """The object of an hour's stored items that are not batches: DynamoDB's JSON, a line each."""
-    return f"{_day(topic, hour)}{str(hour)[-2:]}.refused.jsonl"
+    """The object of an hour's stored items that are not batches: DynamoDB's JSON, a line each. Athena and
+    Spark skip names with an underscore in front."""
+    return f"{_day(topic, hour)}_{str(hour)[-2:]}.refused.jsonl"
 
 
 def _day(topic: Topic, hour: Hour) -> str:
