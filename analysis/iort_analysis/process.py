@@ -14,7 +14,7 @@ import numpy as np
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style
+from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
 from iort_analysis.results import DriveResult, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
@@ -28,6 +28,7 @@ MINERS: Mapping[str, Miner] = MappingProxyType(
         "battery": battery.mine,
         "motor": motor.mine,
         "drivetrain": drivetrain.mine,
+        "thermal": thermal.mine,
         "laps": laps.mine,
         "style": style.mine,
     }

@@ -67,13 +67,12 @@ def mine(drive: Drive) -> Mined:
         if isinstance(motor, str)
         else _forces(drive, motion, motor, gain, registered)
     )
+    moved = (motion.coefficients, motion.covariance)
     ratios = {
         "acceleration_per_a_mps2": propagated(
-            lambda c: math.sqrt(max(c[0] * c[1], 0.0)),
-            (motion.coefficients, motion.covariance),
-            unit="m/s2/A",
+            lambda c: math.sqrt(max(c[0] * c[1], 0.0)) * (1 + _slipped(c)), moved, unit="m/s2/A"
         ),
-        "friction_per_mass_mps2": motion.of(2, "m/s2"),
+        "friction_per_mass_mps2": propagated(lambda c: c[2] * (1 + _slipped(c)), moved, unit="m/s2"),
     }
     return Mined({**estimates, **ratios, **found.estimates}, {**missing, **found.missing})
 
@@ -124,21 +123,19 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
     def per_amp(flux_wb: float, erpm_per_mps: float) -> float:
         return 1.5 * flux_wb * RAD_S_PER_ERPM * erpm_per_mps
 
-    def slipped(c: Array) -> Any:
-        # How much the wheels are faster than the car while they roll, compared with coasting.
-        return c[7] * c[4] / max(c[2], 1e-12)
-
     def mass_kg(c: Array) -> Any:
         # The accelerations were found with the gain, too. Both are of wheels that slip.
         seen = per_amp(c[0], c[1]) / math.sqrt(max(c[2] * c[3], 1e-12)) * c[1] / used_gain
-        return seen / (1 + slipped(c) * (1 + c[-1]))
+        return seen / (1 + _slipped(c[2:]) * (1 + c[-1]))
 
     def force_n(c: Array, index: int) -> Any:
-        return mass_kg(c) * c[index] * (1 + slipped(c))
+        return mass_kg(c) * c[index] * (1 + _slipped(c[2:]))
 
     parts = (flux, gains, moved, _BEYOND)
     estimates = {
-        "motor_force_n_per_a": propagated(lambda c: per_amp(c[0], c[1]), flux, gains, unit="N/A"),
+        "motor_force_n_per_a": propagated(
+            lambda c: per_amp(c[0], c[1]) / (1 + _slipped(c[2:]) * c[-1]), *parts, unit="N/A"
+        ),
         "effective_mass_kg": propagated(mass_kg, *parts, unit="kg"),
         "friction_n": propagated(lambda c: force_n(c, 4), *parts, unit="N"),
         "drag_n_s2_per_m2": propagated(lambda c: force_n(c, 5), *parts, unit="N s2/m2"),
@@ -155,6 +152,11 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
             value=moved_kg.value - known_kg, low=moved_kg.low - known_kg, high=moved_kg.high - known_kg
         )
     return Mined(estimates, missing)
+
+
+def _slipped(motion: Array) -> float:
+    """How much the wheels are faster than the car while they roll, compared with coasting."""
+    return float(motion[5] * motion[2] / max(motion[0], 1e-12))
 
 
 def _dragging(seconds: Array, brakes: NDArray[np.bool_]) -> Array:

@@ -122,4 +122,40 @@ FORCES = (
     ),
 )
 
-HEAT = ()
+_BODIES = {"motor": ("temp_motor",), "controller": ("temp_fet", "temperature_pcb")}
+HEAT = tuple(
+    parameter
+    for name, fields in _BODIES.items()
+    for parameter in (
+        Parameter(
+            f"{name}_rise_k_per_a2",
+            "K/A2",
+            f"warming of the {name} for each A2 of the motor current's mean square, with the drive's wind",
+            worse="up",
+            kind="cooling_lost",
+            fields=("current_motor", *fields),
+            least_share=0.4,
+        ),
+        Parameter(
+            f"{name}_thermal_resistance_k_per_w",
+            "K/W",
+            f"warming of the {name} for each watt lost in motor and controller together",
+            worse="up",
+            fields=("current_motor", *fields),
+        ),
+        Parameter(
+            f"{name}_final_degc",
+            "degC",
+            f"temperature at which the {name} settles, if the load of the drive's last minutes goes on",
+            worse="up",
+            fields=("current_motor", *fields),
+        ),
+        Parameter(
+            f"{name}_time_to_limit_s",
+            "s",
+            f"time until the {name} reaches 85 degC, if the load of the drive's last minutes goes on",
+            worse="down",
+            fields=("current_motor", *fields),
+        ),
+    )
+)
