@@ -114,6 +114,12 @@ KINDS = {
             explains=("pattern_unusual",),
         ),
         Kind(
+            "fault_reported",
+            "the motor controller reported a fault",
+            "read what the fault's name means in VESC Tool's manual; look at the evidence in the history",
+            severity="serious",
+        ),
+        Kind(
             "pattern_unusual",
             "a stretch of the drive is like no other one",
             "look at the evidence in the history",

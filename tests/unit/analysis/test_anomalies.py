@@ -132,6 +132,14 @@ def test_samples_that_come_again_are_an_intermittent_link() -> None:
     assert event.effect.value == pytest.approx(0.035, abs=0.01)
 
 
+def test_a_reported_fault_is_an_event_by_its_name() -> None:
+    made = changed("fault_code", slice(1000, 1010), 2.0)
+    made["vesc"].columns["fault_code"][2000] = 2.0
+    (event,) = anomalies.mine(build(KEY, made)).events
+    assert (event.kind, event.text) == ("fault_reported", "fault 2, under voltage: reported 2 times")
+    assert (event.start_us, event.end_us) == (START_US + 20_000_000, START_US + 20_180_000)
+
+
 def test_a_computer_that_pauses_is_no_intermittent_link() -> None:
     made = {}
     for name, block in streams(120).items():

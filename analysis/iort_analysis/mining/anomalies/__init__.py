@@ -7,6 +7,7 @@ from iort_analysis.mining.anomalies.balance import mine_balance
 from iort_analysis.mining.anomalies.discords import mine_discords
 from iort_analysis.mining.anomalies.drift import mine_drift
 from iort_analysis.mining.anomalies.dropouts import mine_dropouts
+from iort_analysis.mining.anomalies.faults import mine_faults
 from iort_analysis.mining.anomalies.frozen import mine_frozen
 from iort_analysis.mining.anomalies.gaps import mine_gaps
 from iort_analysis.mining.anomalies.readings import readings
@@ -18,7 +19,7 @@ from iort_analysis.results import Mined
 
 def mine(drive: Drive) -> Mined:
     """All anomalies of a drive."""
-    parts = [mine_frozen(drive), mine_gaps(drive)]
+    parts = [mine_faults(drive), mine_frozen(drive), mine_gaps(drive)]
     samples = readings(drive)
     if isinstance(samples, str):
         parts.append(Mined(missing={"anomalies": samples}))

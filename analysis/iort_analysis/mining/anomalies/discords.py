@@ -15,7 +15,7 @@ from iort_contract.messages.findings import Estimate
 
 KIND = "pattern_unusual"
 # Stretches of this time, in at most so many steps of at least this time.
-_LONG_S, _MOST_STEPS, _LEAST_STEP_S = 8.0, 2400, 0.25
+_LONG_S, _MOST_STEPS, _LEAST_STEP_S = 8.0, 2400, 0.5
 # The nearest neighbour is so many times as far as it usually is at worst.
 _STANDS_OUT = 1.6
 # A drive has a discord that is likelier than this every now and then.
