@@ -10,10 +10,10 @@ import json
 import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
-from typing import Any, Iterable, Mapping, NamedTuple
+from typing import Any, Iterable, Iterator, Mapping, NamedTuple
 
 from iort_contract.checks import checked, integer, text
-from iort_contract.dynamodb import Item, Keys, TopicTable, plain
+from iort_contract.dynamodb import Item, Keys, TelemetryTable, TopicTable, plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, ENVELOPE, TOPIC
 from iort_contract.topics import Topic
@@ -152,6 +152,22 @@ def hours_between(first: Hour | None, last: Hour | None) -> Keys:
     """The keys of hours between two, both inclusive; None is open."""
     low, high = ("0" if first is None else str(first)), ("9~" if last is None else str(last))
     return Keys({"S": low}, {"S": high}, low > high)
+
+
+def stored_hours(table: TelemetryTable, topic: str, until_us: int) -> Iterator[Hour]:
+    """The hours of a topic that have stored items and are over by a time; a query each."""
+    from_us = 0
+    while True:
+        keys = starting_between(from_us, until_us)
+        page = next(table.pages(topic, keys, attributes=(BATCH,), page_items=1), None)
+        if page is None or not page.items:
+            return
+        # An invalid key still begins with a time.
+        hour = hour_of(int(page.items[0][BATCH]["S"][:16]))
+        if hour.end_us > until_us:
+            return
+        yield hour
+        from_us = hour.end_us
 
 
 def item_hash(item: Item) -> str:

@@ -20,15 +20,14 @@ from iort_contract.archive import (
     SAFE_UNTIL_S,
     SWEEP,
     TASK,
-    Hour,
     Pending,
-    hour_of,
     hours_between,
+    stored_hours,
 )
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.dynamodb import Item, plain, starting_between
-from iort_contract.tables import BATCH, ROBOT, STREAMS, TOPIC
+from iort_contract.dynamodb import Item, plain
+from iort_contract.tables import ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 
 # A mark that is due for longer than this waits for something to be mended.
@@ -90,7 +89,7 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
     marked = {pending.period for pending, _ in marks if pending.topic == topic}
     found = [
         Pending(topic, str(hour))
-        for hour in hours_of(archive, topic, until_us)
+        for hour in stored_hours(archive.telemetry, topic, until_us)
         if str(hour) not in archived or str(hour) in marked
     ]
     for pending in found:
@@ -104,22 +103,6 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
 def _rows(archive: Archive, topic: str) -> Iterator[Item]:
     for page in archive.manifest.pages(topic, hours_between(None, None), attributes=(HOUR,)):
         yield from page.items
-
-
-def hours_of(archive: Archive, topic: str, until_us: int) -> Iterator[Hour]:
-    """The hours with stored items that are over by a time, a query each."""
-    from_us = 0
-    while True:
-        keys = starting_between(from_us, until_us)
-        page = next(archive.telemetry.pages(topic, keys, attributes=(BATCH,), page_items=1), None)
-        if page is None or not page.items:
-            return
-        # An invalid key still begins with a time.
-        hour = hour_of(int(page.items[0][BATCH]["S"][:16]))
-        if hour.end_us > until_us:
-            return
-        yield hour
-        from_us = hour.end_us
 
 
 def _task(kind: str, pending: Pending) -> dict[str, Any]:
