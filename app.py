@@ -15,6 +15,7 @@ except ModuleNotFoundError as missing:
     sys.exit(f"app.py: no module {missing.name} for {sys.executable}: `make layer` sets up .venv/bin/python")
 
 from stacks.account import Account
+from stacks.analysis import Analysis
 from stacks.archive import Archive
 from stacks.checks.acknowledged import Acknowledged, acknowledge
 from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
@@ -37,7 +38,8 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
     processing = Processing(app, settings, storage=storage, quarantine=quarantine, called=called)
     Ingest(app, settings, storage=storage, quarantine=quarantine, functions=processing.called)
     archive = Archive(app, settings, storage=storage, quarantine=quarantine)
-    watched = (storage, quarantine, fleet, processing, archive)
+    analysis = Analysis(app, settings, storage=storage, alarms=processing.alarms)
+    watched = (storage, quarantine, fleet, processing, archive, analysis)
     Monitoring(app, settings, stacks=watched, topic=processing.alarms)
     if settings.site:
         Site(app, settings)

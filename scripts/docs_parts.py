@@ -25,7 +25,7 @@ from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.findings import KINDS, PARAMETERS, Parameter
-from iort_contract.catalog.questions import QUESTIONS
+from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_contract.messages.ask import REASONS
@@ -39,6 +39,7 @@ from scripts.page_contract import formula, page_contract
 __all__ = [
     "agent_manual",
     "alarms",
+    "car_limits",
     "car_yaml",
     "cost",
     "decisions",
@@ -71,6 +72,7 @@ FILES = tuple(
         "docs/explanation/benchmark.md",
         "docs/explanation/findings.md",
         "docs/how-to/alarms.md",
+        "docs/how-to/ask.md",
         "docs/how-to/simulated-car.md",
         "docs/reference/car-yaml.md",
         "docs/reference/clients.md",
@@ -182,6 +184,25 @@ def questions() -> None:
     ]
     head = ("question", "answer", "a robot and hour", "s at most", "question, KiB", "answer, KiB")
     _table(head, rows, right=False)
+
+
+def car_limits() -> None:
+    """The limits of a car in the question raceline, from the catalogue."""
+    rows = [
+        (
+            f"`{one.name}`",
+            one.unit,
+            one.meaning,
+            f"{one.default:g}",
+            ", ".join(f"`{p}`" for p in one.calibrated),
+        )
+        for one in CAR_LIMITS.values()
+    ]
+    _table(("limit", "unit", "meaning", "default", "from the calibration"), rows, right=False)
+
+
+def _code(name: str) -> str:
+    return f"`{name}`"
 
 
 def _kib(size: int) -> str:

@@ -33,6 +33,7 @@ from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
+from stacks.parts.layers import arrays
 from stacks.parts.queue import queue
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
@@ -274,6 +275,7 @@ class Processing(PlatformStack):
             ),
             memory_mb=max(question.memory_mb for question in questions),
             timeout_s=max(question.timeout_s for question in questions),
+            layers=arrays(self),
         )
         # A robot that waits asks again.
         invoked_by_rule(answer, self._rejected)

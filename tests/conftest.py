@@ -177,7 +177,7 @@ def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synth
     (layer / "python").mkdir()
     (layer / "python" / "nothing.py").touch()
     app = App(outdir=str(folder))
-    settings = Settings(layer=layer, **given)
+    settings = Settings(layer=layer, analysis_layer=layer, **given)
     acknowledged = build(app, settings)
     stacks = app.synth().stacks
     prefix = f"{settings.namespace}-"

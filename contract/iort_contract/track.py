@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Iterator
+from typing import Any, Iterator, Mapping
 
 from iort_contract.checks import shown
 from iort_contract.limits import ContractError
@@ -48,6 +48,16 @@ def parse_track(text: str) -> Track:
     if not _LEAST_POINTS <= len(rows) <= MAX_POINTS:
         raise ContractError(f"a track must have {_LEAST_POINTS} to {MAX_POINTS} points, got {len(rows)}")
     return Track(*(tuple(column) for column in zip(*rows)))
+
+
+def track_of(columns: Mapping[str, Any]) -> Track:
+    """A track of four lists, by their names. Raises `ContractError`."""
+    lists = [values for values in map(columns.get, _COLUMNS) if isinstance(values, list)]
+    if set(columns) != set(_COLUMNS) or len(lists) != len(_COLUMNS):
+        raise ContractError(f"a track must be the four lists {', '.join(_COLUMNS)}, got {shown(columns)}")
+    if len(set(map(len, lists))) != 1:
+        raise ContractError(f"the lists of a track must be equally long, got {[len(one) for one in lists]}")
+    return parse_track("\n".join(", ".join(map(repr, row)) for row in zip(*lists)))
 
 
 def _rows(text: str) -> Iterator[tuple[float, ...]]:

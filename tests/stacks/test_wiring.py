@@ -38,7 +38,7 @@ from iort_contract.topics import (
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
-from tests.stacks.templates import name
+from tests.stacks.templates import layers, name
 from tests.stacks.test_dashboards import FUNCTIONS
 
 HANDLERS = (
@@ -238,7 +238,7 @@ def test_functions_log_their_own_lines_and_lambdas_errors(synthesized, functions
 
 
 def test_lambdas_own_lines_are_logged_on_request(tmp_path):
-    app = App(context={"function_logs": "all", "layer": str(tmp_path)})
+    app = App(context={"function_logs": "all", **layers(tmp_path)})
     stack = PlatformStack(app, "x", Settings.from_context(app))
     function(stack, "Echo", environments.Environment("iort"))
     (made,) = (
@@ -248,7 +248,7 @@ def test_lambdas_own_lines_are_logged_on_request(tmp_path):
     )
     assert made["LoggingConfig"].keys() == {"LogGroup"}
     with pytest.raises(SettingsError, match="function_logs must be own or all, got 'none'"):
-        Settings.from_context(App(context={"function_logs": "none", "layer": str(tmp_path)}))
+        Settings.from_context(App(context={"function_logs": "none", **layers(tmp_path)}))
 
 
 def matches(topic_filter, topic):

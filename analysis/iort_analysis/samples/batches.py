@@ -71,7 +71,7 @@ def part(
 ) -> Part:
     """The samples of a page of items, in the order of its batches."""
     block = _block(_opened(items, refused, messages=messages), refused, wanted)
-    return Part(block, start_us(items[-1]))
+    return Part(block, start_us(items[-1]) if items else 0)
 
 
 def in_order(parts: Iterable[Part]) -> Iterator[Block]:

@@ -26,12 +26,14 @@ BATTERY = (
         "V",
         "open-circuit voltage at the drive's end, as after a long rest",
         fields=_BATTERY,
+        state=True,
     ),
     Parameter(
         "battery_voltage_per_ah",
         "V/Ah",
         "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
         fields=_BATTERY,
+        state=True,
     ),
 )
 
@@ -149,6 +151,7 @@ HEAT = tuple(
             f"temperature at which the {name} settles, if the load of the drive's last minutes goes on",
             worse="up",
             fields=("current_motor", *fields),
+            state=True,
         ),
         Parameter(
             f"{name}_time_to_limit_s",
@@ -156,6 +159,10 @@ HEAT = tuple(
             f"time until the {name} reaches 85 degC, if the load of the drive's last minutes goes on",
             worse="down",
             fields=("current_motor", *fields),
+            state=True,
         ),
     )
 )
+
+# The groups in the order in which a person reads them.
+GROUPS = {"Battery": BATTERY, "Motor": MOTOR, "Forces": FORCES, "Heat": HEAT}

@@ -72,6 +72,20 @@ class InsightsAnswer(TypedDict):
     groups: dict[str, dict[str, ParameterEntry]]
 
 
+class AnalysisStarted(TypedDict):
+    """Answers ``analyse``: the run of the analysis."""
+
+    run: str
+
+
+class AnalysisAnswer(TypedDict):
+    """Answers ``analysis``: how far a run is. ``drives`` is null until they are found."""
+
+    running: bool
+    drives: int | None
+    done: int
+
+
 class Lap(Extent):
     """A lap; null for what is not known. ``complete`` is false if it does not fit the others."""
 

@@ -8,7 +8,14 @@ from __future__ import annotations
 from typing import Literal, TypedDict, Union
 
 from iort_contract.limits import Value
-from iort_contract.messages.insights import DeltaAnswer, Extent, InsightsAnswer, LapsAnswer
+from iort_contract.messages.insights import (
+    AnalysisAnswer,
+    AnalysisStarted,
+    DeltaAnswer,
+    Extent,
+    InsightsAnswer,
+    LapsAnswer,
+)
 
 
 class TrackMap(TypedDict):
@@ -285,6 +292,8 @@ class Logs(TypedDict):
 
 
 Answer = Union[
+    AnalysisAnswer,
+    AnalysisStarted,
     InsightsAnswer,
     LapsAnswer,
     DeltaAnswer,

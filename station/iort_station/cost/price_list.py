@@ -59,6 +59,8 @@ PRODUCTS = {
     "compute_arm": Product("AWSLambda", "Lambda-GB-Second-ARM"),
     "compute_x86": Product("AWSLambda", "Lambda-GB-Second"),
     "transition": Product("AmazonStates", "StateTransition"),
+    "express_request": Product("AmazonStates", "StepFunctions-Request"),
+    "express_duration": Product("AmazonStates", "StepFunctions-GB-Second"),
     "logs": Product("AmazonCloudWatch", "DataProcessing-Bytes"),
     "metric": Product("AmazonCloudWatch", "CW:MetricMonitorUsage"),
     "metric_request": Product("AmazonCloudWatch", "CW:GMD-Metrics"),

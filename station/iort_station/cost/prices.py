@@ -64,6 +64,8 @@ PRICES = {
     "compute_arm": Price(0.0000133334, 1, "GB-second, Arm", _LAMBDA, _ARTILLERY),
     "compute_x86": Price(0.0000166667, 1, "GB-second, x86", _LAMBDA, _ARTILLERY),
     "transition": Price(0.025, 1000, "state transition", _STATES, "the page's table, Europe (Ireland)"),
+    "express_request": Price(1.00, 1e6, "request of an express workflow", _STATES),
+    "express_duration": Price(0.00001667, 1, "GB-second of an express workflow", _STATES),
     "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
     "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH, "signoz.io, 2026-02-15"),
     "metric_request": Price(0.01, 1000, "metric requested by GetMetricData", _CLOUDWATCH),

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 
-from iort_analysis.samples.batches import RefusedItems, in_order
-from iort_analysis.samples.blocks import EMPTY, Block, values
+from iort_analysis.samples.batches import RefusedItems, in_order, part
+from iort_analysis.samples.blocks import EMPTY, Block, join, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -17,6 +17,7 @@ from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.tables import STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import Recorded
+from iort_station.data.reports import last_reports
 from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown
@@ -126,17 +127,17 @@ def _seen(cloud: Cloud, robot: str) -> set[str]:
 
 def _announced(cloud: Cloud, robot: str, *, newest: bool) -> set[str]:
     """The streams that the agent has named in its types and accounts, or in the newest second of each."""
-    names: set[str] = set()
-    for own in (TYPES_STREAM, ACCOUNT_STREAM):
-        start_us = None
-        if newest:
-            last = Recorded(cloud, robot, own).before(None)
-            if last is None:
-                continue
-            start_us = last.t_us
-        for block in _blocks(cloud, robot, own, start_us):
-            names |= {name for name in block.columns.get("stream", ()) if isinstance(name, str)}
-    return names
+    if newest:
+        blocks = [_newest_second(cloud, robot, own) for own in (TYPES_STREAM, ACCOUNT_STREAM)]
+    else:
+        reports = part(list(last_reports(cloud, robot)), RefusedItems()).block
+        blocks = [*_blocks(cloud, robot, TYPES_STREAM), reports]
+    return {name for block in blocks for name in block.columns.get("stream", ()) if isinstance(name, str)}
+
+
+def _newest_second(cloud: Cloud, robot: str, stream: str) -> Block:
+    last = Recorded(cloud, robot, stream).before(None)
+    return EMPTY if last is None else join(list(_blocks(cloud, robot, stream, last.t_us)))
 
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:

@@ -7,14 +7,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from iort_contract.catalog.streams import ACCOUNT_STREAM
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
+from iort_station.data.reports import last_reports
 from iort_station.operations.audit import Audit, RunAudit, Shortfall
-from iort_station.operations.delivery import items
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
@@ -36,7 +36,7 @@ class Account:
 
 def accounts(cloud: Cloud, robot: str) -> dict[str, Account]:
     """The last account of each run, by the run's name."""
-    return last_of(items(cloud, robot, ACCOUNT_STREAM))
+    return last_of(map(plain, last_reports(cloud, robot)))
 
 
 def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:

@@ -102,7 +102,7 @@ def test_an_interval_beside_the_truth_does_not_cover_it():
 
 
 def test_every_truth_is_of_a_parameter_and_in_its_unit():
-    truth = simulated(SPEC, None).truth
+    truth = {**simulated(SPEC, None).truth, "seconds": SECONDS, "motor_sensor": 1.0}
     assert TRUTHS.keys() <= PARAMETERS.keys()
     assert all(np.isfinite(of(truth)) for of in TRUTHS.values())
 
@@ -112,4 +112,4 @@ def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
     assert slow.dollars["Lambda computing"] > once.dollars["Lambda computing"]
-    assert slow.dollars["Step Functions"] == once.dollars["Step Functions"]
+    assert slow.dollars["DynamoDB, samples read"] == once.dollars["DynamoDB, samples read"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import Path
 
 import boto3
 import pytest
@@ -17,7 +18,7 @@ from functions.shared.bodies import Bodies
 from functions.shared.quota import HOUR, Quota
 from functions.shared.work import RefusedError, work_of
 from iort_contract.catalog.environments import AnswerEnvironment
-from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, Question
+from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, RACELINE, Question
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis import AnalysedDrive
@@ -45,6 +46,7 @@ from iort_contract.messages.files import File, file_key
 from iort_contract.messages.findings import DriveKey, Estimate
 from iort_contract.tables import FINDING, ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
+from iort_contract.track import parse_track
 
 NOW_S = 1_700_000_000.0
 NOW_US, NOW_MS = int(NOW_S * 1e6), int(NOW_S * 1000)
@@ -299,6 +301,51 @@ def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
     }
     assert answer.handler({**asked, "robot": "car2"}, Context)["refused"] == NO_DATA
     assert answer.handler({**asked, "question": "nobody"}, Context)["refused"] == UNKNOWN
+
+
+HALL = (Path(__file__).parents[3] / "docs/examples/hall.csv").read_text()
+
+
+def raceline(**body):
+    return answer.handler({"robot": "car", "question": RACELINE.name, "body": body}, Context)
+
+
+def test_the_raceline_uses_the_questions_limits_then_the_calibration_then_defaults(deployed):
+    parameters(deployed, 1_000_000, effective_mass_kg=4.2, battery_open_voltage_v=12.0)
+    parameters(deployed, 2_000_000, battery_resistance_ohm=0.1, friction_n=-1.0)
+    found = raceline(track=HALL, car={"grip": 0.5})["body"]
+    used = {name: (one["value"], one["from"]) for name, one in found["car"].items()}
+    assert used["grip"] == (0.5, "question")
+    assert used["mass_kg"] == (4.2, "calibration")
+    # At 80 % of 12 V, 24 A flow through 0.1 ohm.
+    assert used["power_w"] == (pytest.approx(12 * 0.8 * 24), "calibration")
+    assert used["rolling_n"] == (0, "default"), "an estimate below 0 is no force"
+    assert used["speed_mps"] == (10, "default")
+    assert 0 < found["lap_s"] < found["centre_line_lap_s"]
+    lengths = {name: len(values) for name, values in found["line"].items()}
+    assert set(lengths) == {"s_m", "x_m", "y_m", "offset_m", "curvature_1pm", "speed_mps", "time_s"}
+    assert len(set(lengths.values())) == 1
+    assert len(json.dumps(found)) < MAX_INLINE_BYTES
+    columns = vars(parse_track(HALL))
+    as_lists = {name: list(values) for name, values in columns.items()}
+    assert raceline(track=as_lists, car={"grip": 0.5})["body"] == found
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ({}, "track must be a CSV text or an object of columns, got None"),
+        ({"track": "1,2,3"}, "line 1 must be the four numbers"),
+        ({"track": {"x_m": [1]}}, "a track must be the four lists"),
+        ({"track": HALL, "car": {"wings": 2}}, "car must be an object of width_m"),
+        ({"track": HALL, "car": {"grip": "wet"}}, "grip must be 0.05 to 5 1, got 'wet'"),
+        ({"track": HALL, "car": {"width_m": 3}}, "the track must be wider than the car (3 m)"),
+    ],
+)
+def test_what_is_no_track_or_car_is_refused_with_the_reason(deployed, body, told):
+    refused = raceline(**body)
+    assert refused["refused"] == INVALID
+    assert told in refused["text"]
 
 
 def test_the_handler_answers_a_robot(deployed):

@@ -374,6 +374,18 @@ export interface InsightsAnswer {
   readonly groups: Readonly<Record<string, Readonly<Record<string, ParameterEntry>>>>;
 }
 
+/** Answers ``analyse``: the run of the analysis. */
+export interface AnalysisStarted {
+  readonly run: string;
+}
+
+/** Answers ``analysis``: how far a run is. ``drives`` is null until they are found. */
+export interface AnalysisAnswer {
+  readonly running: boolean;
+  readonly drives: number | null;
+  readonly done: number;
+}
+
 /** A lap; null for what is not known. ``complete`` is false if it does not fit the others. */
 export interface Lap {
   readonly from_us: number;

@@ -5,14 +5,14 @@ import { el } from "../base/dom";
 import { number } from "../base/format";
 
 /** How the page writes a unit of the catalogue. */
-const UNITS: Readonly<Record<string, string>> = { "1": "%", ohm: "Ω", degC: "°C", "m/s^2": "m/s²" };
+const UNITS: Readonly<Record<string, string>> = { "1": "%", ohm: "Ω", degC: "°C" };
 const SMALL = new Set(["ohm", "Wb", "H"]);
 // The room on either side of what is drawn, as a share of it.
 const MARGIN = 0.08;
 
 /** The factor and the unit in which values of about this size are written. */
 export function scale(unit: string, size: number): readonly [factor: number, unit: string] {
-  const name = UNITS[unit] ?? unit;
+  const name = UNITS[unit] ?? unit.replace(/2/g, "²");
   if (unit === "1") return [100, name];
   if (!SMALL.has(unit) || size === 0 || Math.abs(size) >= 0.1) return [1, name];
   return Math.abs(size) < 1e-4 ? [1e6, `µ${name}`] : [1e3, `m${name}`];

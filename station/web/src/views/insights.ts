@@ -1,10 +1,11 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import type { Config, InsightsAnswer, RunsAnswer } from "../base/contract";
+import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { dayTime, zone } from "../base/format";
 import { readTime, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
+import { Analyse } from "../insights/analyse";
 import { drivesTable } from "../insights/drives_table";
 import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
@@ -24,6 +25,7 @@ export class InsightsView {
   private readonly driven = el("div", { class: "insights-part" });
   private readonly parameters = new Parameters();
   private readonly laps = new LapsPanel((laps) => this.write(laps));
+  private readonly analyse = new Analyse((text) => this.note.set(text), (drives) => void this.analysed(drives));
   private loading: AbortController | undefined;
   private robot: string | undefined;
   private answer: InsightsAnswer | undefined;
@@ -31,7 +33,8 @@ export class InsightsView {
 
   constructor(private readonly config: Config) {
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
-    const served = [this.note.node, this.found, this.laps.node, this.parameters.node, this.driven];
+    const status = el("div", { class: "history-status" }, this.note.node, ...(config.actions.includes("analyse") ? [this.analyse.node] : []));
+    const served = [status, this.found, this.laps.node, this.parameters.node, this.driven];
     this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
   }
 
@@ -40,12 +43,14 @@ export class InsightsView {
     this.title.set(robot ?? "Fleet");
     this.tools.replaceChildren(...(robot === undefined ? [] : [el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"), el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"), el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet")]));
     if (!this.config.answers) return;
+    this.analyse.of(robot);
     if (robot === this.robot && this.answer) void this.present(query);
     else void this.load(robot, query);
   }
 
   leave(): void {
     this.loading?.abort();
+    this.analyse.stop();
     this.answer = undefined;
     this.laps.clear();
     this.parameters.clear();
@@ -65,12 +70,21 @@ export class InsightsView {
       this.answer = await ask<InsightsAnswer>("insights", robot === undefined ? {} : { robot }, loading.signal);
       if (!loading.signal.aborted) await this.present(query);
     } catch (error) {
-      if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (loading.signal.aborted) return;
+      this.note.set(error instanceof AnswerError ? error.message : String(error));
+      // Laps need no findings.
+      if (robot !== undefined && !this.answer) await this.showLaps(robot, undefined, query).catch(() => undefined);
     }
   }
 
+  /** Show the new findings; without drives, say why there are none. */
+  private async analysed(drives: number): Promise<void> {
+    await this.load(this.robot, {});
+    if (drives === 0) this.note.set("No drive of that time is over yet: a drive ends when the car has stood, or sent nothing, for a minute.");
+  }
+
   private async present(query: Query<"insights">): Promise<void> {
-    const { robot, loading } = this;
+    const { robot } = this;
     const answer = this.answer!;
     const { findings, drives, groups } = answer;
     const newest = drives[0];
@@ -89,15 +103,18 @@ export class InsightsView {
     const bars = styles(drives, groups[STYLE_GROUP] ?? {});
     this.driven.replaceChildren(...(bars ? [bars] : []), ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
     this.parameters.show(answer, [STYLE_GROUP]);
-    this.drive = chosen ? [chosen.from_us / 1e6, chosen.to_us / 1e6] : await this.newestRun(robot, loading!.signal);
-    this.laps.node.hidden = this.drive === undefined;
-    if (this.drive && !loading!.signal.aborted) await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
+    await this.showLaps(robot, chosen, query);
   }
 
-  /** Before anything is analysed, laps are those of the newest run. */
-  private async newestRun(robot: string, signal: AbortSignal): Promise<Range | undefined> {
-    const { runs } = await ask<RunsAnswer>("runs", { robot, count: "1" }, signal);
-    return runs[0] && [runs[0].from_us / 1e6, runs[0].to_us / 1e6];
+  /** Show the laps of a drive; before anything is analysed, those of the newest run. */
+  private async showLaps(robot: string, of: Extent | undefined, query: Query<"insights">): Promise<void> {
+    const { signal } = this.loading!;
+    const extent = of ?? (await ask<RunsAnswer>("runs", { robot, count: "1" }, signal)).runs[0];
+    if (signal.aborted) return;
+    this.laps.node.hidden = extent === undefined;
+    if (!extent) return;
+    this.drive = [extent.from_us / 1e6, extent.to_us / 1e6];
+    await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
   }
 
   private write(laps: readonly number[]): void {

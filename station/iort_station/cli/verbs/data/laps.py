@@ -17,7 +17,7 @@ from iort_station.cli.progress import reading
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
-from iort_station.times import iso
+from iort_station.times import iso, iso_s
 
 if TYPE_CHECKING:
     from iort_analysis.results import Table as Columns
@@ -32,10 +32,10 @@ _METHODS = {
 }
 _COLUMNS = (
     ("time_s", "time s", 3),
-    ("distance_m", "distance m", 1),
-    ("energy_wh", "energy Wh", 3),
+    ("distance_m", "m", 1),
+    ("energy_wh", "Wh", 3),
     ("energy_wh_per_km", "Wh/km", 2),
-    ("mean_speed_mps", "mean m/s", 2),
+    ("mean_speed_mps", "m/s", 2),
     ("top_speed_mps", "top m/s", 2),
 )
 
@@ -96,7 +96,7 @@ def laps(
 
 
 def _print(run: RunLaps) -> None:
-    out.print(f"run {run.run}, from {iso(run.start_us)} to {iso(run.end_us)}")
+    out.print(f"run {run.run[:8]}, {iso_s(run.start_us)} to {iso_s(run.end_us)}")
     table = run.mined.tables.get(LAPS_TABLE)
     if table is None:
         out.print(next(iter(run.mined.missing.values())))
@@ -107,7 +107,8 @@ def _print(run: RunLaps) -> None:
     for i, lap in enumerate(table["lap"].tolist()):
         mark = "best" if table["best"][i] else "" if table["complete"][i] else "not complete"
         figures = [_figure(float(table[name][i]), digits) for name, _, digits in _COLUMNS]
-        start = iso(int(table["start_us"][i])).replace("T", " ")[:-4]
+        # The line above has the day.
+        start = iso(int(table["start_us"][i])).partition("T")[2][:-4]
         shown.add_row(str(lap), start, *figures, mark, style="bold" if mark == "best" else "")
     out.print(shown)
     for name, estimate in run.mined.estimates.items():
