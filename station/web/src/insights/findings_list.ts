@@ -21,7 +21,7 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
   const { robot, kind, severity, meaning, action, text, stream, fields, q, effect, from_us, to_us } = finding;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
   const query = { ...(stream ? { stream } : {}), from: writeTime(from), to: writeTime(Math.max(to, from + 1)), ...(fields.length > 0 ? { fields: fields.join(",") } : {}) };
-  const chance = q === null ? [] : [el("span", { class: "note", title: "The share of false findings among those that count as sure as this one" }, `false alarms: ${number(q * 100, q < 0.001 ? 3 : 1)} % at most`)];
+  const chance = q === null ? [] : [el("span", { class: "note", title: "The share of false findings among those that count as sure as this one" }, `false alarms: ${q < 1e-5 ? "less than 0.001" : `${number(q * 100, q < 0.001 ? 3 : 1)}`} % of such findings`)];
   return el(
     "li",
     { class: "panel finding", "data-severity": severity, "data-kind": kind },
