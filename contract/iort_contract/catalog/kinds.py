@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+# The severity that a person gets a mail for, and the kind of a drive that has no result.
+SERIOUS, ANALYSIS_FAILED = "serious", "analysis_failed"
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -126,7 +129,7 @@ KINDS = {
             severity="info",
         ),
         Kind(
-            "analysis_failed",
+            ANALYSIS_FAILED,
             "a drive could not be analysed",
             "the text has the reason; the samples are kept, so analyse it again",
         ),

@@ -18,6 +18,8 @@ VERBS = {
     "data.export": "Write a recording: MCAP or a ROS 1 bag.",
     "data.plot": "Draw recorded samples.",
     "data.laps": "List laps: time, distance, energy, and compare two.",
+    "operations.analyse": "Analyse robots' drives in the cloud, now.",
+    "data.findings": "List what the analysis found about drives.",
     "data.calibrate": "Print a car's parameters, for vesc.yaml too.",
     "operations.trace": "Measure the delay of live updates, hop by hop.",
     "page.watch": "Show every car in the terminal, live, until Ctrl-C.",
