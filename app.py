@@ -15,6 +15,7 @@ except ModuleNotFoundError as missing:
     sys.exit(f"app.py: no module {missing.name} for {sys.executable}: `make layer` sets up .venv/bin/python")
 
 from stacks.account import Account
+from stacks.analysis import Analysis
 from stacks.checks.acknowledged import Acknowledged, acknowledge
 from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.fleet import Fleet
@@ -35,7 +36,8 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
     called = {"presence": fleet.presence}
     processing = Processing(app, settings, storage=storage, quarantine=quarantine, called=called)
     Ingest(app, settings, storage=storage, quarantine=quarantine, functions=processing.called)
-    watched = (storage, quarantine, fleet, processing)
+    analysis = Analysis(app, settings, storage=storage, alarms=processing.alarms)
+    watched = (storage, quarantine, fleet, processing, analysis)
     Monitoring(app, settings, stacks=watched, topic=processing.alarms)
     if settings.site:
         Site(app, settings)

@@ -19,7 +19,7 @@ _ACCOUNT = "000000000000"
 _STEP_S = 180.0
 # The sources of a synthesized assembly. If they have not changed, the kept assembly is deployed.
 _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
-_MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract")
+_MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract", "analysis/iort_analysis")
 
 
 def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:

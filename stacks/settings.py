@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.page import PAGE_URL
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_contract.topics import check_namespace
 
@@ -73,6 +74,12 @@ def _email(value: Any) -> str | None:
         return None
     if not _EMAIL.fullmatch(str(value)):
         raise ValueError("must be one e-mail address")
+    return str(value)
+
+
+def _address(value: Any) -> str:
+    if not re.fullmatch(r"https?://[^\s#?]+/", str(value)):
+        raise ValueError("must be a page's address, such as https://page.example.org/")
     return str(value)
 
 
@@ -180,6 +187,14 @@ class Settings(BaseModel):
         default="",
         description="AWS IoT's own log: `error`, `warn`, `info` or `debug` "
         "([how](../how-to/alarms.md#aws-iots-own-log))",
+    )
+    nightly_analysis: Flag = Field(
+        default=True,
+        description="analyses the last two days' drives every night at 03:00 UTC; `false` leaves it to "
+        "[`iort analyse`](../explanation/analysis.md)",
+    )
+    page_url: Annotated[str, BeforeValidator(_address)] = Field(
+        default=PAGE_URL, description="where the page is, for the links in mails about findings"
     )
     site: Flag = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
     embedded: Flag = Field(

@@ -7,7 +7,7 @@ from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 
-from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, T_US, TOPIC
 from stacks.parts.base import PlatformStack
@@ -24,7 +24,7 @@ _TEXT = dynamodb.AttributeType.STRING
 
 class Storage(PlatformStack):
     """Five tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
-    time. The quarantine has one item per message, by robot.
+    time. The quarantine has one item per message, by robot, and the findings one per finding and drive.
 
     All other stacks use ``encryption`` for their resources.
     """
@@ -123,6 +123,7 @@ class Storage(PlatformStack):
         rules = [
             s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
             s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
+            s3.LifecycleRule(id="plans", prefix=PLANS_PREFIX, expiration=Duration.days(7)),
         ]
         days = self.settings.files_days
         if not 0 < days <= _RARE_AFTER_DAYS:

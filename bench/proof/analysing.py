@@ -19,6 +19,7 @@ import iort_contract
 from bench import ROOT
 from bench.proof.cars import DriveSpec
 from bench.proof.drives import digest, simulated
+from iort_agent.sources.sim.sensors import ALL
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, Measured
 from iort_contract.catalog.derived import F1TENTH
@@ -55,9 +56,9 @@ def analysed(spec: DriveSpec) -> Analysed:
     car = spec.vehicle
     known = {"mass_kg": car.mass_kg, "cells": float(car.cells), "pole_pairs": float(car.pole_pairs)}
     result = analyse(spec.key, streams, F1TENTH, known)
-    made = Analysed(
-        replace(result, mined=replace(result.mined, tables={})), truth, time.process_time() - began
-    )
+    cpu_s = time.process_time() - began
+    truth = {**truth, "seconds": spec.seconds, "motor_sensor": float(spec.fields == ALL)}
+    made = Analysed(replace(result, mined=replace(result.mined, tables={})), truth, cpu_s)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{random.getrandbits(64):x}")
     partial.write_bytes(pickle.dumps(made))
@@ -81,7 +82,7 @@ def on_all_cores(work: Callable[[A], B], items: Iterable[A], done: Done) -> list
 
 @cache
 def _version() -> str:
-    """The version of the analysis: its code and the contract's."""
+    """The version of the analysis: its code, the contract's, and this module's."""
     folders: Sequence[str] = [*iort_analysis.__path__, *iort_contract.__path__]
-    code = sorted(path for folder in folders for path in Path(folder).rglob("*.py"))
+    code = [*sorted(path for folder in folders for path in Path(folder).rglob("*.py")), Path(__file__)]
     return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()[:16]

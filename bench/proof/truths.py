@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from iort_agent.sources.sim.heat import WIND_MPS
 from iort_agent.sources.sim.parameters import AIR_KG_PER_M3, G_MPS2
 
 Truth = Callable[[Mapping[str, float]], float]
@@ -25,13 +26,43 @@ def _friction_n(truth: Mapping[str, float]) -> float:
     return truth["drivetrain_friction_n"] + truth["rolling_resistance"] * truth["mass_kg"] * G_MPS2
 
 
+def _motor_w_per_k(truth: Mapping[str, float]) -> float:
+    return truth["motor_cooling_w_per_k"] * _wind(truth) + truth["motor_to_board_w_per_k"]
+
+
+def _wind(truth: Mapping[str, float]) -> float:
+    return 1 + truth["distance_m"] / truth["seconds"] / WIND_MPS
+
+
+def _motor_rise(truth: Mapping[str, float]) -> float:
+    return 1.5 * truth["motor_resistance_ohm"] / _motor_w_per_k(truth)
+
+
+def _controller_rise(truth: Mapping[str, float]) -> float:
+    """Beside a motor of known temperature; else with what comes from the motor."""
+    across = truth["motor_to_board_w_per_k"]
+    watts_per_k = truth["board_cooling_w_per_k"] * _wind(truth) + across
+    own = 1.5 * truth["fet_resistance_ohm"]
+    if truth["motor_sensor"]:
+        return own / watts_per_k
+    warm = 1.5 * (truth["motor_resistance_now_ohm"] - truth["fet_resistance_ohm"]) / _motor_w_per_k(truth)
+    return (own + across * warm) / (watts_per_k - across**2 / _motor_w_per_k(truth))
+
+
+def _phase_ohm(truth: Mapping[str, float]) -> float:
+    """A phase's resistance as a drive's fields give it: at 25 degC with the motor's temperature, else now."""
+    if truth["motor_sensor"]:
+        return truth["motor_resistance_ohm"] + truth["fet_resistance_ohm"]
+    return truth["motor_resistance_now_ohm"]
+
+
 # By the names of `iort_contract.catalog.findings.PARAMETERS`; of a healthy car.
 TRUTHS: dict[str, Truth] = {
     "battery_resistance_ohm": _same("battery_resistance_ohm"),
     "battery_slow_resistance_ohm": _same("battery_slow_resistance_ohm"),
     "battery_open_voltage_v": _same("open_voltage_v"),
     "battery_voltage_per_ah": _same("voltage_per_ah"),
-    "motor_resistance_25_ohm": lambda truth: truth["motor_resistance_ohm"] + truth["fet_resistance_ohm"],
+    "motor_resistance_25_ohm": _phase_ohm,
     "motor_resistance_ohm": _same("motor_resistance_now_ohm"),
     "motor_flux_linkage_wb": _same("flux_linkage_wb"),
     "motor_inductance_h": _same("motor_inductance_h"),
@@ -60,6 +91,10 @@ TRUTHS: dict[str, Truth] = {
         _friction_n(truth) / truth["newtons_per_amp"] / truth["drivetrain_efficiency"]
     ),
     "brake_drag_a": _nothing,
+    "motor_rise_k_per_a2": _motor_rise,
+    "motor_thermal_resistance_k_per_w": lambda truth: _motor_rise(truth) / 1.5 / _phase_ohm(truth),
+    "controller_rise_k_per_a2": _controller_rise,
+    "controller_thermal_resistance_k_per_w": lambda truth: _controller_rise(truth) / 1.5 / _phase_ohm(truth),
     "voltage_drift_v": _nothing,
     "motor_current_drift_a": _nothing,
     "temperature_drift_k": _nothing,

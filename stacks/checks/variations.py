@@ -18,6 +18,7 @@ FLIPS: dict[str, dict[str, Any]] = {
     "kept key": {"keep_customer_key": True},
     "account": {"device_defender": True, "iot_log_level": "error"},
     "site": {"site": True},
+    "no nightly analysis": {"nightly_analysis": False},
     "old table": {"old_telemetry": True},
     "properties": {
         "retention_days": 7,
@@ -31,6 +32,7 @@ FLIPS: dict[str, dict[str, Any]] = {
         "high_temperature_degc": 70.0,
         "stream_behind_s": 30.0,
         "car_to_lambda_ms": 1_000.0,
+        "page_url": "https://page.example.org/",
     },
 }
 KEY: dict[str, Any] = {"customer_key": True}

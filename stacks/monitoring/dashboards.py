@@ -27,6 +27,8 @@ from stacks.settings import Settings
 
 # The functions and tables that every sample passes.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
+# Nobody waits for these, and fifty metrics are free.
+_IN_THE_BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present"}
 
 
 class Dashboards(Construct):
@@ -133,7 +135,11 @@ def _tables(watched: Watched) -> cloudwatch.GraphWidget:
 
 def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
     running = "ConcurrentExecutions"
-    durations = [metrics.function("Duration", of, label=label) for label, of in watched.functions.items()]
+    durations = [
+        metrics.function("Duration", of, label=label)
+        for label, of in watched.functions.items()
+        if label not in _IN_THE_BACKGROUND
+    ]
     concurrency = [
         metrics.function(running, watched.functions[name], label=name) for name in _FUNCTIONS_OF_SAMPLES
     ]

@@ -23,6 +23,7 @@ UNKNOWN = {
     "AWS::IoT::TopicRule": "moto knows it by IoT's API alone: test_moto.py hands it every rule",
     "AWS::Lambda::EventInvokeConfig": "moto knows it by Lambda's API alone",
     "AWS::S3::BucketPolicy": "moto knows it by S3's API alone",
+    "AWS::Scheduler::Schedule": "moto knows it by the Scheduler's API alone",
     "AWS::SNS::Subscription": "moto knows it by SNS' API alone",
     "AWS::SNS::TopicPolicy": "moto knows it by SNS' API alone",
     "AWS::SQS::QueuePolicy": "moto knows it by SQS' API alone",

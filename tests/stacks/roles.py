@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import PRESENCE, STREAMS
@@ -78,6 +78,8 @@ SUMMARIZES = {
     ("dynamodb:GetItem", "Robots.Arn"),
     ("dynamodb:UpdateItem", "Robots.Arn"),
 }
+# Permissions of the functions that find and analyse drives.
+READS_DRIVES = {("dynamodb:Query", "Batches.Arn"), ("dynamodb:GetItem", "Robots.Arn")}
 # For every role: each action on each resource, and who may assume it.
 ROLES = {
     "LiveRole": (
@@ -186,6 +188,51 @@ ROLES = {
         | DESTINATION
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
     ),
+    "PlanRole": (
+        "lambda.amazonaws.com",
+        {(action, "PlanLog.Arn") for action in LOG}
+        | READS_DRIVES
+        | {
+            ("dynamodb:Scan", "Robots.Arn"),
+            ("dynamodb:Query", "Findings.Arn"),
+            ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
+        },
+    ),
+    "AnalyseRole": (
+        "lambda.amazonaws.com",
+        {(action, "AnalyseLog.Arn") for action in LOG}
+        | READS_DRIVES
+        | {
+            ("dynamodb:PutItem", "Findings.Arn"),
+            ("s3:PutObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*"),
+        },
+    ),
+    "EvaluateRole": (
+        "lambda.amazonaws.com",
+        {(action, "EvaluateLog.Arn") for action in LOG}
+        | {
+            ("dynamodb:Scan", "Robots.Arn"),
+            ("dynamodb:Query", "Findings.Arn"),
+            ("s3:GetObject", f"Files.Arn/{ANALYSIS_PREFIX}*"),
+            ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
+        },
+    ),
+    "PresentRole": (
+        "lambda.amazonaws.com",
+        {(action, "PresentLog.Arn") for action in LOG}
+        | {(f"dynamodb:{action}", "Findings.Arn") for action in ("Query", "PutItem", "DeleteItem")}
+        | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")},
+    ),
+    "MachineRole": (
+        "states.amazonaws.com",
+        {("lambda:InvokeFunction", f"{name}.Arn") for name in ("Plan", "Analyse", "Evaluate", "Present")}
+        | {
+            ("s3:ListBucket", "Files.Arn"),
+            ("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"),
+            ("states:StartExecution", "Machine"),
+        },
+    ),
+    "NightlyRole": ("scheduler.amazonaws.com", {("states:StartExecution", "Machine")}),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
     "AuditRole": ("iot.amazonaws.com", {(action, "*") for action in AUDIT_READS}),
     "LogRole": (

@@ -105,7 +105,7 @@ def test_every_role_can_be_assumed_by_one_service_of_this_account(synthesized, r
         service, _ = ROLES[role]
         assert (statement["Effect"], statement["Action"]) == ("Allow", "sts:AssumeRole")
         assert statement["Principal"] == {"Service": service}
-        if service == "iot.amazonaws.com":
+        if service != "lambda.amazonaws.com":
             # The service acts for every account; only for ours may it take our role.
             condition = statement["Condition"]
             assert condition == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
@@ -126,7 +126,7 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 # whether a certificate was registered.
                 known = (
                     r":topic/(pong|answer)/iort/\*/\*?|:thing/\*/agent$"
-                    r"|/(robots|results|ask)/\*$|:AWSIotLogsV2:\*$"
+                    r"|/(robots|results|ask|plans|analysis)/\*$|/analysis/robot=\*$|:AWSIotLogsV2:\*$"
                 )
                 named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from iort_contract.catalog.rules import RULES
-from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
@@ -129,6 +129,9 @@ def test_lambda_1_has_reserved_concurrency_only_in_prod(synthesized, production)
     assert reserved(production) == {"functions.live.handler": 5}
 
 
+BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present"}
+
+
 def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized, functions, reader):
     logs = {name(k): v for k, v in synthesized.resources("AWS::Logs::LogGroup").items()}
     assert logs.keys() == {f"{noun}Log" for noun in functions}
@@ -137,7 +140,8 @@ def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized,
         assert reader.text(function["LoggingConfig"]["LogGroup"]) == f"{noun}Log"
         assert reader.text(function["Role"]) == f"{noun}Role.Arn"
         assert (function["Runtime"], function["Architectures"]) == ("python3.13", ["arm64"])
-        assert function["Timeout"] <= 60
+        # The analysis waits for nobody's answer.
+        assert function["Timeout"] <= {"Analyse": 90}.get(noun, 900 if noun in BACKGROUND else 60)
 
 
 def test_live_messages_and_pings_are_not_retried(synthesized, reader):
@@ -246,7 +250,8 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
     (ownership,) = bucket["OwnershipControls"]["Rules"]
     assert ownership["ObjectOwnership"] == "BucketOwnerEnforced"
     rules = {rule["Id"]: rule for rule in bucket["LifecycleConfiguration"]["Rules"]}
-    assert rules.keys() == {"abandoned", "results", "rare"}
+    assert rules.keys() == {"abandoned", "results", "plans", "rare"}
+    assert (rules["plans"]["Prefix"], rules["plans"]["ExpirationInDays"]) == (PLANS_PREFIX, 7)
     assert rules["abandoned"]["AbortIncompleteMultipartUpload"] == {"DaysAfterInitiation": 7}
     assert "Prefix" not in rules["abandoned"]
     assert (rules["results"]["Prefix"], rules["results"]["ExpirationInDays"]) == (

@@ -16,7 +16,10 @@ from stacks.storage import OLD_TELEMETRY
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
-STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")
+STACKS = (
+    *("storage", "quarantine", "fleet", "processing", "ingest", "analysis", "monitoring", "site"),
+    "account",
+)
 # In these states neither CloudFormation nor the CDK can continue.
 _STUCK = {
     "ROLLBACK_COMPLETE": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",

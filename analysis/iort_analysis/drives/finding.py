@@ -33,12 +33,18 @@ class Found(NamedTuple):
     run: str
 
 
-def find(batches: Iterable[Heard]) -> Iterator[Found]:
-    """The drives in batches in order of time.
+def find(batches: Iterable[Heard], until_us: int | None = None) -> Iterator[Found]:
+    """The drives in batches in order of time, that begin before ``until_us``.
 
     A drive begins with the run or some seconds before the car moves, and ends alike. Runs that recorded at
-    the same time are apart.
+    the same time are apart. No more batches are read than the last drive needs.
     """
+    for found in _find(batches, until_us):
+        if until_us is None or found.start_us < until_us:
+            yield found
+
+
+def _find(batches: Iterable[Heard], until_us: int | None) -> Iterator[Found]:
     runs: dict[str, _Run] = {}
     for batch in batches:
         for boot, run in list(runs.items()):
@@ -47,6 +53,10 @@ def find(batches: Iterable[Heard]) -> Iterator[Found]:
                 del runs[boot]
         run = runs.setdefault(batch.id.boot, _Run(batch.id))
         yield from run.hear(batch)
+        if until_us is None or batch.id.t_us < until_us + STAND_US:
+            continue
+        if not any(run.is_in_drive_before(until_us) for run in runs.values()):
+            return
     for run in runs.values():
         yield from run.ended()
 
@@ -63,6 +73,10 @@ class _Run:
         self._moved_us = first.t_us
         # Since the last look.
         self._unseen: list[Heard] = []
+
+    def is_in_drive_before(self, t_us: int) -> bool:
+        """Whether a drive goes on that began before a time."""
+        return self._start_us is not None and self._start_us < t_us
 
     def hear(self, batch: Heard) -> Iterator[Found]:
         """Take the next batch; yields the drive that a stand has just ended."""

@@ -108,6 +108,35 @@ class QuarantineEnvironment(Environment):
     retention_s: int
 
 
+@dataclass(frozen=True)
+class PlanEnvironment(Environment):
+    """The functions that find drives and analyse them."""
+
+    telemetry_table: str
+    robots_table: str
+    findings_table: str
+    files_bucket: str
+
+
+@dataclass(frozen=True)
+class EvaluateEnvironment(Environment):
+    """The function that compares drives with earlier ones, and with the fleet's."""
+
+    robots_table: str
+    findings_table: str
+    files_bucket: str
+
+
+@dataclass(frozen=True)
+class PresentEnvironment(Environment):
+    """The function that keeps findings and mails the serious ones, with links into the page."""
+
+    findings_table: str
+    files_bucket: str
+    alarm_topic: str
+    page_url: str
+
+
 def _text(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+# The severity that a person gets a mail for, and the kind of a drive that has no result.
+SERIOUS, ANALYSIS_FAILED = "serious", "analysis_failed"
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -81,6 +84,8 @@ KINDS = {
             "motor_resistance_grown",
             "the motor's phases have more resistance",
             "check the three phase wires and their plugs for a bad joint; compare again with a cold motor",
+            # More resistance is more heat.
+            explains=("cooling_lost",),
             alternatives=("a hotter motor than usual",),
         ),
         Kind(
@@ -104,6 +109,7 @@ KINDS = {
                 "brake_dragging",
                 "motor_resistance_grown",
                 "battery_worn",
+                "cooling_lost",
                 "pattern_unusual",
             ),
         ),
@@ -126,7 +132,7 @@ KINDS = {
             severity="info",
         ),
         Kind(
-            "analysis_failed",
+            ANALYSIS_FAILED,
             "a drive could not be analysed",
             "the text has the reason; the samples are kept, so analyse it again",
         ),

@@ -115,9 +115,10 @@ def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
 
 def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
     """The row's content as an object for JSON."""
+    content = {name: value for name, value in vars(analysed).items() if name != "drive"}
     return {
-        **vars(analysed),
-        "drive": vars(analysed.drive),
+        **vars(analysed.drive),
+        **content,
         "estimates": {name: encode_estimate(one) for name, one in analysed.estimates.items()},
     }
 
@@ -125,7 +126,7 @@ def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
 def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
     """Decode a row's content; raises `ContractError`."""
     return AnalysedDrive(
-        drive=_drive(_object(content, "drive")),
+        drive=_drive(content),
         end_us=integer(content, "end_us"),
         job=text(content, "job"),
         samples=integer(content, "samples"),

@@ -47,6 +47,16 @@ def test_runs_and_pauses_cut() -> None:
     assert in_seconds(list(find([*first, *pause, *again]))) == [(0, 99, A), (200, 249, A), (260, 359, B)]
 
 
+def test_a_drive_that_begins_in_a_range_is_read_to_its_end() -> None:
+    heard = batches(parts(0, 100, 100, 200, 100, 300, 100, 300))
+    left = iter(heard)
+    found = find(left, until_us=START_US + 250 * S)
+
+    assert in_seconds(list(found)) == [(0, 109, A), (190, 409, A)]
+    # The rest is not read.
+    assert len(list(left)) > 600
+
+
 def test_two_runs_at_the_same_time_are_apart() -> None:
     both = sorted([*batches(parts(0, 100)), *batches(parts(0, 100), B, from_s=50)], key=lambda one: one.id)
 

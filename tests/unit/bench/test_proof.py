@@ -102,7 +102,7 @@ def test_an_interval_beside_the_truth_does_not_cover_it():
 
 
 def test_every_truth_is_of_a_parameter_and_in_its_unit():
-    truth = simulated(SPEC, None).truth
+    truth = {**simulated(SPEC, None).truth, "seconds": SECONDS, "motor_sensor": 1.0}
     assert TRUTHS.keys() <= PARAMETERS.keys()
     assert all(np.isfinite(of(truth)) for of in TRUTHS.values())
 

@@ -7,7 +7,7 @@ from iort_agent.sources.sim.parameters import VehicleConfig
 # Copper's resistance grows by this share a kelvin; the settings are at this temperature.
 _COPPER_PER_K, REFERENCE_DEGC = 0.0039, 25.0
 # The car's own wind doubles the cooling at this speed.
-_WIND_MPS = 5.0
+WIND_MPS = 5.0
 # The logic warms the board before the drive begins.
 _WARM_K = 3.0
 
@@ -27,7 +27,7 @@ class Heat:
     def step(self, motor_w: float, board_w: float, speed_mps: float, cooling: float, dt: float) -> None:
         """Heat both for ``dt`` seconds; ``cooling`` is the share of their cooling that is left."""
         c = self._config
-        wind = cooling * (1 + abs(speed_mps) / _WIND_MPS)
+        wind = cooling * (1 + abs(speed_mps) / WIND_MPS)
         across_w = (self.motor_degc - self.board_degc) * c.motor_to_board_w_per_k
         motor_out_w = (self.motor_degc - c.ambient_degc) * c.motor_cooling_w_per_k * wind + across_w
         board_out_w = (self.board_degc - c.ambient_degc) * c.board_cooling_w_per_k * wind - across_w

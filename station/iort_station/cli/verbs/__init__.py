@@ -18,6 +18,8 @@ VERBS = {
     "data.export": "Write a recording: MCAP or a ROS 1 bag.",
     "data.plot": "Draw recorded samples.",
     "data.laps": "List laps: time, distance, energy, and compare two.",
+    "operations.analyse": "Analyse robots' drives in the cloud, now.",
+    "data.findings": "List what the analysis found about drives.",
     "data.calibrate": "Print a car's parameters, for vesc.yaml too.",
     "operations.trace": "Measure the delay of live updates, hop by hop.",
     "page.watch": "Show every car in the terminal, live, until Ctrl-C.",
@@ -27,5 +29,6 @@ VERBS = {
     "operations.replay_errors": "Process rejected recordings again.",
     "operations.adopt": "Copy batches of an old telemetry table.",
     "fleet.send": "Send a command and print the robot's answer.",
+    "fleet.ask": "Ask the cloud what a robot may ask.",
     "fleet.config": "Show or change a robot's settings.",
 }

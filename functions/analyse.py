@@ -1,0 +1,75 @@
+"""Analyse: one drive, as an item of the state machine's map.
+
+Its result goes to the bucket, and a row with its estimates to the table of findings, for later drives. Run
+again it writes the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+from functions.shared import clients
+from functions.shared.environment import variables
+from functions.shared.kept import Kept
+from functions.shared.recordings import Recordings
+from iort_analysis.drives.recorded import recorded
+from iort_analysis.process import analyse
+from iort_analysis.results import DriveResult, encode_result
+from iort_analysis.samples.blocks import Block
+from iort_contract.catalog.environments import PlanEnvironment
+from iort_contract.cloud import drive_prefix
+from iort_contract.findings_table import FindingsTable
+from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, decode_planned
+
+
+def analysed(planned: PlannedDrive, recordings: Recordings) -> DriveResult:
+    """The result of a drive, from its samples as they are stored."""
+    drive, registered = planned.drive, recordings.registered(planned.drive.robot)
+    streams: dict[str, Block] = {}
+    notes: dict[str, str] = {}
+    for stream in planned.streams:
+        items = recordings.items(drive.robot, stream, drive.start_us, planned.end_us + 1)
+        found = recorded(drive, planned.end_us, stream, items)
+        streams[stream] = found.block
+        notes.update(found.notes)
+    result = analyse(drive, streams, registered.vehicle, registered.known)
+    mined = replace(result.mined, missing={**notes, **result.mined.missing})
+    return replace(result, end_us=planned.end_us, mined=mined)
+
+
+def row(result: DriveResult, job: str) -> AnalysedDrive:
+    """What the table keeps of a result."""
+    mined = result.mined
+    return AnalysedDrive(
+        drive=result.drive,
+        end_us=result.end_us,
+        job=job,
+        samples=result.samples,
+        estimates=mined.estimates,
+        missing=mined.missing,
+        repairs=result.repairs,
+    )
+
+
+@cache
+def _recordings() -> Recordings:
+    given = variables(PlanEnvironment)
+    return Recordings(
+        clients.dynamodb(),
+        telemetry=given.telemetry_table,
+        robots=given.robots_table,
+        namespace=given.namespace,
+    )
+
+
+def handler(event: Mapping[str, Any], _context: object) -> None:
+    """Entry point of the state Analyse."""
+    given = variables(PlanEnvironment)
+    result = analysed(decode_planned(event["planned"]), _recordings())
+    kept = Kept(clients.s3(), given.files_bucket)
+    kept.put_json(f"{drive_prefix(result.drive)}result.json", encode_result(result))
+    # The row comes last: it says that the result is there.
+    FindingsTable(clients.dynamodb(), given.findings_table).put_drive(row(result, event["job"]))

@@ -1,0 +1,143 @@
+"""Plan: finds the drives to analyse, first step of the state machine `analysis`.
+
+Without a robot it names the robots of the run; with one it writes the robot's drives to the bucket, an item a
+drive.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from functions.shared import clients
+from functions.shared.environment import variables
+from functions.shared.kept import Kept
+from functions.shared.recordings import Recordings
+from iort_analysis.drives.finding import STAND_US, Heard, find
+from iort_analysis.drives.motion import motion_field, motion_stream, moving
+from iort_analysis.samples.batches import RefusedItems, blocks
+from iort_contract.catalog.environments import PlanEnvironment
+from iort_contract.cloud import plan_key
+from iort_contract.dynamodb import Item
+from iort_contract.findings_table import FindingsTable
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
+from iort_contract.messages.analysis import (
+    AnalysisRequest,
+    PlannedDrive,
+    decode_request,
+    encode_planned,
+    encode_request,
+)
+from iort_contract.messages.batch import batch_id
+from iort_contract.messages.findings import DriveKey
+from iort_contract.tables import BATCH
+
+_END_US = 2**53
+# A drive may have begun so long before the range.
+_BEFORE_US = tuple(seconds * 1_000_000 for seconds in (120, 1_800, 28_800))
+
+
+def selected(request: AnalysisRequest, recordings: Recordings, job: str) -> dict[str, Any]:
+    """The run with the names of its robots."""
+    robots = list(request.robots) or recordings.robots()
+    return {**encode_request(request), "robots": robots, "job": job}
+
+
+def planned(robot: str, request: AnalysisRequest, recordings: Recordings) -> list[PlannedDrive]:
+    """The robot's drives that have samples in the range, each from its own beginning to its end."""
+    fields = {
+        stream: names
+        for stream in recordings.registered(robot).streams
+        if (names := recordings.fields(robot, stream, request.start_us, request.end_us)) is not None
+    }
+    if not fields:
+        return []
+    motion = motion_stream(fields)
+    # Without a speed every stream is as good, and only pauses and runs cut.
+    stream = motion or min(fields)
+    heard = _Heard(recordings, robot, stream, motion_field(fields[stream]))
+    return [
+        PlannedDrive(
+            DriveKey(robot, found.start_us, found.run),
+            found.last_us + MAX_BATCH_SPAN_US - 1,
+            tuple(sorted(fields)),
+            motion or "",
+        )
+        for found in find(heard.between(heard.beginning_us(request.start_us), _END_US), request.end_us)
+        if found.last_us >= request.start_us
+    ]
+
+
+class _Heard:
+    """The batches of the stream that tells of motion, by ``field``; without one only pauses and runs cut."""
+
+    def __init__(self, recordings: Recordings, robot: str, stream: str, field: str | None) -> None:
+        self._recordings, self._robot, self._stream, self._field = recordings, robot, stream, field
+
+    def beginning_us(self, start_us: int) -> int:
+        """The time from which on to look: that of the range, or where a drive began that goes on there."""
+        for before_us in _BEFORE_US:
+            drives = find(self.between(max(0, start_us - before_us), start_us))
+            first_us = min(
+                (one.start_us for one in drives if one.last_us >= start_us - STAND_US), default=None
+            )
+            if first_us is None:
+                break
+            if first_us > start_us - before_us + STAND_US:
+                return first_us
+        return start_us
+
+    def between(self, start_us: int, end_us: int) -> Iterator[Heard]:
+        """The batches with samples in a range."""
+        for item in self._recordings.items(self._robot, self._stream, start_us, end_us):
+            # What is not a batch has no time.
+            with suppress(ContractError, KeyError):
+                yield Heard(batch_id(item[BATCH]["S"]), partial(self._moves, item))
+
+    def _moves(self, item: Item) -> bool:
+        """Whether the car moves in a batch, or nobody knows."""
+        if self._field is None:
+            return True
+        for block in blocks([[item]], RefusedItems(), self._field.__eq__):
+            moves = moving(block.columns)
+            return moves is None or bool(moves.any() or np.isnan(block.columns[self._field]).all())
+        return False
+
+
+def unknown_to(table: FindingsTable, drives: list[PlannedDrive]) -> list[PlannedDrive]:
+    """The drives that have not been analysed up to their end."""
+    if not drives:
+        return []
+    first, last = drives[0].drive, drives[-1].drive
+    done = {(one.drive, one.end_us) for one in table.drives(first.robot, first.start_us, last.start_us + 1)}
+    return [one for one in drives if (one.drive, one.end_us) not in done]
+
+
+@cache
+def _recordings() -> Recordings:
+    given = variables(PlanEnvironment)
+    return Recordings(
+        clients.dynamodb(),
+        telemetry=given.telemetry_table,
+        robots=given.robots_table,
+        namespace=given.namespace,
+    )
+
+
+def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
+    """Entry point of the states Robots, with an ``input``, and Plan, with a ``robot``."""
+    now_us = time.time_ns() // 1000
+    if "robot" not in event:
+        return selected(decode_request(event["input"], now_us), _recordings(), event["job"])
+    given, request = variables(PlanEnvironment), decode_request(event, now_us)
+    drives = planned(event["robot"], request, _recordings())
+    if not request.again:
+        drives = unknown_to(FindingsTable(clients.dynamodb(), given.findings_table), drives)
+    kept = Kept(clients.s3(), given.files_bucket)
+    kept.put_json(plan_key(event["job"], event["robot"]), [encode_planned(one) for one in drives])
+    return {"drives": len(drives)}

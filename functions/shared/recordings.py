@@ -1,0 +1,88 @@
+"""What robots recorded, by stream and range, and what the registry says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from iort_contract.catalog.derived import Vehicle
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.dynamodb import Item, TelemetryTable, plain, with_samples_between
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import decode_batch
+from iort_contract.tables import ROBOT, STREAMS
+from iort_contract.topics import record_topic
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
+
+# A stream with more fields is a scan or an image, from which nothing is mined.
+MAX_FIELDS = 100
+# A stream that begins with so many broken batches has no known fields.
+_TRIES = 5
+
+
+class Registered(NamedTuple):
+    """What the registry says of a robot; nothing of one that is not registered.
+
+    ``known`` are the numbers of its row, such as ``mass_kg``.
+    """
+
+    streams: Sequence[str]
+    vehicle: Vehicle | None
+    known: dict[str, float]
+
+
+class Recordings:
+    """Reads the tables of telemetry and of robots."""
+
+    def __init__(self, client: DynamoDBClient, *, telemetry: str, robots: str, namespace: str) -> None:
+        self._client, self._robots, self._namespace = client, robots, namespace
+        self._telemetry = TelemetryTable(client, telemetry)
+
+    def robots(self) -> list[str]:
+        """The names of all registered robots."""
+        return robots_of(self._client, self._robots)
+
+    def registered(self, robot: str) -> Registered:
+        """What is known of a robot."""
+        answer = self._client.get_item(TableName=self._robots, Key={ROBOT: {"S": robot}}, ConsistentRead=True)
+        row = plain(answer.get("Item", {}))
+        known = {name: float(value) for name, value in row.items() if _is_number(value)}
+        gain = known.get("speed_to_erpm_gain", 0.0)
+        streams = sorted({VESC_STREAM, *row.get(STREAMS, ())} - OWN_STREAMS)
+        vehicle = Vehicle(gain, known.get("speed_to_erpm_offset", 0.0)) if gain else None
+        return Registered(streams, vehicle, known)
+
+    def items(
+        self, robot: str, stream: str, start_us: int, end_us: int, *, page_items: int | None = None
+    ) -> Iterator[Item]:
+        """The stored batches with samples from ``start_us`` to ``end_us`` (exclusive), in order of time."""
+        topic = record_topic(robot, stream, self._namespace)
+        keys = with_samples_between(start_us, end_us)
+        for page in self._telemetry.pages(topic, keys, page_items=page_items):
+            yield from page.items
+
+    def fields(self, robot: str, stream: str, start_us: int, end_us: int) -> list[str] | None:
+        """The fields of a stream at the beginning of a range; None if it has no samples there that could be
+        mined."""
+        for item in islice(self.items(robot, stream, start_us, end_us, page_items=_TRIES), _TRIES):
+            with suppress(ContractError):
+                names = list(decode_batch(plain(item)).columns)
+                return names if len(names) <= MAX_FIELDS else None
+        return None
+
+
+def robots_of(client: DynamoDBClient, table: str) -> list[str]:
+    """The names of all registered robots."""
+    pages = client.get_paginator("scan").paginate(
+        TableName=table, ProjectionExpression="#robot", ExpressionAttributeNames={"#robot": ROBOT}
+    )
+    return sorted(str(item[ROBOT]["S"]) for page in pages for item in page["Items"])
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, (bool, str, set, list, dict, bytes)) and value is not None

@@ -1,0 +1,170 @@
+"""The analysis of drives: the state machine `analysis`, its four functions, and its nightly start.
+
+Robots and Plan find the drives, Drives is a distributed map with one function call for each, Evaluate
+compares them, and Present keeps and mails what was found: docs/explanation/analysis.md.
+"""
+
+from __future__ import annotations
+
+import json
+
+from aws_cdk import App, CfnOutput, Duration
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_scheduler as scheduler
+from aws_cdk import aws_sns as sns
+from aws_cdk import aws_stepfunctions as stepfunctions
+
+from iort_contract.catalog.environments import EvaluateEnvironment, PlanEnvironment, PresentEnvironment
+from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
+from stacks.parts.base import PlatformStack
+from stacks.parts.function import allow, function
+from stacks.parts.layers import arrays
+from stacks.parts.states import states
+from stacks.settings import Settings
+from stacks.storage import Storage
+
+# Lambda gives a whole core at 1769 MB, and these functions compute. A robot-hour takes two seconds.
+_CORE_MB = 1769
+# A child of the map is an express workflow, which AWS ends after five minutes: three attempts must fit.
+_ANALYSE_S, _PLAN_S, _EVALUATE_S = 90, 900, 900
+# Robots that are planned at once, and drives that are analysed at once. The embedded cloud's functions share
+# this machine's cores, and a new account on AWS has ten environments for all functions.
+_ROBOTS, _DRIVES, _EMBEDDED = 8, 200, 2
+# Every night both days are looked at: a drive that went on at night is analysed whole the next time.
+_NIGHTLY_S = 2 * 86_400
+
+
+class Analysis(PlatformStack):
+    """The state machine and its functions; serious findings go to the topic ``alarms``."""
+
+    def __init__(self, app: App, settings: Settings, *, storage: Storage, alarms: sns.ITopic) -> None:
+        super().__init__(app, "analysis", settings, storage.encryption)
+        self._storage, self._alarms = storage, alarms
+        self._layers = arrays(self)
+        functions = {
+            "Plan": self._plan(),
+            "Analyse": self._analyse(),
+            "Evaluate": self._evaluate(),
+            "Present": self._present(),
+        }
+        self.machine = self._machine(functions)
+        CfnOutput(self, "AnalysisMachine", value=self.machine.state_machine_arn)
+        if settings.nightly_analysis:
+            self._nightly()
+
+    def _plan(self) -> lambda_.Function:
+        plan = function(
+            self, "Plan", self._reading(), memory_mb=_CORE_MB, timeout_s=_PLAN_S, layers=self._layers
+        )
+        self._may_read(plan)
+        self._storage.robots.grant(plan, "dynamodb:Scan")
+        self._storage.findings.grant(plan, "dynamodb:Query")
+        allow(plan, ["s3:PutObject"], self._objects(PLANS_PREFIX))
+        return plan
+
+    def _analyse(self) -> lambda_.Function:
+        analyse = function(
+            self, "Analyse", self._reading(), memory_mb=_CORE_MB, timeout_s=_ANALYSE_S, layers=self._layers
+        )
+        self._may_read(analyse)
+        self._storage.findings.grant(analyse, "dynamodb:PutItem")
+        allow(analyse, ["s3:PutObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
+        return analyse
+
+    def _evaluate(self) -> lambda_.Function:
+        environment = EvaluateEnvironment(
+            namespace=self.settings.namespace,
+            robots_table=self._storage.robots.table_name,
+            findings_table=self._storage.findings.table_name,
+            files_bucket=self._storage.files.bucket_name,
+        )
+        evaluate = function(
+            self, "Evaluate", environment, memory_mb=_CORE_MB, timeout_s=_EVALUATE_S, layers=self._layers
+        )
+        self._storage.robots.grant(evaluate, "dynamodb:Scan")
+        self._storage.findings.grant(evaluate, "dynamodb:Query")
+        allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))
+        allow(evaluate, ["s3:PutObject"], self._objects(PLANS_PREFIX))
+        return evaluate
+
+    def _present(self) -> lambda_.Function:
+        environment = PresentEnvironment(
+            namespace=self.settings.namespace,
+            findings_table=self._storage.findings.table_name,
+            files_bucket=self._storage.files.bucket_name,
+            alarm_topic=self._alarms.topic_arn,
+            page_url=self.settings.page_url,
+        )
+        present = function(self, "Present", environment, timeout_s=_EVALUATE_S)
+        self._storage.findings.grant(present, "dynamodb:Query", "dynamodb:PutItem", "dynamodb:DeleteItem")
+        allow(present, ["s3:GetObject"], self._objects(PLANS_PREFIX))
+        allow(present, ["sns:Publish"], self._alarms.topic_arn)
+        return present
+
+    def _reading(self) -> PlanEnvironment:
+        return PlanEnvironment(
+            namespace=self.settings.namespace,
+            telemetry_table=self._storage.telemetry.table_name,
+            robots_table=self._storage.robots.table_name,
+            findings_table=self._storage.findings.table_name,
+            files_bucket=self._storage.files.bucket_name,
+        )
+
+    def _may_read(self, function_: lambda_.Function) -> None:
+        self._storage.telemetry.grant(function_, "dynamodb:Query")
+        self._storage.robots.grant(function_, "dynamodb:GetItem")
+
+    def _objects(self, prefix: str) -> str:
+        return str(self._storage.files.arn_for_objects(f"{prefix}*"))
+
+    def _machine(self, functions: dict[str, lambda_.Function]) -> stepfunctions.StateMachine:
+        role = self._role("Machine", "states.amazonaws.com")
+
+        def may(actions: list[str], resources: list[str]) -> None:
+            role.add_to_policy(iam.PolicyStatement(actions=actions, resources=resources))
+
+        may(["lambda:InvokeFunction"], [one.function_arn for one in functions.values()])
+        # The map lists the plans of its run, and reads them.
+        may(["s3:ListBucket"], [self._storage.files.bucket_arn])
+        may(["s3:GetObject"], [self._objects(PLANS_PREFIX)])
+        definition = states(
+            self.partition,
+            {name: one.function_arn for name, one in functions.items()},
+            bucket=self._storage.files.bucket_name,
+            at_once=(_EMBEDDED, _EMBEDDED) if self.settings.embedded else (_ROBOTS, _DRIVES),
+        )
+        machine = stepfunctions.StateMachine(
+            self,
+            "Machine",
+            role=role,
+            definition_body=stepfunctions.DefinitionBody.from_string(json.dumps(definition)),
+            timeout=Duration.hours(12),
+        )
+        # The map's children are executions of the machine itself, which is made after its role: "IAM policies
+        # for using Distributed Map states".
+        children = iam.Policy(self, "MapPolicy", roles=[role])
+        children.add_statements(
+            iam.PolicyStatement(actions=["states:StartExecution"], resources=[machine.state_machine_arn])
+        )
+        return machine
+
+    def _nightly(self) -> None:
+        role = self._role("Nightly", "scheduler.amazonaws.com")
+        self.machine.grant_start_execution(role)
+        scheduler.CfnSchedule(
+            self,
+            "Nightly",
+            flexible_time_window=scheduler.CfnSchedule.FlexibleTimeWindowProperty(mode="OFF"),
+            schedule_expression="cron(0 3 * * ? *)",
+            target=scheduler.CfnSchedule.TargetProperty(
+                arn=self.machine.state_machine_arn,
+                role_arn=role.role_arn,
+                input=json.dumps({"robots": [], "last_s": _NIGHTLY_S}),
+            ),
+        )
+
+    def _role(self, name: str, service: str) -> iam.Role:
+        # The service acts for every account; only for ours may it take our role.
+        conditions = {"StringEquals": {"aws:SourceAccount": self.account}}
+        return iam.Role(self, f"{name}Role", assumed_by=iam.ServicePrincipal(service, conditions=conditions))

@@ -1,0 +1,106 @@
+"""`iort findings`: what the analysis has found."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from iort_contract.catalog.kinds import KINDS
+from iort_contract.messages.analysis import AnalysedDrive, encode_analysed
+from iort_contract.messages.findings import Estimate, Finding, encode_finding
+from iort_contract.page import PAGE_URL, history_link
+from iort_station.cli import completion
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson, When, ranged
+from iort_station.cli.words import examples
+from iort_station.data import findings as stored
+from iort_station.fleet import registry
+from iort_station.times import iso_s
+
+commands = typer.Typer()
+_STYLES = {"serious": "bold red", "warning": "yellow", "info": ""}
+
+
+@commands.command("findings", epilog=examples("findings car7", "findings car7 --drives", "findings --json"))
+@ranged
+def findings(
+    context: typer.Context,
+    when: When,
+    robot: Annotated[
+        str | None,
+        typer.Argument(help="The robot. Default: all.", autocompletion=completion.robots, show_default=False),
+    ] = None,
+    drives: Annotated[
+        bool, typer.Option("--drives", help="List the analysed drives, and what could not be computed.")
+    ] = False,
+    count: Annotated[int, typer.Option(min=1, max=10_000, help="The most to list; the newest.")] = 50,
+    as_json: AsJson = False,
+) -> None:
+    """List what the analysis found about drives, the newest first, with its evidence and what to do.
+
+    An interval holds the truth in 90 of 100 cases. The link opens the page's history at the evidence, where
+    `iort dashboard` serves it.
+    """
+    cloud, within = context.obj.cloud(), when.range()
+    if drives:
+        analysed = stored.drives(cloud, robot, within.start_us, within.end_us, most=count)
+        if as_json:
+            print_json([encode_analysed(one) for one in analysed])
+        for one in () if as_json else analysed:
+            _show_drive(one)
+        found: list[Any] = list(analysed)
+    else:
+        found = stored.findings(cloud, robot, within.start_us, within.end_us, most=count)
+        if as_json:
+            print_json([{**encode_finding(one), "link": history_link(PAGE_URL, one)} for one in found])
+        for finding in () if as_json else found:
+            _show(finding)
+    if not found and robot is not None:
+        registry.get(cloud, robot)
+    if not found and not as_json:
+        errors.print("nothing was found in this range; `iort analyse` looks now")
+
+
+def _show(one: Finding) -> None:
+    kind = KINDS.get(one.kind)
+    out.print(
+        Text.assemble(
+            f"{iso_s(one.from_us)}  {one.drive.robot}  ",
+            (f"{one.severity}: {one.text}", _STYLES.get(one.severity, "")),
+        )
+    )
+    rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
+    rows.add_column(width=8)
+    rows.add_column(overflow="fold")
+    if one.effect is not None:
+        rows.add_row("effect", _interval(one.effect))
+    if one.baseline is not None:
+        rows.add_row("before", _interval(one.baseline))
+    if one.q is not None:
+        rows.add_row("false", f"at most {one.q:.2g} of such findings")
+    rows.add_row("evidence", history_link(PAGE_URL, one))
+    if kind is not None:
+        rows.add_row("to do", kind.action)
+    out.print(rows)
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.value:.4g} {estimate.unit} ({estimate.low:.4g} to {estimate.high:.4g})"
+
+
+def _show_drive(one: AnalysedDrive) -> None:
+    lasted_s = (one.end_us - one.drive.start_us) / 1e6
+    out.print(f"{iso_s(one.drive.start_us)}  {one.drive.robot}  {lasted_s:,.0f} s, {one.samples:,} samples")
+    rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
+    rows.add_column()
+    rows.add_column(overflow="fold")
+    for name, estimate in one.estimates.items():
+        rows.add_row(name, _interval(estimate))
+    for kind, samples in one.repairs.items():
+        rows.add_row(f"repaired: {kind}", f"{samples:,} samples")
+    for name, reason in one.missing.items():
+        rows.add_row(f"missing: {name}", reason, style="yellow")
+    out.print(rows)

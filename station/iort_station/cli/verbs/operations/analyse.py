@@ -1,0 +1,100 @@
+"""`iort analyse`: start a run of the analysis."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import typer
+
+from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.limits import ContractError
+from iort_contract.messages.analysis import (
+    MAX_RANGE_US,
+    AnalysisRequest,
+    decode_request,
+    encode_request,
+)
+from iort_station.cli import completion
+from iort_station.cli.console import errors, tell
+from iort_station.cli.options import AsJson, When, ranged
+from iort_station.cli.words import examples, say
+from iort_station.cloud import Cloud
+from iort_station.data import findings
+from iort_station.errors import UsageError
+from iort_station.fleet import registry
+from iort_station.operations import analysis
+
+commands = typer.Typer()
+# The range without an option.
+_USUAL = "1d"
+
+
+@commands.command("analyse", epilog=examples("analyse car7 --last 1d", "analyse --fleet --last 7d --wait"))
+@ranged
+def analyse(
+    context: typer.Context,
+    when: When,
+    robots: Annotated[
+        list[str] | None,
+        typer.Argument(help="The robots.", autocompletion=completion.robots, show_default=False),
+    ] = None,
+    fleet: Annotated[bool, typer.Option("--fleet", help="Every registered robot.")] = False,
+    new: Annotated[bool, typer.Option("--new", help="Only drives that have not been analysed.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait for the findings, and show how far it is.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Analyse the drives of robots in the cloud, as it does every night.
+
+    The drives with samples in the range are cut, cleaned and mined, and compared with earlier ones. Without
+    --wait the command returns at once; `iort findings` prints what is found.
+    """
+    if bool(robots) == fleet:
+        raise UsageError("name the robots, or give --fleet for all")
+    cloud = context.obj.cloud()
+    for robot in robots or ():
+        registry.get(cloud, robot)
+    request = _request(robots or [], when, again=not new)
+    run = analysis.start(cloud, request)
+    name = run.rpartition(":")[2]
+    if not wait:
+        tell({"run": name}, f"started {name}; `iort findings` prints what it finds", as_json=as_json)
+        return
+    done = _watched(cloud, run)
+    asked: list[str | None] = list(robots) if robots else [None]
+    failed = sum(
+        finding.kind == ANALYSIS_FAILED
+        for robot in asked
+        for finding in findings.findings(cloud, robot, request.start_us, request.end_us)
+    )
+    facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
+    text = f"{done.drives or 0} drives analysed, {done.findings} findings"
+    tell(facts, f"{text}, {failed} drives failed" if failed else text, as_json=as_json)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _request(robots: list[str], when: When, *, again: bool) -> AnalysisRequest:
+    within, now_us = when.range(_USUAL), time.time_ns() // 1000
+    end_us = within.end_us or now_us
+    start_us = max(0, end_us - MAX_RANGE_US) if within.start_us is None else within.start_us
+    request = AnalysisRequest(tuple(robots), start_us, end_us, again=again)
+    try:
+        return decode_request(encode_request(request), now_us)
+    except ContractError as error:
+        raise UsageError(str(error)) from error
+
+
+def _watched(cloud: Cloud, run: str) -> analysis.Progress:
+    """Follow a run to its end; drives that are done are shown to whoever looks."""
+    last = analysis.Progress(analysis.RUNNING)
+    try:
+        with errors.status("finding the drives") as status:
+            for last in analysis.watch(cloud, run):
+                if last.drives is not None:
+                    status.update(f"{last.done} of {last.drives} drives")
+    except KeyboardInterrupt:
+        say("the analysis goes on in the cloud; `iort findings` prints what it finds")
+        raise
+    return last

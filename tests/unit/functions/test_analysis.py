@@ -1,0 +1,300 @@
+"""The analysis, from stored batches to findings and mails, through its four functions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import boto3
+import numpy as np
+import pytest
+
+from functions import analyse, evaluate, plan, present
+from functions.shared.kept import Kept
+from iort_analysis.results import DriveResult, Mined, encode_result
+from iort_analysis.samples.blocks import Block, values
+from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
+from iort_contract.cloud import drive_prefix, plan_key
+from iort_contract.dynamodb import TelemetryTable
+from iort_contract.findings_table import FindingsTable
+from iort_contract.limits import ContractError
+from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, encode_planned
+from iort_contract.messages.batch import Batch
+from iort_contract.messages.findings import DriveKey, Estimate, Finding
+from iort_contract.page import PAGE_URL
+from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
+from iort_contract.topics import record_topic
+from tests.fakes import item_of
+from tests.unit.analysis.simulated import HZ, START_US, changed, streams
+
+S = 1_000_000
+CAR, BUCKET, RUN = "car", "files", "00c0ffee"
+TELEMETRY, ROBOTS, FINDINGS = "telemetry", "robots", "findings"
+VARIABLES = {
+    "TELEMETRY_TABLE": TELEMETRY,
+    "ROBOTS_TABLE": ROBOTS,
+    "FINDINGS_TABLE": FINDINGS,
+    "FILES_BUCKET": BUCKET,
+    "PAGE_URL": PAGE_URL,
+}
+JOB = "night"
+
+
+class Deployed:
+    """The tables and the bucket in moto, and the state machine's calls of the functions."""
+
+    def __init__(self, topic: str) -> None:
+        self.dynamodb, self.s3, self.topic = boto3.client("dynamodb"), boto3.client("s3"), topic
+        self.table = FindingsTable(self.dynamodb, FINDINGS)
+
+    def register(self, robot: str, *streams_of: str, **numbers: float) -> None:
+        row = {ROBOT: {"S": robot}, STREAMS: {"SS": list(streams_of or ("vesc",))}}
+        self.dynamodb.put_item(
+            TableName=ROBOTS, Item={**row, **{name: {"N": str(value)} for name, value in numbers.items()}}
+        )
+
+    def record(
+        self, blocks: dict[str, Block], *, robot: str = CAR, run: str = RUN, first_seq: int = 0
+    ) -> None:
+        for stream, block in blocks.items():
+            seconds = (block.times_us - block.times_us[0]) // S
+            batches = []
+            for seq, second in enumerate(np.unique(seconds)):
+                part = block.take(seconds == second)
+                columns = {name: values(column) for name, column in part.columns.items()}
+                batches.append(Batch(run, first_seq + seq, part.times_us.tolist(), columns))
+            items = (item_of(batch, record_topic(robot, stream)) for batch in batches)
+            TelemetryTable(self.dynamodb, TELEMETRY).put(items)
+
+    def run(self, **asked: object) -> list[dict]:
+        """Run the states in order; return the planned drives."""
+        request = {"robots": [], "start_us": START_US, "end_us": START_US + 3600 * S, **asked}
+        run = plan.handler({"input": request, "job": JOB}, None)
+        drives = []
+        for robot in run["robots"]:
+            plan.handler({**run, "robot": robot}, None)
+            drives += self.json(plan_key(JOB, robot))
+        for drive in drives:
+            analyse.handler({"planned": drive, "job": JOB}, None)
+        evaluate.handler(run, None)
+        present.handler({"job": JOB}, None)
+        return drives
+
+    def json(self, key: str) -> object:
+        return json.loads(self.s3.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+
+
+@pytest.fixture
+def cloud(aws: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
+    dynamodb = boto3.client("dynamodb")
+    for table, keys in {TELEMETRY: (TOPIC, "batch"), ROBOTS: (ROBOT,), FINDINGS: (ROBOT, FINDING)}.items():
+        dynamodb.create_table(
+            TableName=table,
+            KeySchema=[
+                {"AttributeName": key, "KeyType": kind}
+                for key, kind in zip(keys, ("HASH", "RANGE"), strict=False)
+            ],
+            AttributeDefinitions=[{"AttributeName": key, "AttributeType": "S"} for key in keys],
+            BillingMode="PAY_PER_REQUEST",
+        )
+    boto3.client("s3").create_bucket(
+        Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"}
+    )
+    topic = boto3.client("sns").create_topic(Name="alarms")["TopicArn"]
+    for name, value in {**VARIABLES, "ALARM_TOPIC": topic}.items():
+        monkeypatch.setenv(name, value)
+    return Deployed(topic)
+
+
+def later(blocks: dict[str, Block], seconds: int) -> dict[str, Block]:
+    return {name: Block(block.times_us + seconds * S, block.columns) for name, block in blocks.items()}
+
+
+def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) -> None:
+    cloud.register(CAR, "vesc", "pose", "agent", speed_to_erpm_gain=4614, mass_kg=3.7)
+    cloud.record(streams(90))
+    cloud.record(later(streams(90), 300), first_seq=90)
+
+    drives = cloud.run()
+
+    assert [(one["start_us"], one["streams"], one["motion"]) for one in drives] == [
+        (START_US, ["pose", "vesc"], "vesc"),
+        (START_US + 300 * S, ["pose", "vesc"], "vesc"),
+    ]
+    second, first = cloud.table.drives(CAR)
+    assert first.samples == second.samples == 90 * HZ * 3 // 2
+    assert not {name: why for name, why in first.missing.items() if "failed" in why or "vesc" in name}
+    assert first.estimates["lap_mean_s"].unit == "s"
+    result = cloud.json(f"{drive_prefix(first.drive)}result.json")
+    assert result["estimates"].keys() == first.estimates.keys()
+
+
+def test_only_new_drives_are_analysed_unless_again(cloud: Deployed) -> None:
+    cloud.register(CAR)
+    cloud.record(streams(30))
+
+    assert len(cloud.run()) == 1
+    assert cloud.run() == []
+    assert len(cloud.run(again=True)) == 1
+    # A drive that has gone on since is another one up to its end.
+    cloud.record(later(streams(30), 30), first_seq=30)
+    assert len(cloud.run()) == 1
+    assert [one.samples for one in cloud.table.drives(CAR)] == [60 * HZ]
+
+
+def test_a_drive_that_began_before_the_range_is_whole(cloud: Deployed) -> None:
+    cloud.register(CAR)
+    cloud.record(streams(120))
+
+    (drive,) = cloud.run(start_us=START_US + 100 * S)
+
+    assert drive["start_us"] == START_US
+
+
+def test_no_state_of_a_recording_stops_the_others(cloud: Deployed) -> None:
+    """Each robot has another trouble, and each gets a result that says what it is."""
+    nulls = changed("speed", slice(None), np.nan, 20)
+    jump = {"vesc": streams(60)["vesc"].take(slice(0, 20 * HZ))}
+    text = np.array(["a", "b"] * 50, dtype=object)
+    troubles = {
+        "null": (nulls, {"vesc.speed": "null in every sample"}),
+        "few": ({"vesc": streams(20)["vesc"].take(slice(40, 42))}, {}),
+        "other": (
+            {"imu": Block(START_US + np.arange(100) * 20_000, {"speed": text})},
+            {"vesc": "no stream has"},
+        ),
+    }
+    for robot, (blocks, _) in troubles.items():
+        cloud.register(robot, *blocks)
+        cloud.record(blocks, robot=robot)
+    cloud.register("clock")
+    cloud.record(jump, robot="clock")
+    cloud.record(later({"vesc": streams(60)["vesc"]}, 15), robot="clock", first_seq=20)
+    cloud.register("quarantine")
+    cloud.record({"vesc": streams(20)["vesc"]}, robot="quarantine")
+    gone = {
+        TOPIC: {"S": record_topic("quarantine", "vesc")},
+        "batch": {"S": f"{START_US + 5 * S:016d}-{RUN}-5"},
+    }
+    cloud.dynamodb.delete_item(TableName=TELEMETRY, Key=gone)
+    cloud.register("nothing")
+
+    cloud.run()
+
+    assert list(cloud.table.drives("nothing")) == []
+    expected = {robot: missing for robot, (_, missing) in troubles.items()} | {
+        "clock": {"vesc clock": "set back by 4.0 s: 20 of 80 batches"},
+        "quarantine": {"vesc batches": "1 of 20 are not stored"},
+    }
+    for robot, missing in expected.items():
+        (analysed,) = cloud.table.drives(robot)
+        for name, reason in missing.items():
+            assert reason in analysed.missing[name], robot
+    # The miners that had too little say so, too.
+    (few,) = cloud.table.drives("few")
+    assert few.missing
+    assert not few.estimates
+
+
+def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
+    def resistance(day: int, value: float, job: str) -> AnalysedDrive:
+        drive = DriveKey(CAR, START_US + day * 86_400 * S, RUN)
+        estimates = {"battery_resistance_ohm": Estimate(value, value - 0.001, value + 0.001, "ohm")}
+        return AnalysedDrive(drive, drive.start_us + 60 * S, job, 3000, estimates, {}, {})
+
+    for day in range(-8, 0):
+        cloud.table.put_drive(resistance(day, 0.03 + 0.0005 * (day % 3), "before"))
+    worn = resistance(0, 0.06, JOB)
+    cloud.table.put_drive(worn)
+    result = DriveResult(worn.drive, worn.end_us, 3000, {}, Mined(estimates=worn.estimates))
+    planned = PlannedDrive(worn.drive, worn.end_us, ("vesc",), "vesc")
+    kept = Kept(cloud.s3, BUCKET)
+    kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
+    kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
+
+    evaluate.handler({"job": JOB, "robots": [CAR]}, None)
+    present.handler({"job": JOB}, None)
+
+    (found,) = cloud.table.findings(CAR)
+    assert (found.kind, found.drive) == ("battery_worn", worn.drive)
+    assert found.effect
+    assert found.effect.low > 0.02
+
+
+def finding(text: str = "the battery drops", *, at_us: int = START_US) -> Finding:
+    return Finding(
+        drive=DriveKey(CAR, START_US, RUN),
+        kind="cell_dropout",
+        severity=SERIOUS,
+        subject="cell_dropout",
+        from_us=at_us,
+        to_us=at_us + 20 * S,
+        stream="vesc",
+        fields=("voltage_input", "current_input"),
+        text=text,
+        effect=Estimate(1.25, 1.1, 1.4, "V"),
+    )
+
+
+def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Deployed) -> None:
+    mails: list[tuple[str, str]] = []
+
+    def notify(subject: str, text: str) -> None:
+        mails.append((subject, text))
+
+    drive = finding().drive
+    for found in ([finding()], [finding("again")], []):
+        present.present([(drive, found)], cloud.table, notify, "https://page.example.org/")
+        assert [one.text for one in cloud.table.findings(CAR)] == [one.text for one in found]
+
+    ((subject, text),) = mails
+    assert subject == "car: the battery's voltage drops for moments under load"
+    assert "1.25 V, 90 % sure between 1.1 and 1.4" in text
+    link = (
+        "https://page.example.org/#/history/car?stream=vesc&from=2023-11-14T22:13:20.000Z"
+        "&to=2023-11-14T22:13:40.000Z&fields=voltage_input,current_input\n"
+    )
+    assert link in text
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        ({"Error": "Sandbox.Timedout", "Cause": ""}, "Sandbox.Timedout"),
+        ({"Error": "Lambda.Unknown", "Cause": "the worker was killed"}, "the worker was killed"),
+        (
+            {"Error": "E", "Cause": json.dumps({"errorType": "MemoryError", "errorMessage": "none left"})},
+            "MemoryError: none left",
+        ),
+    ],
+)
+def test_a_failed_drive_is_a_finding_until_it_succeeds(
+    cloud: Deployed, error: dict[str, str], reason: str
+) -> None:
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    (drive,) = cloud.run()
+
+    present.handler({"failed": drive, "error": error}, None)
+    (found,) = cloud.table.findings(CAR)
+    cloud.run(again=True)
+
+    assert (found.kind, found.drive.start_us) == (ANALYSIS_FAILED, START_US)
+    assert found.text == f"the drive could not be analysed in three attempts: {reason}"
+    assert ANALYSIS_FAILED not in {one.kind for one in cloud.table.findings(CAR)}
+
+
+@pytest.mark.parametrize(
+    "request_", [{}, {"start_us": 2, "end_us": 2}, {"last_s": 10**9}, {"last_s": 60, "robots": ["a/b"]}]
+)
+def test_a_wrong_request_is_refused(cloud: Deployed, request_: dict) -> None:
+    with pytest.raises(ContractError):
+        plan.handler({"input": request_, "job": JOB}, None)
+
+
+def test_the_schedule_asks_for_the_last_days(cloud: Deployed) -> None:
+    cloud.register(CAR)
+    found = plan.handler({"input": {"robots": [], "last_s": 86_400}, "job": JOB}, None)
+
+    assert found["end_us"] - found["start_us"] == 86_400 * S
+    assert found["robots"] == [CAR]
