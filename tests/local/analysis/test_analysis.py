@@ -20,7 +20,7 @@ from iort_contract.catalog.kinds import ANALYSIS_FAILED
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import ROBOT, STREAMS
-from iort_contract.topics import record_topic
+from iort_contract.topics import RECORD, build_topic
 from iort_station import data
 from iort_station.data import findings
 from tests.fakes import item_of
@@ -48,7 +48,7 @@ def stored(embedded, robot: str, blocks: dict[str, Block], *, run: str = "00c0ff
             part = block.take(seconds == second)
             columns = {name: values(column) for name, column in part.columns.items()}
             items.append(
-                item_of(Batch(run, seq, part.times_us.tolist(), columns), record_topic(robot, stream))
+                item_of(Batch(run, seq, part.times_us.tolist(), columns), build_topic(RECORD, robot, stream))
             )
     TelemetryTable(client, embedded.cloud.output("storage", "TelemetryTable")).put(items)
 

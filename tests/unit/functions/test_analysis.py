@@ -23,7 +23,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.messages.findings import DriveKey, Estimate, Finding
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
-from iort_contract.topics import record_topic
+from iort_contract.topics import RECORD, build_topic
 from tests.fakes import item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
@@ -63,7 +63,7 @@ class Deployed:
                 part = block.take(seconds == second)
                 columns = {name: values(column) for name, column in part.columns.items()}
                 batches.append(Batch(run, first_seq + seq, part.times_us.tolist(), columns))
-            items = (item_of(batch, record_topic(robot, stream)) for batch in batches)
+            items = (item_of(batch, build_topic(RECORD, robot, stream)) for batch in batches)
             TelemetryTable(self.dynamodb, TELEMETRY).put(items)
 
     def run(self, **asked: object) -> list[dict]:
@@ -173,7 +173,7 @@ def test_no_state_of_a_recording_stops_the_others(cloud: Deployed) -> None:
     cloud.register("quarantine")
     cloud.record({"vesc": streams(20)["vesc"]}, robot="quarantine")
     gone = {
-        TOPIC: {"S": record_topic("quarantine", "vesc")},
+        TOPIC: {"S": build_topic(RECORD, "quarantine", "vesc")},
         "batch": {"S": f"{START_US + 5 * S:016d}-{RUN}-5"},
     }
     cloud.dynamodb.delete_item(TableName=TELEMETRY, Key=gone)
