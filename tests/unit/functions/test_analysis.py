@@ -11,6 +11,7 @@ import pytest
 
 from functions import analyse, evaluate, plan, present
 from functions.shared.kept import Kept
+from iort_analysis.archive.tables import read_table
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
@@ -127,6 +128,10 @@ def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) 
     assert first.estimates["lap_mean_s"].unit == "s"
     result = cloud.json(f"{drive_prefix(first.drive)}result.json")
     assert result["estimates"].keys() == first.estimates.keys()
+    file = cloud.s3.get_object(Bucket=BUCKET, Key=f"{drive_prefix(first.drive)}laps.parquet")
+    laps = read_table(file["Body"].read())
+    assert laps["time_s"][laps["best"]] == pytest.approx([first.estimates["lap_best_s"].value])
+    assert set(laps["method"]) == {"gate"}
 
 
 def test_only_new_drives_are_analysed_unless_again(cloud: Deployed) -> None:
