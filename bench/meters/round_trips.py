@@ -44,7 +44,7 @@ class RoundTrips:
     def __init__(
         self, bundles: Mapping[str, Bundle], floor: Bundle, namespace: str, port: int | None = None
     ) -> None:
-        self._uplinks = {path: _Connected(bundle, port) for path, bundle in bundles.items()}
+        self._uplinks = {path: Connected(bundle, port) for path, bundle in bundles.items()}
         self.raw = RawClient(floor.folder, port)
         self._topic = build_topic(PING, floor.robot, BROKER, namespace)
         self._exit = ExitStack()
@@ -94,10 +94,10 @@ class RoundTrips:
         return values
 
 
-class _Connected:
+class Connected:
     """The agent's uplink of a bundle, connected from `__enter__` to `__exit__`, to ``port`` if given."""
 
-    def __init__(self, bundle: Bundle, port: int | None) -> None:
+    def __init__(self, bundle: Bundle, port: int | None = None) -> None:
         self.config = load_config(bundle.config)
         self.clock = SystemClock()
         self.lost = 0
@@ -123,6 +123,11 @@ class _Connected:
     def __exit__(self, *_: object) -> None:
         self.uplink.stop(5.0)
 
+    def link(self) -> Link:
+        """The robot's link, without the agent's limit of its rate."""
+        limiter = RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9)
+        return Link(self.config.robot, self.config.namespace, self.uplink, self.clock, limiter)
+
     def measure(self, path: str, rate_hz: float, size: int, begins: float, seconds: float) -> list[float]:
         """Round trips over a path from then on, in milliseconds, by the agent's own pings."""
         trips: list[float] = []
@@ -132,9 +137,8 @@ class _Connected:
             if isinstance(value, (int, float)):
                 trips.append(float(value))
 
-        limiter = RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9)
         pings = Pings(
-            Link(self.config.robot, self.config.namespace, self.uplink, self.clock, limiter),
+            self.link(),
             PingConfig(rate_hz, (path,), max(0, size - _ENVELOPE)),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from itertools import product
 
 from bench.floors.raw_mqtt import tcp_connect_s
+from bench.meters.asking import asking, round_trips_ms
 from bench.meters.round_trips import RAW, RoundTrips
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
@@ -17,12 +18,15 @@ from bench.report.spread import ratio, rounded, text
 from bench.sections import thesis_ping
 from bench.target import Say, Target
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
+from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 
 SIZES = {"0.5 KB": 512, "5 KB": 5 * 1024, "50 KB": 50 * 1024, "127 KB": 127 * 1024 - 200}
 RATES_HZ = (1, 10, 50)
 REPEATS = 3
+# Within a robot's quota of an hour.
+_QUESTIONS, _QUESTIONS_HZ = 40, 10
 _LEAST, _LEAST_S = 12, 3.0
 # Round trips in ms by way, a list a repeat.
 Cell = dict[str, list[list[float]]]
@@ -48,11 +52,30 @@ def run(target: Target, say: Say) -> Section:
             cell = cells.setdefault((size, rate_hz), {name: [] for name in found})
             for name, values in found.items():
                 cell[name].append(values)
+    say(f"the question {CALIBRATION.name}")
+    with asking(target.robot("bench-ask")) as ask:
+        asked = round_trips_ms(ask, CALIBRATION.name, count=_QUESTIONS, rate_hz=_QUESTIONS_HZ)
     _report(section, cells, floors)
+    _report_questions(section, asked, cells)
     section.ratio("pings that did not come back", lines.lost, 0, unit="pings")
     if target.embedded is not None:
         thesis_ping.report(section, thesis_ping.measure(target, bundles, floor, say))
     return section
+
+
+def _report_questions(section: Section, asked: list[float], cells: dict[tuple[str, int], Cell]) -> None:
+    pinged = cells[("0.5 KB", _QUESTIONS_HZ)][LAMBDA]
+    section.table(
+        "A question to the cloud, beside a ping of 0.5 KB through Lambda at the same rate",
+        ["what", "round trip: median (p95, p99)"],
+        [[f"the question `{CALIBRATION.name}`", text([asked])], ["ping through Lambda", text(pinged)]],
+    )
+    times = ratio([asked], pinged)
+    section.ratio("round trip of a question / of a ping over lambda", times and round(times, 3), None)
+    section.notes.append(
+        f"The question {CALIBRATION.name} checks the deadline, counts in the robot's row and reads the "
+        f"findings: {_QUESTIONS} of them, of {CALIBRATION.per_hour} that a robot may ask in an hour."
+    )
 
 
 def seconds(rate_hz: float) -> float:

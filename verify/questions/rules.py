@@ -10,12 +10,14 @@ import uuid
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
+from iort_contract.messages.ask import Ask, decode_answer, encode_ask
 from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
-from iort_contract.topics import FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW
+from iort_contract.topics import ANSWER, ASK, FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW, build_topic
 from iort_station.fleet import registry
 from verify.question import Seen, question
 from verify.tools.robots import listener, pair_of
@@ -179,6 +181,31 @@ def upload_spoofed(target: Target) -> Seen:
         "key_is_its_own": answer.get("key") == file_key(pair.robot.name, file),
         "names_the_victim": pair.victim in json.dumps(answer),
     }
+
+
+@question(
+    "rules.ask_spoofed",
+    expected={"answered_its_own": True, "counted_as_its_own": True, "counted_as_the_victims": False},
+    source=f"{_SQL} and {_BINARY}",
+    relied_on_by=(_RULES, "functions/answer.py"),
+)
+def ask_spoofed(target: Target) -> Seen:
+    """The function answer answers the robot of the topic, and takes the question from its quota."""
+
+    def counted(robot: str) -> bool:
+        return CALIBRATION.count_attribute in registry.get(target.cloud, robot)
+
+    asked = Ask(uuid.uuid4().hex, time.time_ns() // 1000, 60_000, {})
+    with pair_of(target, "verify-spoofs-ask") as pair:
+        answers = build_topic(ANSWER, pair.robot.name, CALIBRATION.name, target.cloud.namespace)
+        pair.robot.subscribe(answers)
+        pair.send(ASK, CALIBRATION.name, encode_ask(asked))
+        topic, answer = pair.robot.next_message()
+        return {
+            "answered_its_own": (topic, decode_answer(answer).id) == (answers, asked.id),
+            "counted_as_its_own": counted(pair.robot.name),
+            "counted_as_the_victims": counted(pair.victim),
+        }
 
 
 @question(

@@ -67,6 +67,17 @@ class ArchiveFile:
             if self._overlaps(group, keys) and (part := self._part(group, wanted, keys, messages=messages)):
                 yield part
 
+    def span(self, hour: Hour) -> tuple[int, int]:
+        """Where an hour's bytes are in the file, from the first one to behind the last."""
+        columns = [
+            self._file.metadata.row_group(group).column(i)
+            for group in self.groups(hour)
+            for i in range(self._file.metadata.num_columns)
+        ]
+        starts = [one.dictionary_page_offset or one.data_page_offset for one in columns]
+        ends = [start + one.total_compressed_size for start, one in zip(starts, columns, strict=True)]
+        return min(starts), max(ends)
+
     def has_messages(self, hour: Hour | None = None) -> bool:
         """Whether batches hold ROS messages as they were published."""
         return any(

@@ -18,6 +18,8 @@ from iort_contract.messages.findings import DriveKey, Estimate, Finding
 FALSE_DISCOVERY_RATE = 0.05
 # With fewer earlier drives of its own, a robot is compared with the fleet; and with fewer robots, not at all.
 MIN_DRIVES = MIN_ROBOTS = 3
+# A baseline is of the newest drives: a car is repaired and changed.
+_RECENT = 50
 # A drive as unlikely as this takes no part in the baseline of the next one.
 _UNUSUAL = 1e-3
 # A trend needs so many drives, over so many days.
@@ -79,7 +81,7 @@ def _expected(
     parameter: Parameter, earlier: Sequence[Measured], fleet: Sequence[Measured]
 ) -> tuple[Baseline, str] | None:
     """The baseline of a parameter and whose it is; None if too few drives have it."""
-    own = [one.estimates[parameter.name] for one in earlier if parameter.name in one.estimates]
+    own = [one.estimates[parameter.name] for one in earlier if parameter.name in one.estimates][-_RECENT:]
     if len(own) >= MIN_DRIVES:
         return baseline(own, _spread(parameter, own)), "its own"
     having = (one for one in fleet if parameter.name in one.estimates)

@@ -84,11 +84,15 @@ class Questions:
         self._answers = f"{ANSWER}/{link.namespace}/{link.robot}/+"
         link.uplink.subscribe(self._answers, self._on_answer)
 
+    def ready(self) -> bool:
+        """Whether a question can reach the cloud, and its answer the robot."""
+        return self._link.uplink.connected() and self._link.uplink.subscribed(self._answers)
+
     def ask(self, name: str, body: Mapping[str, Any], timeout_s: float) -> Mapping[str, Any]:
         """The body of the answer. Raises `AskError`: when the cloud refuses, when no answer comes within
         ``timeout_s``, and at once without a connection."""
-        uplink, until = self._link.uplink, self._clock.monotonic() + timeout_s
-        if not (uplink.connected() and uplink.subscribed(self._answers)):
+        until = self._clock.monotonic() + timeout_s
+        if not self.ready():
             raise AskError(NOT_CONNECTED, "the robot is not connected to the cloud")
         request_id, wait = uuid.uuid4().hex, _Wait()
         with self._lock:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from math import ceil
 from typing import Any
 
+from iort_contract.catalog.questions import QUESTIONS
 from iort_station.cost.line_items import (
     METER,
     PUBNUB_UNIT,
@@ -44,6 +45,9 @@ SUBSCRIPTIONS = 8
 _SHADOW_MESSAGES = 3
 # `iort send` publishes, the robot receives and acknowledges.
 _COMMAND_MESSAGES = 3
+# The robot publishes; the function publishes, the robot receives and acknowledges. The function counts in the
+# robot's row and reads the newest drives' parameters, of some 1 KB each. The time is a calibration's.
+_QUESTION_MESSAGES, _QUESTION_MS, _QUESTION_READS, _ANSWER_LINE = 4, 30.0, 13, 260
 # The broker publishes when a connection begins and when it ends.
 _PRESENCE_EVENTS, _PRESENCE_MB, _PRESENCE_MS = 2, 256, 20.0
 
@@ -81,6 +85,7 @@ def _bill(usage: Usage) -> list[LineItem]:
         LineItem("IoT Core", "ping", "clock ping rule", "rule", clock),
         LineItem("IoT Core", "ping", "action", "action", clock),
     ]
+    items += _question_items(usage.questions_per_hour, all_lines=usage.function_logs == "all")
     items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
     writes = batches * units(sizes.telemetry_item, WRITE)
     # The batches of one stream in an event; one query reads them and those of the second before.
@@ -239,6 +244,29 @@ def _connecting(usage: Usage) -> list[LineItem]:
             all_lines=usage.function_logs == "all",
         ),
         LineItem("DynamoDB", lane, "robot's row written", "write", events),
+    ]
+
+
+def _question_items(asked: float, *, all_lines: bool) -> list[LineItem]:
+    """Questions that fit into a message, with their answers."""
+    if not asked:
+        return []
+    lane = "questions"
+    return [
+        LineItem("IoT Core", lane, "questions and answers", "message", _QUESTION_MESSAGES * asked),
+        LineItem("IoT Core", lane, "rule triggered", "rule", asked),
+        LineItem("IoT Core", lane, "action", "action", asked),
+        *function(
+            lane,
+            "answer",
+            asked,
+            memory_mb=max(question.memory_mb for question in QUESTIONS.values()),
+            billed_ms=_QUESTION_MS,
+            logged=asked * _ANSWER_LINE,
+            all_lines=all_lines,
+        ),
+        LineItem("DynamoDB", lane, "counted in the robot's row", "write", asked),
+        LineItem("DynamoDB", lane, "parameters read", "read", asked * _QUESTION_READS),
     ]
 
 

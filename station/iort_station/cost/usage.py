@@ -20,7 +20,8 @@ class Usage:
     """How a fleet is driven. The defaults are the agent's and the stacks' own.
 
     Of a robot: it has ``streams`` of ``rate_hz`` samples a second each, sends ``live_hz`` live messages and
-    ``ping_hz`` pings per path a second, and gets ``command_hz`` commands a second. A batch spans ``batch_s``.
+    ``ping_hz`` pings per path a second, gets ``command_hz`` commands a second and asks the cloud
+    ``questions_per_hour``. A batch spans ``batch_s``.
     The agent sends its metrics ``agent_every_s``.
 
     Of a deployment: items are kept ``retention_days``, and are ``recoverable`` to a point in time in stage
@@ -42,6 +43,7 @@ class Usage:
     agent_every_s: float = 10.0
     connects_per_hour: float = 1.0
     command_hz: float = 0.0
+    questions_per_hour: float = 0.0
     hours_per_day: float = 2.0
     viewers: int = 1
     retention_days: int = DEFAULT_RETENTION_DAYS
@@ -127,6 +129,7 @@ def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
         yield name, replace(usage, batch_s=batch_s)
     yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
     yield "commands at 10 Hz", replace(usage, command_hz=10.0)
+    yield "a question to the cloud every minute", replace(usage, questions_per_hour=60.0)
     yield "reconnecting every minute", replace(usage, connects_per_hour=60.0)
     yield "with Lambda's own log lines", replace(usage, function_logs="all")
     yield "kept for 30 days", replace(usage, retention_days=30)

@@ -17,7 +17,7 @@ from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.evaluation.student import quantile, tail
 from iort_analysis.evaluation.trends import US_PER_DAY, trend
 from iort_analysis.results import DriveResult, Event, Measured, Mined
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.findings import DriveKey, Estimate, Finding
 
 NAME = "battery_resistance_ohm"
 
@@ -104,6 +104,43 @@ def test_an_event_counts_by_its_chance_or_by_its_miner() -> None:
     )
     found = evaluate([result(0.03, likely, unlikely, judged)], drives(USUAL), [])
     assert [finding.from_us - at for finding in found] == [1, 2]
+
+
+def test_one_cause_is_one_finding() -> None:
+    usual = {"speed_to_erpm_gain": 4614.0, "rolling_current_a": 4.0, "voltage_drift_v": 0.0}
+    units = {"speed_to_erpm_gain": "erpm per m/s", "rolling_current_a": "A", "voltage_drift_v": "V"}
+
+    def estimates(**changes: float) -> dict[str, Estimate]:
+        return {
+            name: Estimate(value, value - 0.01, value + 0.01, units[name])
+            for name, value in {**usual, **changes}.items()
+        }
+
+    history = [Measured(key(day), estimates()) for day in range(5)]
+
+    def found(**changes: float) -> list[Finding]:
+        drive = key(100)
+        one = DriveResult(drive, drive.start_us + 600_000_000, 9, {}, Mined(estimates(**changes)))
+        return evaluate([one], history, [])
+
+    (friction,) = found(rolling_current_a=6.0)
+    assert friction.kind == "friction_added"
+    assert "The data cannot tell this from a softer ground" in friction.text
+    # A flat tyre rolls worse, too.
+    (tyre,) = found(rolling_current_a=6.0, speed_to_erpm_gain=4850.0)
+    assert tyre.kind == "tyre_flat"
+    assert "This goes with it: motor current that rolling takes" in tyre.text
+    # A sensor that drifts is no flat tyre.
+    assert [one.kind for one in found(voltage_drift_v=-0.4, speed_to_erpm_gain=4850.0)] == [
+        "sensor_drift",
+        "tyre_flat",
+    ]
+
+
+def test_a_parameter_that_nobody_knows_is_passed_over() -> None:
+    drive = result(0.03)
+    newer = Mined({**drive.mined.estimates, "of_another_version": ohms(1.0)})
+    assert evaluate([DriveResult(drive.drive, drive.end_us, 9, {}, newer)], drives(USUAL), []) == []
 
 
 @given(st.randoms(use_true_random=False))

@@ -19,13 +19,16 @@ from iort_analysis.results import Mined
 from iort_contract.messages.findings import Estimate
 
 VOLTAGE_DRIFT, CURRENT_DRIFT = "voltage_drift_v", "motor_current_drift_a"
-_STEP_S = 0.2
+_STEP_S, _LEAST_S = 0.2, 180.0
 # The error is a straight line between so many points of time, at least so far apart.
 _MOST_KNOTS, _KNOT_S = 8, 60.0
 
 
 def mine_drift(samples: Readings) -> Mined:
     """The drifts that the drive's fields allow."""
+    if samples.seconds[-1] < _LEAST_S:
+        reason = f"the drive must last {_LEAST_S:g} s"
+        return Mined(missing=dict.fromkeys((VOLTAGE_DRIFT, CURRENT_DRIFT), reason))
     steady = _steady(samples)
     fits = {VOLTAGE_DRIFT: _voltage(samples, steady), CURRENT_DRIFT: _current(samples, steady)}
     estimates = {name: found for name, found in fits.items() if found is not None}

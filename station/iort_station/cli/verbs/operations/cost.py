@@ -62,6 +62,9 @@ def cost_(
         float, typer.Option(help="Connections of a robot in an hour.")
     ] = _DEFAULT.connects_per_hour,
     command_hz: Annotated[float, typer.Option(help="Commands a second to a robot.")] = _DEFAULT.command_hz,
+    questions_per_hour: Annotated[
+        float, typer.Option(help="Questions of a robot to the cloud in an hour.")
+    ] = _DEFAULT.questions_per_hour,
     dashboard_hours: Annotated[
         float, typer.Option(help="Hours a month that the live page shows CloudWatch.")
     ] = _DEFAULT.dashboard_hours,
@@ -108,6 +111,7 @@ def cost_(
         summarize_ms=summarize_ms,
         connects_per_hour=connects_per_hour,
         command_hz=command_hz,
+        questions_per_hour=questions_per_hour,
         dashboard_hours=dashboard_hours,
         **rates,
     ).check()
