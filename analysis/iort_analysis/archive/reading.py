@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,7 +33,7 @@ class ArchiveFile:
     chooses one in the methods that take it; None is all.
     """
 
-    def __init__(self, source: bytes | BinaryIO) -> None:
+    def __init__(self, source: bytes | IO[bytes]) -> None:
         self._file = pq.ParquetFile(pa.BufferReader(source) if isinstance(source, bytes) else source)
         metadata = self._file.schema_arrow.metadata
         self._hours: dict[str, list[int]] = json.loads(metadata[HOURS])
