@@ -99,22 +99,21 @@ def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) 
     )
     indicators = {name: one for name, one in sorted(found.items()) if name in INDICATORS}
     section.table(
-        "Indicators, which are only compared with the car's own earlier drives",
+        "Indicators: only compared with the car's own earlier drives",
         head,
         [_coverage(name, one, good=True) for name, one in indicators.items()],
     )
     outside = [name for name, one in parameters.items() if not _covers(one)]
     section.ratio(
-        f"parameters of {len(parameters)} whose intervals do not hold the truth in {_COVERED[0]:g} to "
-        f"{_COVERED[1]:g} % of the drives",
+        f"parameters of {len(parameters)} whose intervals hold the truth less or more often than 85 to 95 %",
         len(outside),
         0.0,
         unit="parameters",
         tolerance=1.0,
     )
     section.notes.append(
-        "Widths and errors are in % of the truth. An indicator's interval says how well a drive repeats; a bias "
-        "that all drives share changes no finding."
+        "Widths and errors are in % of the truth. An indicator's interval says how well a drive repeats; "
+        "a bias that all drives share changes no finding."
     )
     if without:
         section.notes.append(f"The simulator has no single truth for {', '.join(without)}.")
