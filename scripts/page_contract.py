@@ -10,7 +10,7 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 
 from iort_contract import checks, limits, topics
 from iort_contract import page as served
-from iort_contract.catalog import vesc
+from iort_contract.catalog import findings, kinds, vesc
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
@@ -70,6 +70,8 @@ def _constants() -> Iterator[str]:
         topics: ("NAME",),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
+        kinds: ("ANALYSIS_FAILED",),
+        findings: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
         served: ("KEY_HEADER",),
     }.items():

@@ -6,7 +6,7 @@ import math
 import time
 from typing import TYPE_CHECKING
 
-from iort_contract.catalog.findings import GROUPS, KINDS, PARAMETERS
+from iort_contract.catalog.findings import GROUPS, KINDS, PARAMETERS, STYLE_GROUP
 from iort_contract.catalog.vesc import VESC_STREAM
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def drive(days_ago: int, *, failed: str = "", robot: str = "car-1") -> DriveEntr
     shares = [0.05, 0.16, 0.2, 0.12, 0.27, 0.14, 0.06]
     styles = {
         name: _estimate(share, share / 9, "1")
-        for name, share in zip((p.name for p in GROUPS["Driving style"]), shares, strict=True)
+        for name, share in zip((p.name for p in GROUPS[STYLE_GROUP]), shares, strict=True)
     }
     return {
         "robot": robot,

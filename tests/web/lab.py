@@ -117,6 +117,7 @@ class Lab:
             actions={
                 "acknowledge": self.acknowledge,
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
+                "analyse": lambda _: {"run": "iort-1"},
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
             },
         )

@@ -32,18 +32,28 @@ class Analysed(Lab):
     def __init__(self) -> None:
         super().__init__()
         self.analysed = True
+        self.polls = 0
 
     def answers(self) -> dict[str, Any]:
         extent = {"from_us": START, "to_us": END}
         part = {**extent, "batches": 90, "samples": 4500}
         run = {**extent, "run": "0badcafe", "state": "ended", "lost": 0, "streams": {"vesc": part}}
         runs = {"runs": [run], "older": False, "streams": {"vesc": extent}}
-        told = {"insights": self.insights, "runs": lambda _: runs}
+        told = {"insights": self.insights, "runs": lambda _: runs, "analysis": self.progress}
         of_car = {
             name: lambda asked, answer=answer: answer({**asked, "robot": "car"})
             for name, answer in laps.answers(driven_cloud()).items()  # type: ignore[arg-type]  # a fake
         }
         return {**super().answers(), **told, **of_car}
+
+    def analyse(self, asked: Mapping[str, str]) -> dict[str, str]:
+        self.asked.append(dict(asked))
+        return {"run": "iort-1"}
+
+    def progress(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        self.polls += 1
+        self.analysed = self.polls > 1
+        return {"running": not self.analysed, "drives": 1, "done": int(self.analysed)}
 
     def insights(self, asked: Mapping[str, str]) -> InsightsAnswer:
         told = insights(asked)
@@ -61,7 +71,9 @@ def lab() -> Analysed:
 @pytest.fixture
 def server(pubnub: PubNubStandIn, lab: Analysed) -> Iterator[PageServer]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=lab.answers(), **told) as server:
+    with PageServer(
+        namespace="iort", answers=lab.answers(), actions={"analyse": lab.analyse}, **told
+    ) as server:
         yield server
 
 
@@ -118,8 +130,11 @@ def test_before_the_first_analysis_the_page_says_so_and_shows_the_laps_of_the_ne
     lab.analysed = False
     page = open_page(f"{server.url}#/insights/car-1", timezone_id="UTC")
     laps_found(page)
-    assert (
-        "No drive of car-1 has been analysed yet"
-        in page.locator(".insights-view .history-note").first.inner_text()
-    )
+    note = page.locator(".insights-view .history-note").first
+    assert "No drive of car-1 has been analysed yet" in note.inner_text()
     assert page.locator(".finding").count() == 0
+    page.get_by_label("Drives of the last").select_option("last 7 days")
+    page.get_by_role("button", name="Analyse").click()
+    until(lambda: "0 of 1 drives are analysed" in note.inner_text(), "the progress")
+    page.locator(".finding").first.wait_for()
+    assert lab.asked == [{"robot": "car-1", "last_s": "604800"}]

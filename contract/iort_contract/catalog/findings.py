@@ -40,6 +40,7 @@ STYLES = {
     "steady slow": "a lower speed, held",
 }
 STYLE_TABLE = "style"
+STYLE_GROUP = "Driving style"
 _STYLES = tuple(
     Parameter(f"style_{style.replace(' ', '_')}_share", "1", f"share of time: {meaning}")
     for style, meaning in STYLES.items()
@@ -134,6 +135,6 @@ GROUPS = {
     "Heat": HEAT,
     "Sensors": _SENSORS,
     "Laps": _LAPS,
-    "Driving style": _STYLES,
+    STYLE_GROUP: _STYLES,
 }
 PARAMETERS = {parameter.name: parameter for group in GROUPS.values() for parameter in group}

@@ -41,22 +41,37 @@ def start(cloud: Cloud, request: AnalysisRequest) -> str:
     return str(answer["executionArn"])
 
 
+def named(cloud: Cloud, name: str) -> str:
+    """The ARN of a run by its name."""
+    machine = cloud.output("analysis", "AnalysisMachine")
+    return f"{machine.replace(':stateMachine:', ':execution:')}:{name}"
+
+
 def watch(cloud: Cloud, run: str) -> Iterator[Progress]:
     """The progress of a run, every second until its end; raises `StationError` if it fails."""
-    client = cloud.client("stepfunctions")
     while True:
+        found = look(cloud, run)
+        yield found
+        if found.state != RUNNING:
+            return
+        time.sleep(_POLL_S)
+
+
+def look(cloud: Cloud, run: str) -> Progress:
+    """The progress of a run now; raises `StationError` if it has failed, or if there is no such run."""
+    client = cloud.client("stepfunctions")
+    try:
         described = client.describe_execution(executionArn=run)
-        state = described["status"]
-        counts = _counts(client, run)
-        if state == RUNNING:
-            yield Progress(state, *counts)
-            time.sleep(_POLL_S)
-            continue
-        if state != SUCCEEDED:
-            reason = described.get("cause") or described.get("error") or state
-            raise StationError(f"the analysis has ended: {state.lower()}: {reason}")
-        yield Progress(state, *counts, findings=int(json.loads(described["output"])["findings"]))
-        return
+    except ClientError as error:
+        raise StationError(f"the analysis {run.rpartition(':')[2]} cannot be read: {error}") from error
+    state = described["status"]
+    counts = _counts(client, run)
+    if state == RUNNING:
+        return Progress(state, *counts)
+    if state != SUCCEEDED:
+        reason = described.get("cause") or described.get("error") or state
+        raise StationError(f"the analysis has ended: {state.lower()}: {reason}")
+    return Progress(state, *counts, findings=int(json.loads(described["output"])["findings"]))
 
 
 def _counts(client: Any, run: str) -> tuple[int | None, int]:

@@ -60,6 +60,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
         "rejected": lambda _asked: alarms.rejected(cloud),
         "insights": lambda asked: insights.insights(cloud, asked),
+        "analysis": lambda asked: insights.progress(cloud, asked),
         **laps.answers(cloud),
     }
 

@@ -17,6 +17,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import commands, registry
 from iort_station.fleet import settings as fleet_settings
 from iort_station.fleet.shadow import Shadow, State
+from iort_station.page import insights
 from iort_station.page.parameters import text, whole
 from iort_station.page.server import Answer
 
@@ -25,11 +26,12 @@ _ANSWER_S = 10.0
 
 
 def actions(cloud: Cloud) -> dict[str, Answer]:
-    """What moves or changes a robot, by its name; only for a server on loopback."""
+    """What moves or changes a robot, or costs something, by its name; only for a server on loopback."""
     return {
         "send": lambda asked: send(cloud, asked),
         "settings": lambda asked: settings(cloud, asked),
         "set": lambda asked: change(cloud, asked),
+        "analyse": lambda asked: insights.analyse(cloud, asked),
     }
 
 

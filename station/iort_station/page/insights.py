@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 from iort_contract.catalog.findings import GROUPS, KINDS
-from iort_contract.messages.analysis import AnalysedDrive
+from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.messages.analysis import MAX_RANGE_US, AnalysedDrive, AnalysisRequest
 from iort_contract.messages.findings import Estimate, Finding
 from iort_contract.messages.insights import (
+    AnalysisAnswer,
+    AnalysisStarted,
     DriveEntry,
     EstimateEntry,
     FindingEntry,
@@ -19,8 +23,9 @@ from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored
 from iort_station.fleet import registry
+from iort_station.operations import analysis
+from iort_station.page.parameters import text, whole
 
-FAILED = "analysis_failed"
 # What is shown of a robot, and of each one of the fleet.
 _DRIVES, _FINDINGS = 60, 60
 _FLEET_DRIVES, _FLEET_FINDINGS = 3, 10
@@ -50,6 +55,21 @@ def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
             for group, parameters in GROUPS.items()
         },
     }
+
+
+def analyse(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisStarted:
+    """Start an analysis of the drives of the last ``last_s``: of ``robot``, or of all robots without one."""
+    last_us = whole(asked, "last_s", 1, MAX_RANGE_US // 1_000_000) * 1_000_000
+    robots = (check_robot(asked["robot"]),) if asked.get("robot") else ()
+    now_us = time.time_ns() // 1000
+    run = analysis.start(cloud, AnalysisRequest(robots, now_us - last_us, now_us, again=True))
+    return {"run": run.rpartition(":")[2]}
+
+
+def progress(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisAnswer:
+    """How far the ``run`` of an analysis is; raises `StationError` if it has failed."""
+    found = analysis.look(cloud, analysis.named(cloud, text(asked, "run")))
+    return {"running": found.state == analysis.RUNNING, "drives": found.drives, "done": found.done}
 
 
 def estimate(of: Estimate) -> EstimateEntry:
@@ -111,5 +131,5 @@ def _failed(findings: Iterable[Finding]) -> list[DriveEntry]:
             "missing": {},
         }
         for finding in findings
-        if finding.kind == FAILED
+        if finding.kind == ANALYSIS_FAILED
     ]

@@ -89,3 +89,58 @@ def test_a_range_without_laps_says_why():
     told = laps.answers(driven_cloud())["laps"]({**WHOLE, "to_us": str(START + 10_000_000)})
     assert told["laps"] == []
     assert told["reason"].startswith("no laps: ")
+
+
+class StepFunctions:
+    """The state machine, which has three drives to analyse."""
+
+    def __init__(self):
+        self.started = []
+        self.status = "RUNNING"
+
+    def start_execution(self, **given):
+        self.started.append(json.loads(given["input"]))
+        return {"executionArn": f"arn:aws:states:eu-west-1:1:execution:iort-analysis:{given['name']}"}
+
+    def describe_execution(self, executionArn):
+        assert executionArn.startswith("arn:aws:states:eu-west-1:1:execution:iort-analysis:iort-")
+        return {"status": self.status, "output": '{"findings": 2}', "cause": "the plan has failed"}
+
+    def list_map_runs(self, **_given):
+        return {"mapRuns": [{"mapRunArn": "map"}]}
+
+    def describe_map_run(self, **_given):
+        return {"itemCounts": {"total": 3, "succeeded": 1, "failed": 1}}
+
+
+class Analysing:
+    """A cloud with the state machine alone."""
+
+    def __init__(self):
+        self.machine = StepFunctions()
+
+    def client(self, _service):
+        return self.machine
+
+    def output(self, _noun, _name):
+        return "arn:aws:states:eu-west-1:1:stateMachine:iort-analysis"
+
+
+def test_an_analysis_is_started_and_followed_by_its_name():
+    cloud = Analysing()
+    run = insights.analyse(cloud, {"robot": "car", "last_s": "86400"})["run"]
+    (asked,) = cloud.machine.started
+    assert asked["robots"] == ["car"]
+    assert asked["end_us"] - asked["start_us"] == DAY_US
+    assert insights.progress(cloud, {"run": run}) == {"running": True, "drives": 3, "done": 2}
+    cloud.machine.status = "SUCCEEDED"
+    assert insights.progress(cloud, {"run": run})["running"] is False
+    cloud.machine.status = "FAILED"
+    with pytest.raises(StationError, match="failed: the plan has failed"):
+        insights.progress(cloud, {"run": run})
+
+
+def test_an_analysis_of_the_fleet_names_no_robot():
+    cloud = Analysing()
+    insights.analyse(cloud, {"last_s": "60"})
+    assert cloud.machine.started[0]["robots"] == []

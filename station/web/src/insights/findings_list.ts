@@ -1,6 +1,6 @@
 // What the analysis found: what changed, by how much, what to do, and where to look.
 
-import type { FindingEntry } from "../base/contract";
+import { ANALYSIS_FAILED, type FindingEntry } from "../base/contract";
 import { el, marked } from "../base/dom";
 import { capital, dayTime, number, zone } from "../base/format";
 import { writeTime } from "../base/range";
@@ -8,12 +8,11 @@ import { route } from "../base/route";
 import { changed, intervalBar, words } from "./figures";
 
 const SEVERITIES = { serious: 0, warning: 1, info: 2 } as const;
-/** The kind of a drive that could not be analysed; the list of drives has it. */
-export const FAILED = "analysis_failed";
 
 /** The findings, the serious ones first and then the newest; `named` tells whose each is. */
 export function findingsList(findings: readonly FindingEntry[], named: boolean): HTMLElement {
-  const shown = findings.filter(({ kind }) => kind !== FAILED).sort((a, b) => SEVERITIES[a.severity] - SEVERITIES[b.severity] || b.from_us - a.from_us);
+  // The list of drives has those that failed.
+  const shown = findings.filter(({ kind }) => kind !== ANALYSIS_FAILED).sort((a, b) => SEVERITIES[a.severity] - SEVERITIES[b.severity] || b.from_us - a.from_us);
   return el("ul", { class: "findings" }, ...shown.map((finding) => item(finding, named)));
 }
 
@@ -21,7 +20,7 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
   const { robot, kind, severity, meaning, action, text, stream, fields, q, effect, from_us, to_us } = finding;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
   const query = { ...(stream ? { stream } : {}), from: writeTime(from), to: writeTime(Math.max(to, from + 1)), ...(fields.length > 0 ? { fields: fields.join(",") } : {}) };
-  const chance = q === null ? [] : [el("span", { class: "note", title: "The share of false findings among those that count as sure as this one" }, `false alarms: ${number(q * 100, q < 0.001 ? 3 : 1)} % at most`)];
+  const chance = q === null ? [] : [el("span", { class: "note", title: "The share of false findings among those that count as sure as this one" }, `false alarms: ${q < 1e-5 ? "less than 0.001" : `${number(q * 100, q < 0.001 ? 3 : 1)}`} % of such findings`)];
   return el(
     "li",
     { class: "panel finding", "data-severity": severity, "data-kind": kind },

@@ -9,6 +9,7 @@ import { digits, intervalBar, scale, words } from "./figures";
 const DAY_S = 86_400;
 // The charts' room around the first and the last drive, as a share of the time between them.
 const MARGIN = 0.04;
+const WIDE = window.matchMedia("(min-width: 48rem)");
 
 export class Parameters {
   readonly node = el("div", { class: "insights-groups" });
@@ -24,8 +25,12 @@ export class Parameters {
       const lacking = Object.keys(parameters).flatMap((name) => (sound[0]?.missing[name] ? [[parameters[name]!.meaning, sound[0].missing[name]] as const] : []));
       if (known.length === 0 && lacking.length === 0) continue;
       const cards = el("div", { class: "parameters" });
-      this.node.append(el("section", { "aria-label": `${group} over the drives` }, el("h3", { class: "group-name" }, group), cards, ...(lacking.length > 0 ? [missing(lacking)] : [])));
+      const count = el("span", { class: "note" }, ` ${known.length}`);
+      const fold = el("details", {}, el("summary", { class: "group-name" }, el("h3", {}, group), count), cards, ...(lacking.length > 0 ? [missing(lacking)] : []));
+      this.node.append(fold);
       for (const [name, parameter] of known) this.card(cards, name, parameter, sound, findings);
+      // A narrow screen shows what has changed.
+      fold.open = WIDE.matches || cards.querySelector("[data-severity]:not([data-severity=''])") !== null;
     }
   }
 

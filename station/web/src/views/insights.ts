@@ -1,6 +1,6 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
+import { STYLE_GROUP, type Config, type Extent, type InsightsAnswer, type RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { dayTime, zone } from "../base/format";
 import { readTime, writeTime, type Range } from "../base/range";
@@ -12,9 +12,6 @@ import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { styles } from "../insights/styles";
 import { ask, AnswerError } from "../server/answers";
-
-/** Groups of the catalogue that are shown in a way of their own. */
-const STYLE_GROUP = "Driving style";
 
 export class InsightsView {
   readonly node: HTMLElement;
