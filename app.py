@@ -16,6 +16,7 @@ except ModuleNotFoundError as missing:
 
 from stacks.account import Account
 from stacks.analysis import Analysis
+from stacks.archive import Archive
 from stacks.checks.acknowledged import Acknowledged, acknowledge
 from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.fleet import Fleet
@@ -36,8 +37,9 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
     called = {"presence": fleet.presence}
     processing = Processing(app, settings, storage=storage, quarantine=quarantine, called=called)
     Ingest(app, settings, storage=storage, quarantine=quarantine, functions=processing.called)
+    archive = Archive(app, settings, storage=storage, quarantine=quarantine)
     analysis = Analysis(app, settings, storage=storage, alarms=processing.alarms)
-    watched = (storage, quarantine, fleet, processing, analysis)
+    watched = (storage, quarantine, fleet, processing, archive, analysis)
     Monitoring(app, settings, stacks=watched, topic=processing.alarms)
     if settings.site:
         Site(app, settings)

@@ -25,6 +25,7 @@ from functions.shared.environment import variables
 from functions.shared.metrics import emit
 from functions.shared.summary.share import waiting
 from iort_contract import tables
+from iort_contract.archive import HOUR, TASK
 from iort_contract.catalog.environments import QuarantineEnvironment
 from iort_contract.limits import ContractError
 from iort_contract.messages.event import event_message
@@ -94,6 +95,10 @@ def entries(body: str, records: Records) -> list[Entry]:
             ]
         if "requestPayload" in document:
             return [_of_invocation(document)]
+        if TASK in document:
+            about = f"{document[TASK]} {document.get(HOUR, '')}".strip()
+            reason = f"the archive failed in five attempts: {about}"
+            return [Entry(BY_FUNCTION, str(document.get(TOPIC, "")), reason, body.encode())]
         if tables.PUT_OFF in document:
             topic, _ = waiting(body)[0]
             return [Entry(BY_LATER, topic, "put off, and not summarised in five attempts", body.encode())]

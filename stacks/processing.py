@@ -13,6 +13,7 @@ from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
 
+from iort_contract.archive import DUE_MS, HOUR
 from iort_contract.catalog.environments import (
     AlertEnvironment,
     AnswerEnvironment,
@@ -28,7 +29,7 @@ from iort_contract.catalog.rules import RULES, Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
-from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
+from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS, TOPIC
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
@@ -158,6 +159,7 @@ class Processing(PlatformStack):
             telemetry_table=self._storage.telemetry.table_name,
             summary_table=self._storage.summary.table_name,
             robots_table=self._storage.robots.table_name,
+            archive_table=self._storage.archive.table_name if self.settings.archive else "",
             rejected_queue=self._rejected.queue_url,
             robot_metrics=self.settings.robot_metrics,
         )
@@ -178,6 +180,8 @@ class Processing(PlatformStack):
         self._storage.summary.grant(made, "dynamodb:BatchWriteItem")
         self._storage.robots.grant(made, "dynamodb:GetItem")
         self._storage.may_keep(made, STREAMS)
+        if self.settings.archive:
+            self._storage.may_change(self._storage.archive, made, TOPIC, HOUR, DUE_MS)
         return made
 
     def _query(self) -> None:

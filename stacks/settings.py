@@ -128,6 +128,11 @@ class Settings(BaseModel):
     retention_days: Annotated[int, _whole(1, 3650)] = Field(
         default=DEFAULT_RETENTION_DAYS, description="lifetime of telemetry and summaries"
     )
+    archive: Flag = Field(
+        default=True,
+        description="finished hours of telemetry go to Parquet in the bucket before they expire, and stay: "
+        "[the archive](archive.md). `false`: no more hours do",
+    )
     files_days: Annotated[int, _whole(0, 3650)] = Field(
         default=0, description="lifetime of uploaded files; 0: for good"
     )

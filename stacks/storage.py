@@ -1,4 +1,4 @@
-"""The telemetry, summary, robots, quarantine and findings tables, and the files' bucket."""
+"""The tables of telemetry, summary, robots, archive, quarantine and findings, and the files' bucket."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 
+from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, T_US, TOPIC
@@ -23,7 +24,7 @@ _TEXT = dynamodb.AttributeType.STRING
 
 
 class Storage(PlatformStack):
-    """Five tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
+    """Six tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
     time. The quarantine has one item per message, by robot, and the findings one per finding and drive.
 
     All other stacks use ``encryption`` for their resources.
@@ -46,6 +47,8 @@ class Storage(PlatformStack):
             self._old_telemetry()
         self.summary = self._table("Summary", partition=TOPIC, sort=SECOND, expires=True)
         self.robots = self._table("Robots", partition=ROBOT)
+        # A row an hour of a stream, and the marks of what is to be archived.
+        self.archive = self._table("Archive", partition=TOPIC, sort=HOUR, sort_type=_TEXT)
         self.quarantine = self._table(
             "Quarantine", partition=ROBOT, sort=ENTRY, sort_type=_TEXT, expires=True
         )
@@ -107,11 +110,16 @@ class Storage(PlatformStack):
         Source: DynamoDB, "Using IAM policy conditions for fine-grained access control". The condition only
         protects attributes that the answer may not return.
         """
+        self.may_change(self.robots, role, ROBOT, *attributes)
+
+    @staticmethod
+    def may_change(table: dynamodb.Table, role: iam.IGrantable, *attributes: str) -> None:
+        """Let a role change only these attributes of a table's items; the keys are among them."""
         statement = iam.PolicyStatement(
             actions=["dynamodb:UpdateItem"],
-            resources=[self.robots.table_arn],
+            resources=[table.table_arn],
             conditions={
-                "ForAllValues:StringLike": {"dynamodb:Attributes": sorted({ROBOT, *attributes})},
+                "ForAllValues:StringLike": {"dynamodb:Attributes": sorted({*attributes})},
                 "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE", "UPDATED_NEW", "UPDATED_OLD"]},
             },
         )
@@ -125,6 +133,12 @@ class Storage(PlatformStack):
             s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
             s3.LifecycleRule(id="plans", prefix=PLANS_PREFIX, expiration=Duration.days(7)),
         ]
+        # Read at once as ever, stored at a sixth of the price, and kept for good.
+        rarest = s3.Transition(
+            storage_class=s3.StorageClass.GLACIER_INSTANT_RETRIEVAL,
+            transition_after=Duration.days(_RARE_AFTER_DAYS),
+        )
+        rules.append(s3.LifecycleRule(id="archive", prefix=ARCHIVE_PREFIX, transitions=[rarest]))
         days = self.settings.files_days
         if not 0 < days <= _RARE_AFTER_DAYS:
             rare = s3.Transition(

@@ -25,12 +25,7 @@ class FakeS3:
 
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
-        self.read_bytes = 0
-
-    def head_object(self, *, Bucket: str, Key: str) -> dict[str, Any]:
-        assert Bucket
-        body = self._body(Key)
-        return {"ContentLength": len(body), "ETag": str(hash(body))}
+        self.reads: list[tuple[int, int]] = []
 
     def get_object(
         self, *, Bucket: str, Key: str, Range: str = "bytes=0-", IfMatch: str | None = None
@@ -40,9 +35,11 @@ class FakeS3:
         if IfMatch not in {None, str(hash(body))}:
             raise ClientError({"Error": {"Code": "PreconditionFailed"}}, "GetObject")
         first, _, last = Range.removeprefix("bytes=").partition("-")
-        part = body[int(first) : int(last) + 1 if last else None]
-        self.read_bytes += len(part)
-        return {"Body": io.BytesIO(part)}
+        start = int(first) if first else max(0, len(body) - int(last))
+        end = int(last) + 1 if first and last else len(body)
+        self.reads.append((start, end))
+        content_range = f"bytes {start}-{end - 1}/{len(body)}"
+        return {"Body": io.BytesIO(body[start:end]), "ETag": str(hash(body)), "ContentRange": content_range}
 
     def _body(self, key: str) -> bytes:
         if key not in self.objects:

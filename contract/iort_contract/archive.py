@@ -10,10 +10,10 @@ import json
 import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
-from typing import Any, Iterable, Mapping, NamedTuple
+from typing import Any, Iterable, Iterator, Mapping, NamedTuple
 
 from iort_contract.checks import checked, integer, text
-from iort_contract.dynamodb import Item, Keys, TopicTable, plain
+from iort_contract.dynamodb import Item, Keys, TelemetryTable, TopicTable, plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, ENVELOPE, TOPIC
 from iort_contract.topics import Topic
@@ -21,10 +21,20 @@ from iort_contract.topics import Topic
 ARCHIVE_PREFIX = "archive/"
 # The manifest's sort key: the hour, such as 2026-11-22T07.
 HOUR = "hour"
-# The manifest's partition of the hours that are not archived yet. The sort key is the hour, `#` and the
-# topic; a row has the newest receipt of a batch.
-PENDING = "pending"
-NEWEST_MS = "newest_ms"
+# The manifest's partition of what is to be done: an hour to archive, or a day whose hours are to be joined.
+# The sort key is the hour or the date, `#` and the topic. It stands for all batches that Lambda 2 saw before
+# ``due_ms``.
+PENDING, DUE_MS = "pending", "due_ms"
+# In a pending row: until then no item of the hour expires, since its expiry was put off.
+SAFE_UNTIL_S = "safe_until_s"
+# An hour is over for this long before it is archived, and a day before its hours are joined, so that late
+# batches seldom rewrite anything.
+HOUR_REST_MS, DAY_REST_MS = 600_000, 36 * 3_600_000
+# In an event or a queue message of the archive's function: what to do.
+TASK = "archive"
+DUE, SWEEP, ARCHIVE, JOIN, PUT_OFF = "due", "sweep", "hour", "day", "put off"
+# With `SWEEP` of a topic: all its hours, not only those that expire soon.
+ALL = "all"
 HOUR_US = 3_600_000_000
 _HOUR = re.compile(r"\d{4}-\d\d-\d\dT\d\d")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -144,6 +154,22 @@ def hours_between(first: Hour | None, last: Hour | None) -> Keys:
     return Keys({"S": low}, {"S": high}, low > high)
 
 
+def stored_hours(table: TelemetryTable, topic: str, until_us: int) -> Iterator[Hour]:
+    """The hours of a topic that have stored items and are over by a time; a query each."""
+    from_us = 0
+    while True:
+        keys = starting_between(from_us, until_us)
+        page = next(table.pages(topic, keys, attributes=(BATCH,), page_items=1), None)
+        if page is None or not page.items:
+            return
+        # An invalid key still begins with a time.
+        hour = hour_of(int(page.items[0][BATCH]["S"][:16]))
+        if hour.end_us > until_us:
+            return
+        yield hour
+        from_us = hour.end_us
+
+
 def item_hash(item: Item) -> str:
     """The hash of a stored item's content: 16 hex digits. A batch that was sent twice keeps its hash."""
     if HASH in item:
@@ -160,12 +186,35 @@ def content_hash(hashes: Iterable[tuple[str, str]]) -> str:
     return whole.hexdigest()
 
 
-def pending_key(topic: str, hour: Hour) -> Item:
-    """The key of the row that says that an hour is to be archived."""
-    return {TOPIC: {"S": PENDING}, HOUR: {"S": f"{hour}#{topic}"}}
+class Pending(NamedTuple):
+    """A pending row: a topic, and the hour or the date."""
+
+    topic: str
+    period: str
+
+    @property
+    def key(self) -> Item:
+        """Its key in the manifest."""
+        return {TOPIC: {"S": PENDING}, HOUR: {"S": f"{self.period}#{self.topic}"}}
+
+    @property
+    def is_day(self) -> bool:
+        """Whether it is a day."""
+        return len(self.period) == len("2026-11-22")
+
+    def due_ms(self, now_ms: int) -> int:
+        """When to do what is noted now: after the period's rest, and after batches that may still follow.
+
+        Items of a car whose clock is ahead would expire before the hour comes, so they do not wait for it.
+        """
+        start_ms = parse_hour(f"{self.period}T00" if self.is_day else self.period).start_us // 1000
+        hours, rest_ms = (24, DAY_REST_MS) if self.is_day else (1, HOUR_REST_MS)
+        over_ms = start_ms + hours * HOUR_US // 1000 + rest_ms
+        soon_ms = now_ms + HOUR_REST_MS
+        return soon_ms if start_ms > now_ms + HOUR_US // 1000 else max(over_ms, soon_ms)
 
 
-def parse_pending(item: Item) -> tuple[str, Hour]:
-    """The topic and the hour of such a row; raises `ContractError`."""
-    hour, _, topic = str(item[HOUR]["S"]).partition("#")
-    return topic, parse_hour(hour)
+def parse_pending(item: Item) -> Pending:
+    """Decode the key of a pending row."""
+    period, _, topic = str(item[HOUR]["S"]).partition("#")
+    return Pending(topic, period)

@@ -11,6 +11,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
+from functions.shared.archive.marks import Marks
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
@@ -51,10 +52,12 @@ def attribute(value: Statistics) -> dict[str, Any]:
 
 
 class Tables:
-    """The three tables of Lambda 2; ``client`` is a boto3 DynamoDB client or a fake of it."""
+    """The tables of Lambda 2; ``client`` is a boto3 DynamoDB client or a fake of it."""
 
-    def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str) -> None:
+    def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str, archive: str = "") -> None:
         self._client = client
+        # Without an archive, nothing is marked for it.
+        self.marks = Marks(client, archive) if archive else None
         self.telemetry, self._summary = TelemetryTable(client, telemetry), SummaryTable(client, summary)
         self._robots = robots
         self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}

@@ -22,6 +22,7 @@ FLIPS: dict[str, dict[str, Any]] = {
     "old table": {"old_telemetry": True},
     "properties": {
         "retention_days": 7,
+        "archive": False,
         "files_days": 30,
         "upload_gb_a_day": 5,
         "live_concurrency": 5,

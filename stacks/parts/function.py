@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration
+from aws_cdk import CfnOutput, Duration, Size
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_lambda_destinations as destinations
@@ -29,12 +29,14 @@ def function(
     *,
     memory_mb: int = 256,
     timeout_s: int = 10,
+    scratch_mb: int | None = None,
     layers: list[lambda_.ILayerVersion] | None = None,
     reserved_concurrency: int = 0,
 ) -> lambda_.Function:
     """The handler of ``functions/<name in lower case>.py``. Its role may only write its own log so far.
 
-    The stack outputs its name as ``<name>Function``. A ``reserved_concurrency`` of 0 reserves nothing.
+    The stack outputs its name as ``<name>Function``. ``scratch_mb`` is the size of /tmp, 512 without one. A
+    ``reserved_concurrency`` of 0 reserves nothing.
     """
     log = logs.LogGroup(
         stack,
@@ -58,6 +60,7 @@ def function(
         **_logged(stack.settings),
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
+        ephemeral_storage_size=Size.mebibytes(scratch_mb) if scratch_mb else None,
         environment=environment.variables(),
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from iort_contract.archive import ARCHIVE_PREFIX, DUE_MS, HOUR
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
-from iort_contract.tables import PRESENCE, STREAMS
+from iort_contract.tables import BATCH, EXPIRES_S, PRESENCE, STREAMS, TOPIC
 from iort_contract.topics import SHADOW
 from stacks.checks.invariants import EVERY_RESOURCE
 
@@ -77,7 +78,9 @@ SUMMARIZES = {
     ("dynamodb:BatchWriteItem", "Summary.Arn"),
     ("dynamodb:GetItem", "Robots.Arn"),
     ("dynamodb:UpdateItem", "Robots.Arn"),
+    ("dynamodb:UpdateItem", "Archive.Arn"),
 }
+CONSUME = ("ReceiveMessage", "DeleteMessage", "ChangeMessageVisibility", "GetQueueAttributes", "GetQueueUrl")
 # Permissions of the functions that find and analyse drives.
 READS_DRIVES = {("dynamodb:Query", "Batches.Arn"), ("dynamodb:GetItem", "Robots.Arn")}
 # For every role: each action on each resource, and who may assume it.
@@ -112,15 +115,25 @@ ROLES = {
         {(action, "LaterLog.Arn") for action in LOG}
         | SUMMARIZES
         | {("dynamodb:GetItem", "Batches.Arn")}
-        | {
-            (f"sqs:{action}", "PutOff.Arn")
-            for action in (
-                *("ReceiveMessage", "DeleteMessage", "ChangeMessageVisibility"),
-                *("GetQueueAttributes", "GetQueueUrl"),
-            )
-        }
+        | {(f"sqs:{action}", "PutOff.Arn") for action in CONSUME}
         | DESTINATION,
     ),
+    "ArchiveRole": (
+        "lambda.amazonaws.com",
+        {(action, "ArchiveLog.Arn") for action in LOG}
+        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:UpdateItem", "Batches.Arn")}
+        | {
+            (f"dynamodb:{action}", "Archive.Arn")
+            for action in ("GetItem", "PutItem", "UpdateItem", "DeleteItem", "Query")
+        }
+        | {("dynamodb:Scan", "Robots.Arn"), ("s3:ListBucket", "Files.Arn")}
+        | {
+            (f"s3:{action}", f"Files.Arn/{ARCHIVE_PREFIX}*")
+            for action in ("DeleteObject", "GetObject", "PutObject")
+        }
+        | {(f"sqs:{action}", "ArchiveTasks.Arn") for action in ("SendMessage", *CONSUME)},
+    ),
+    "ScheduleRole": ("scheduler.amazonaws.com", {("lambda:InvokeFunction", "Archive.Arn")}),
     "EchoRole": (
         "lambda.amazonaws.com",
         {(action, "EchoLog.Arn") for action in LOG}
@@ -258,4 +271,10 @@ KEEPS = {
     "SummarizeRole": (STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
     "AnswerRole": ("asked_*",),
+}
+# The attributes of other items that a function may change, by its role and the table.
+CHANGES = {
+    ("ArchiveRole", "Batches.Arn"): (BATCH, EXPIRES_S, TOPIC),
+    ("LaterRole", "Archive.Arn"): (DUE_MS, HOUR, TOPIC),
+    ("SummarizeRole", "Archive.Arn"): (DUE_MS, HOUR, TOPIC),
 }

@@ -58,7 +58,7 @@ def test_app_py_runs_without_credentials_and_is_reproducible(tmp_path, layer):
         {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.template.json")}
         for name in ("one", "two")
     )
-    assert len(one) == 7
+    assert len(one) == 8
     assert one == two
     assert not any(str(tmp_path).encode() in template for template in one.values())
 

@@ -14,6 +14,7 @@ from stacks.checks.invariants import EVERY_RESOURCE
 from stacks.parts.documents import provisioning_template
 from tests.stacks.roles import (
     CERTIFICATES,
+    CHANGES,
     IOT,
     KEEPS,
     NOT_REGISTERED,
@@ -36,11 +37,14 @@ def test_every_role_has_exactly_its_listed_permissions(synthesized, reader):
             assert statement["Effect"] == "Allow"
             if "Condition" in statement:
                 assert statement["Action"] == "dynamodb:UpdateItem"
+                table = reader.text(statement["Resource"])
+                of_robots = table == "Robots.Arn"
+                attributes = {"robot", *KEEPS[role]} if of_robots else CHANGES[role, table]
                 assert statement["Condition"] == {
-                    "ForAllValues:StringLike": {"dynamodb:Attributes": sorted({"robot", *KEEPS[role]})},
+                    "ForAllValues:StringLike": {"dynamodb:Attributes": sorted(attributes)},
                     "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE", "UPDATED_NEW", "UPDATED_OLD"]},
                 }
-                conditional.add(role)
+                conditional |= {role} if of_robots else set()
             for action in reader.texts(statement["Action"]):
                 granted[role] |= {(action, resource) for resource in reader.texts(statement["Resource"])}
     assert granted == {role: actions for role, (_, actions) in ROLES.items()}
@@ -126,7 +130,7 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 # whether a certificate was registered.
                 known = (
                     r":topic/(pong|answer)/iort/\*/\*?|:thing/\*/agent$"
-                    r"|/(robots|results|ask|plans|analysis)/\*$|/analysis/robot=\*$|:AWSIotLogsV2:\*$"
+                    r"|/(archive|robots|results|ask|plans|analysis)/\*$|/analysis/robot=\*$|:AWSIotLogsV2:\*$"
                 )
                 named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
@@ -167,7 +171,7 @@ def test_a_function_may_be_called_only_by_its_rule_or_template(synthesized, read
 
 def test_queues_are_encrypted_and_require_tls(synthesized, reader):
     queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
-    assert queues.keys() == {"Rejected", "Last", "PutOff"}
+    assert queues.keys() == {"Rejected", "Last", "PutOff", "ArchiveTasks"}
     for properties in queues.values():
         assert properties["SqsManagedSseEnabled"] is True
         assert properties["MessageRetentionPeriod"] == 14 * 86_400
@@ -178,7 +182,7 @@ def test_queues_are_encrypted_and_require_tls(synthesized, reader):
         assert statement["Condition"] == {"Bool": {"aws:SecureTransport": "false"}}
         assert statement["Principal"] == {"AWS": "*"}
         closed |= {reader.text(statement["Resource"])}
-    assert closed == {"Rejected.Arn", "Last.Arn", "PutOff.Arn"}
+    assert closed == {"Rejected.Arn", "Last.Arn", "PutOff.Arn", "ArchiveTasks.Arn"}
 
 
 def test_no_template_holds_a_password_an_account_or_a_path_of_this_machine(synthesized):

@@ -7,7 +7,10 @@ import re
 
 import pytest
 
-STACKS = ("fleet", "storage", "quarantine", "processing", "ingest", "analysis", "monitoring", "account")
+STACKS = (
+    *("fleet", "storage", "quarantine", "processing", "ingest", "archive", "analysis", "monitoring"),
+    "account",
+)
 _ASSET = re.compile(r"[0-9a-f]{64}")
 
 

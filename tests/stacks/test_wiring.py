@@ -210,7 +210,7 @@ def test_the_variables_have_the_values_that_the_functions_expect(functions, read
 
     name = DEFAULT_NAMESPACE
     later = environments.LaterEnvironment(
-        name, "Batches", "Summary", "Robots", "Rejected", robot_metrics=False
+        name, "Archive", "Batches", "Summary", "Robots", "Rejected", robot_metrics=False
     )
     files = environments.UploadEnvironment(name, "Files", "Robots", "Rejected", 50 * 10**9)
     query = environments.QueryEnvironment(name, "Batches", "Robots", "Files")

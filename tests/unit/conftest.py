@@ -89,14 +89,15 @@ def dynamodb(aws, tables):
     """moto's DynamoDB with the tables as the template declares them."""
     import boto3
 
-    from tests.fakes import ARCHIVE, NAMES, QUARANTINE
+    from tests.fakes import NAMES, QUARANTINE
 
     client = boto3.client("dynamodb")
-    nouns = {**NAMES, QUARANTINE: QUARANTINE, ARCHIVE: ARCHIVE, "batches": NAMES["telemetry"]}
+    nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
     for logical, properties in tables.items():
         client.create_table(
             TableName=next(
-                (name for noun, name in nouns.items() if logical.lower().startswith(noun)), logical
+                (name for noun, name in nouns.items() if logical.lower().startswith(noun)),
+                logical[:-8].lower(),  # without the CDK's hash
             ),
             KeySchema=properties["KeySchema"],
             AttributeDefinitions=properties["AttributeDefinitions"],

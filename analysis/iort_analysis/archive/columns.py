@@ -48,11 +48,15 @@ OWN = {
 # In a column's metadata: the field's name, its unit and meaning, and whether its texts are JSON.
 FIELD, UNIT, MEANING, ENCODING = b"iort:field", b"iort:unit", b"iort:meaning", b"iort:encoding"
 JSON = b"json"
-# The kinds of a field's column. `NOTHING` is null everywhere, `MIXED` JSON.
-NOTHING, NUMBER, FLAG, TEXT, MIXED = "nothing", "number", "flag", "text", "mixed"
+# The kinds of a field's column. `NOTHING` is null everywhere, `VARIED` a number with many different values,
+# `MIXED` JSON. A number is always a float64: tools that read many files expect one type.
+NOTHING, NUMBER, VARIED, FLAG, TEXT, MIXED = "nothing", "number", "varied", "flag", "text", "mixed"
+# A dictionary of a column's values suits a number with fewer different values than this share of its rows.
+_VARIED = 0.05
 TYPES = {
     NOTHING: pa.float64(),
     NUMBER: pa.float64(),
+    VARIED: pa.float64(),
     FLAG: pa.bool_(),
     TEXT: pa.string(),
     MIXED: pa.string(),
@@ -83,7 +87,9 @@ def wire(value: Value) -> Value:
 def kind_of(column: Column) -> str:
     """The kind of a column."""
     if column.dtype.kind == "f":
-        return NOTHING if np.isnan(column).all() else NUMBER
+        if np.isnan(column).all():
+            return NOTHING
+        return VARIED if len(np.unique(column)) > _VARIED * len(column) else NUMBER
     if column.dtype.kind == "b":
         return FLAG
     kinds = set(map(type, column)) - {type(None)}
@@ -100,6 +106,8 @@ def joined_kind(one: str, other: str) -> str:
     """The kind that holds the values of both."""
     if NOTHING in (one, other):
         return one if other == NOTHING else other
+    if {one, other} == {NUMBER, VARIED}:
+        return VARIED
     return one if one == other else MIXED
 
 
@@ -114,7 +122,7 @@ def to_arrow(column: Column, kind: str) -> Any:
 
 def cast(array: Any, kind: str, into: str) -> Any:
     """An array of a kind as one of another kind that holds it too."""
-    if kind == into:
+    if kind == into or {kind, into} == {NUMBER, VARIED}:
         return array
     if kind == NOTHING:
         return pa.nulls(len(array), TYPES[into])

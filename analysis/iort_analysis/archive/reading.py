@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,7 +33,7 @@ class ArchiveFile:
     chooses one in the methods that take it; None is all.
     """
 
-    def __init__(self, source: bytes | BinaryIO) -> None:
+    def __init__(self, source: bytes | IO[bytes]) -> None:
         self._file = pq.ParquetFile(pa.BufferReader(source) if isinstance(source, bytes) else source)
         metadata = self._file.schema_arrow.metadata
         self._hours: dict[str, list[int]] = json.loads(metadata[HOURS])
@@ -66,6 +66,17 @@ class ArchiveFile:
         for group in self.groups(hour):
             if self._overlaps(group, keys) and (part := self._part(group, wanted, keys, messages=messages)):
                 yield part
+
+    def span(self, hour: Hour) -> tuple[int, int]:
+        """Where an hour's bytes are in the file, from the first one to behind the last."""
+        columns = [
+            self._file.metadata.row_group(group).column(i)
+            for group in self.groups(hour)
+            for i in range(self._file.metadata.num_columns)
+        ]
+        starts = [one.dictionary_page_offset or one.data_page_offset for one in columns]
+        ends = [start + one.total_compressed_size for start, one in zip(starts, columns, strict=True)]
+        return min(starts), max(ends)
 
     def has_messages(self, hour: Hour | None = None) -> bool:
         """Whether batches hold ROS messages as they were published."""

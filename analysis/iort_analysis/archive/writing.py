@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,6 +16,7 @@ from iort_analysis.archive.columns import (
     NOTHING,
     OWN,
     TYPES,
+    VARIED,
     cast,
     column_name,
     joined_kind,
@@ -46,11 +47,11 @@ class Written(NamedTuple):
 
 def write_hour(
     items: Iterable[Item],
-    into: BinaryIO,
+    into: IO[bytes],
     *,
     hour: Hour,
-    refused: BinaryIO,
-    scratch: BinaryIO,
+    refused: IO[bytes],
+    scratch: IO[bytes],
     describe: Describe = lambda _field: ("", ""),
 ) -> Written:
     """Write the batches of an hour, in the order of their ids.
@@ -93,7 +94,7 @@ def write_hour(
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
 
 
-def write_day(hours: Mapping[Hour, ArchiveFile], into: BinaryIO, *, describe: Describe) -> None:
+def write_day(hours: Mapping[Hour, ArchiveFile], into: IO[bytes], *, describe: Describe) -> None:
     """Join files to one with the row groups of these hours, each from the file that is given for it."""
     kinds: dict[str, str] = {}
     places: dict[str, tuple[int, int]] = {}
@@ -107,7 +108,7 @@ def write_day(hours: Mapping[Hour, ArchiveFile], into: BinaryIO, *, describe: De
 
 
 def _write(
-    into: BinaryIO,
+    into: IO[bytes],
     kinds: Mapping[str, str],
     tables: Iterable[tuple[Any, Mapping[str, str]]],
     places: Mapping[str, tuple[int, int]],
@@ -116,9 +117,17 @@ def _write(
     """Write each table, whose fields have these kinds, as a row group."""
     of_columns = dict(list(kinds.items())[: names.MAX_COLUMNS])
     schema = _schema(of_columns, places, describe)
-    # Dictionaries also suit numbers: a sensor has few different values.
-    options = {"compression": "zstd", "compression_level": _LEVEL}
-    with pq.ParquetWriter(into, schema, **options) as writer:
+    varied = [column_name(name) for name, kind in of_columns.items() if kind == VARIED]
+    # Of a number with many values the bytes of one place are similar; of regular times, the steps.
+    encodings = {**dict.fromkeys(varied, "BYTE_STREAM_SPLIT"), names.TIME: "DELTA_BINARY_PACKED"}
+    with pq.ParquetWriter(
+        into,
+        schema,
+        compression="zstd",
+        compression_level=_LEVEL,
+        column_encoding=encodings,
+        use_dictionary=[name for name in schema.names if name not in {*encodings, names.MESSAGE}],
+    ) as writer:
         for table, local in tables:
             arrays = {name: table[name] for name in OWN}
             arrays[names.OTHER] = _with_others(
@@ -133,7 +142,7 @@ def _write(
             writer.write_table(rows, row_group_size=max(1, len(rows)))
 
 
-def _read(scratch: BinaryIO) -> Any:
+def _read(scratch: IO[bytes]) -> Any:
     return pa.ipc.open_stream(scratch).read_all().combine_chunks().to_batches()[0]
 
 

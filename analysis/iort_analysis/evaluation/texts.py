@@ -23,10 +23,8 @@ def trending(parameter: Parameter, newest: Estimate, change: Estimate, days: flo
     """How a parameter developed."""
     way = "rose" if change.value > 0 else "fell"
     low, high = sorted((abs(change.low), abs(change.high)))
-    return (
-        f"{parameter.meaning}: {way} by {_number(abs(change.value), change.unit)} ({low:.3g} to {high:.3g}) "
-        f"in {days:.0f} days, to {_number(newest.value, newest.unit)}"
-    )
+    by = f"{_number(abs(change.value), change.unit)} ({_digits(low)} to {_digits(high)})"
+    return f"{parameter.meaning}: {way} by {by} in {days:.0f} days, to {_number(newest.value, newest.unit)}"
 
 
 def complete(finding: Finding, explained: Sequence[Finding]) -> str:
@@ -41,7 +39,7 @@ def complete(finding: Finding, explained: Sequence[Finding]) -> str:
 
 def _with_interval(estimate: Estimate) -> str:
     value, low, high, unit = estimate
-    return f"{_number(value, unit)} ({low:.3g} to {high:.3g})"
+    return f"{_number(value, unit)} ({_digits(low)} to {_digits(high)})"
 
 
 def _compared(change: float, baseline: float, unit: str) -> str:
@@ -53,4 +51,9 @@ def _compared(change: float, baseline: float, unit: str) -> str:
 
 
 def _number(value: float, unit: str) -> str:
-    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"
+    return _digits(value) if unit == "1" else f"{_digits(value)} {unit}"
+
+
+def _digits(value: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

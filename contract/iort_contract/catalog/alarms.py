@@ -48,6 +48,13 @@ PUT_OFF_WAITING = Alarm(
     "`iort robots show` says how many batches wait; mend what it sends, or `iort robots remove`",
     periods=15,
 )
+# Every hour each stream has a task, and every day a second one.
+ARCHIVE_TASKS_WAITING = Alarm(
+    "tasks of the archive wait for half an hour",
+    "nothing is lost, the hours are archived later: the archive's function fails (its log says why), or the "
+    "fleet is large and its ten environments are too few",
+    periods=30,
+)
 ERRORS = Alarm(
     "the function failed",
     "its log group; an asynchronous event is tried again, a stream's batch too",
@@ -67,7 +74,7 @@ BEHIND = Alarm(
 # By the ends of their names.
 OF_RESOURCES = {"Waiting": WAITING, "Errors": ERRORS, "Throttled": THROTTLED, "Behind": BEHIND}
 # By their names.
-OF_ONE_RESOURCE = {"PutOffWaiting": PUT_OFF_WAITING}
+OF_ONE_RESOURCE = {"PutOffWaiting": PUT_OFF_WAITING, "ArchiveTasksWaiting": ARCHIVE_TASKS_WAITING}
 # Messages that can be lost without being in quarantine, by AWS' namespace and metric. Account-wide, since AWS
 # documents no values for some of the dimensions.
 OF_THE_ACCOUNT = {

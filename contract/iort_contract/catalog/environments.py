@@ -38,9 +38,22 @@ class LiveEnvironment(Environment):
 
 
 @dataclass(frozen=True)
-class LaterEnvironment(Environment):
-    """What both summarizing functions need."""
+class ArchiveEnvironment(Environment):
+    """The archive's writer. ``archive_table`` is its manifest, ``archive_queue`` has its own tasks."""
 
+    telemetry_table: str
+    archive_table: str
+    robots_table: str
+    files_bucket: str
+    archive_queue: str
+    retention_s: int
+
+
+@dataclass(frozen=True)
+class LaterEnvironment(Environment):
+    """What both summarizing functions need. Without an archive, ``archive_table`` is empty."""
+
+    archive_table: str
     telemetry_table: str
     summary_table: str
     robots_table: str

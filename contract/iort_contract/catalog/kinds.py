@@ -84,6 +84,8 @@ KINDS = {
             "motor_resistance_grown",
             "the motor's phases have more resistance",
             "check the three phase wires and their plugs for a bad joint; compare again with a cold motor",
+            # More resistance is more heat.
+            explains=("cooling_lost",),
             alternatives=("a hotter motor than usual",),
         ),
         Kind(
@@ -107,6 +109,7 @@ KINDS = {
                 "brake_dragging",
                 "motor_resistance_grown",
                 "battery_worn",
+                "cooling_lost",
                 "pattern_unusual",
             ),
         ),

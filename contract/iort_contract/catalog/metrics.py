@@ -39,11 +39,12 @@ FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
 PRESENCE_CHART = Chart("Robots: who comes and goes")
 ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
 FILES_CHART = Chart("Robots: files")
+ARCHIVE_CHART = Chart("Archive: hours a minute, and what is overdue or was put off")
 ASKS_CHART = Chart("Robots: questions, and the time of an answer, p95 ms")
 # What the robots ask of the cloud, and what it does by itself: the rows of the services' dashboard.
 SERVICE_CHARTS: tuple[tuple[Chart, ...], ...] = (
     (PRESENCE_CHART, ADMISSION_CHART),
-    (FILES_CHART, ASKS_CHART),
+    (FILES_CHART, ARCHIVE_CHART, ASKS_CHART),
 )
 # The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
 ROBOT_CHARTS: tuple[tuple[Chart, ...], ...] = (
@@ -207,6 +208,32 @@ METRICS = {
         Metric("FilesStored", "upload", FILES_CHART),
         Metric("FilesRefused", "upload", FILES_CHART),
         Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
+        Metric("HoursArchived", "archive", ARCHIVE_CHART),
+        Metric("DaysJoined", "archive", ARCHIVE_CHART),
+        Metric("SamplesArchived", "archive", ARCHIVE_CHART, right=True),
+        Metric("BytesArchived", "archive", ARCHIVE_CHART, right=True, unit="Bytes"),
+        Metric("ItemsSetAside", "archive", ARCHIVE_CHART),
+        Metric(
+            "TasksOverdue",
+            "archive",
+            ARCHIVE_CHART,
+            statistic="Maximum",
+            alarm=Alarm(
+                "hours of telemetry wait for the archive for more than three hours",
+                "nothing is lost: the archive's function failed, and its log says why. It tries again every "
+                "hour; `iort archive verify` lists what is missing ([the archive](../reference/archive.md))",
+            ),
+        ),
+        Metric(
+            "ExpiriesPutOff",
+            "archive",
+            ARCHIVE_CHART,
+            alarm=Alarm(
+                "telemetry would have expired before it was archived, and was given 30 more days",
+                "the archive has failed for long: its function's log says why. Mend it within the 30 days, "
+                "then `iort archive run`",
+            ),
+        ),
         Metric("QuestionsAnswered", "answer", ASKS_CHART),
         Metric("QuestionsRefused", "answer", ASKS_CHART),
         # From the rule's receipt to the answer's publish.

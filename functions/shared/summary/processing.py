@@ -87,8 +87,12 @@ def process(
     _put(tables, topics)
     if beside_others:
         topics = _settled(tables, decoded, topics, at_once)
-    for name in map(parse_topic, topics):
+    for topic in topics:
+        name = parse_topic(topic)
         tables.note_stream(name.robot, name.name)
+        if tables.marks is not None:
+            starts = [batch.t_us for batch in decoded.batches[topic]]
+            tables.marks.note(topic, starts, int(time.time() * 1000))
     for topic, summaries in topics.items():
         decoded.refuse(topic, summaries.beyond, _BEYOND)
     left = {one.number for one in (decoded.refused if event.get(REPLAY) else refuse(decoded.refused))}
@@ -215,6 +219,7 @@ def stored_tables() -> Tables:
         telemetry=given.telemetry_table,
         summary=given.summary_table,
         robots=given.robots_table,
+        archive=given.archive_table,
     )
     # botocore's models are a hundred thousand permanent objects; the garbage collector need not scan them.
     gc.collect()

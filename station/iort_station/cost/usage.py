@@ -54,9 +54,9 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 32
-    insights_metrics: int = 61
-    dashboards: tuple[int, ...] = (47, 13, 20)
+    alarms: int = 37
+    insights_metrics: int = 63
+    dashboards: tuple[int, ...] = (49, 20, 20)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False

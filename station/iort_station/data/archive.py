@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 
 import numpy as np
 from botocore.exceptions import ClientError
@@ -38,10 +38,11 @@ if TYPE_CHECKING:
 # The table's items of an hour are no longer taken for complete this long before the first one expires: no
 # command reads for longer.
 _BEFORE_EXPIRY_S = 86_400
-# A smaller object is read at once: a second request takes longer than a megabyte.
-_AT_ONCE_BYTES = 1_000_000
-# What a request for a part of an object reads at least.
-_LEAST_BYTES = 64 * 1024
+# An hour up to this size is read by one request, also if few of its fields are needed: a request for each
+# field takes longer. An hour of thirty fields at 50 Hz has some 3 MB.
+_AT_ONCE_BYTES = 8_000_000
+# The end of a day's file, which tells where the hours are.
+_END_BYTES = 256 * 1024
 _GONE = frozenset({"404", "NoSuchKey", "412", "PreconditionFailed"})
 _T = TypeVar("_T")
 
@@ -155,7 +156,12 @@ class HourFile:
         if self._row.size_bytes <= _AT_ONCE_BYTES:
             return ArchiveFile(self._get(self._row.key))
         ranges = _Ranges(self._client, self._bucket, self._row.key)
-        return ArchiveFile(io.BufferedReader(ranges, _LEAST_BYTES))
+        file = ArchiveFile(cast("BinaryIO", ranges))
+        start, end = file.span(self._hour)
+        if end - start <= _AT_ONCE_BYTES:
+            # One request takes less time than one for each column.
+            ranges.keep(start, end)
+        return file
 
     def _refused(self) -> list[Item]:
         if not self._row.refused:
@@ -172,10 +178,16 @@ class _Ranges(io.RawIOBase):
 
     def __init__(self, client: Any, bucket: str, key: str) -> None:
         self._client, self._of = client, {"Bucket": bucket, "Key": key}
-        head = client.head_object(**self._of)
+        answer = client.get_object(**self._of, Range=f"bytes=-{_END_BYTES}")
         # An object that is replaced in between is an error, and no mixture.
-        self._of["IfMatch"] = head["ETag"]
-        self._size, self._at = int(head["ContentLength"]), 0
+        self._of["IfMatch"] = answer["ETag"]
+        self._size, self._at = int(answer["ContentRange"].rpartition("/")[2]), 0
+        end: bytes = answer["Body"].read()
+        self._kept = [(self._size - len(end), end)]
+
+    def keep(self, start: int, end: int) -> None:
+        """Read a part that will be asked for."""
+        self._kept.append((start, self._get(start, end)))
 
     def readable(self) -> bool:
         return True
@@ -194,7 +206,16 @@ class _Ranges(io.RawIOBase):
         end = min(self._at + len(into), self._size)
         if end <= self._at:
             return 0
-        body = self._client.get_object(**self._of, Range=f"bytes={self._at}-{end - 1}")["Body"].read()
+        body = self._part(self._at, end)
         into[: len(body)] = body
         self._at += len(body)
         return len(body)
+
+    def _part(self, start: int, end: int) -> bytes:
+        for first, body in self._kept:
+            if first <= start and end <= first + len(body):
+                return body[start - first : end - first]
+        return self._get(start, end)
+
+    def _get(self, start: int, end: int) -> bytes:
+        return bytes(self._client.get_object(**self._of, Range=f"bytes={start}-{end - 1}")["Body"].read())

@@ -209,26 +209,29 @@ class Recorded:
 
     def _ahead(
         self, pool: ThreadPoolExecutor, rows: Sequence[ArchivedHour], read: Callable[[HourFile], _T]
-    ) -> Iterator[tuple[ArchivedHour, _T]]:
+    ) -> Iterator[tuple[ArchivedHour, _T | None]]:
         """The hours with what ``read`` makes of them; while the caller uses one, the next ones are read."""
-        coming: deque[tuple[ArchivedHour, Future[_T]]] = deque()
+        coming: deque[tuple[ArchivedHour, Future[_T] | None]] = deque()
         left = deque(rows)
         while coming or left:
             while left and len(coming) < _HOURS_AHEAD:
                 if coming and sum(row.samples for row, _ in coming) + left[0].samples > _SAMPLES_AHEAD:
                     break
-                coming.append((left[0], pool.submit(self._archive.read, left.popleft(), read)))
-            row, future = coming.popleft()
-            yield row, future.result()
+                row = left.popleft()
+                # An hour with anything else than batches is read in `_with`.
+                content = None if row.refused else pool.submit(self._archive.read, row, read)
+                coming.append((row, content))
+            row, content = coming.popleft()
+            yield row, None if content is None else content.result()
 
     def _with(
-        self, beside: Sequence[Item], row: ArchivedHour, content: _T, keys: Keys
+        self, beside: Sequence[Item], row: ArchivedHour, content: _T | None, keys: Keys
     ) -> _Archived[_T] | Sequence[Item]:
         """What an hour holds in the archive and ``beside`` it in the table."""
         if beside:
             archived = set(self._archive.read(row, HourFile.ids))
             beside = [item for item in beside if key_of(item) not in archived]
-        if not beside and not row.refused:
+        if not beside and content is not None:
             return _Archived(content)
         # Rare and slow: batches that came late, or items that are not batches.
         return within(sorted([*self._archive.read(row, HourFile.items), *beside], key=key_of), keys)

@@ -49,7 +49,7 @@ def same_columns(one, other):
 def message_batches(draw):
     """A batch of ROS messages, that may become columns, or that are kept as published."""
     made = draw(definitions())
-    kind = RosType("/made", made.kind, "0", made.definition)
+    kind = RosType("/made", made.kind, made.md5sum, made.definition)
     raws = draw(st.lists(messages(made) | st.binary(max_size=8), min_size=1, max_size=4))
     first = draw(st.integers(0, 2**50))
     times = [first + i for i in range(len(raws))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import random
 
 import pytest
 from hypothesis import Phase, given, settings
@@ -19,6 +20,7 @@ from iort_contract.ros1.message import Messages, RosType
 from iort_contract.tables import RECOMPUTE_FROM_S
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
+from iort_station.data import archive as station_archive
 from iort_station.data.overview import overview
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
@@ -264,6 +266,33 @@ def test_one_of_the_two_alone_can_be_asked(before):
     assert counts["auto"] == counts["archive"] == len(data.query(before, "car", "vesc"))
     assert 0 < counts["table"] < counts["auto"]
     assert len(data.query(half, "car", "vesc", source="table").origin.hours) == 0
+
+
+def test_of_a_large_file_only_what_is_needed_is_read(monkeypatch):
+    chance = random.Random(1)
+    cloud = cloud_of(page_items=100)
+    cloud.bucket = FakeS3()
+    for hour in range(2):
+        times = [START + hour * HOUR + i * 1_000 for i in range(1_000)]
+        columns = {f"f{i}": [chance.random() for _ in times] for i in range(40)}
+        cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", hour, times, columns)))
+    expected = data.query(cloud, "car", "vesc", START + HOUR, fields=["f7"])
+    archive(cloud.table, cloud.bucket)
+    compact(cloud.table, cloud.bucket)
+    expire(cloud.table)
+    (size,) = map(len, cloud.bucket.objects.values())
+    monkeypatch.setattr(station_archive, "_END_BYTES", 70_000)
+    requests, read = [], []
+    # The whole file at once; its end and the hour; its end and some columns.
+    for most in (size, size - 100_000, 0):
+        monkeypatch.setattr(station_archive, "_AT_ONCE_BYTES", most)
+        del cloud.bucket.reads[:]
+        assert asked(data.query(cloud, "car", "vesc", START + HOUR, fields=["f7"])) == asked(expected)
+        requests.append(len(cloud.bucket.reads))
+        read.append(sum(end - start for start, end in cloud.bucket.reads))
+    assert requests[:2] == [1, 2]
+    assert requests[2] > 2
+    assert read[2] < read[1] < read[0] == size
 
 
 def test_a_file_that_moves_while_it_is_read_is_found_again(before):

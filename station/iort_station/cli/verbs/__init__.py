@@ -11,6 +11,7 @@ VERBS = {
     "page.pubnub": "Store PubNub's keys, encrypted, where Lambda 1 reads them.",
     "page.dashboard": "Serve the live page until Ctrl-C.",
     "operations.cost": "Print the cost of a fleet, at list prices.",
+    "operations.archive": "Telemetry that is kept for good: show, run, verify.",
     "operations.audit": "Prove that every sample of a robot arrived.",
     "data.streams": "List a robot's streams: fields, runs, times.",
     "data.runs": "List the runs of a robot's agent.",

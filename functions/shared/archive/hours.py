@@ -1,0 +1,157 @@
+"""Archives an hour of a stream: its items from the telemetry table into one object of the bucket.
+
+Exactly once: a run writes the object only over the version that it has seen, and the manifest's row only over
+the content that it has seen. A run that is killed leaves the row as it was; the next one writes the object
+again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from heapq import merge
+from itertools import groupby
+from tempfile import TemporaryFile
+from typing import IO, Any, NamedTuple
+
+from functions.shared.archive.archive import Archive
+from functions.shared.metrics import emit
+from iort_analysis.archive.items import items as archived_items
+from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.archive.writing import Describe, write_hour
+from iort_contract.archive import ArchivedHour, Pending, hour_key, parse_hour, refused_key
+from iort_contract.catalog.streams import CATALOG
+from iort_contract.dynamodb import Item, starting_between
+from iort_contract.tables import BATCH
+from iort_contract.topics import parse_topic
+
+# An item may go a little before its time, by another clock.
+_MARGIN_S = 3600
+
+
+def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHour | None:
+    """Archive what the table has of an hour; returns the manifest's row, None if there is nothing."""
+    topic, hour = parse_topic(pending.topic), parse_hour(pending.period)
+    due_ms = archive.marks.due_ms(pending)
+    row = archive.row(pending.topic, hour)
+    etags = {key: archive.objects.etag(key) for key in (hour_key(topic, hour), refused_key(topic, hour))}
+    with ExitStack() as files:
+        made = _write(archive, pending, row, now_ms, files)
+        if made.batches + made.refused and (row is None or row.content != made.content):
+            sha256, size = "", 0
+            (key, etag), (refused, refused_etag) = etags.items()
+            if made.batches:
+                sha256, size = archive.objects.write(key, made.file, etag)
+            if made.refused:
+                archive.objects.write(refused, made.set_aside, refused_etag)
+            # The day's object, if there is one, is now old.
+            archive.marks.add(Pending(pending.topic, hour.date), now_ms)
+            before, row = (
+                row,
+                ArchivedHour(
+                    topic=pending.topic,
+                    hour=str(hour),
+                    key=key if made.batches else "",
+                    batches=made.batches,
+                    samples=made.samples,
+                    refused=made.refused,
+                    content=made.content,
+                    sha256=sha256,
+                    size_bytes=size,
+                    archived_ms=now_ms,
+                    first_expires_s=made.first_expires_s,
+                ),
+            )
+            _keep(archive, row, before)
+            emit(
+                "archive",
+                HoursArchived=1,
+                SamplesArchived=made.samples,
+                BytesArchived=size,
+                ItemsSetAside=made.refused,
+            )
+    if due_ms is not None and due_ms <= now_ms:
+        archive.marks.remove(pending, due_ms)
+    return row
+
+
+class _Made(NamedTuple):
+    """An hour's files, and what they hold."""
+
+    file: IO[bytes]
+    set_aside: IO[bytes]
+    batches: int
+    samples: int
+    refused: int
+    content: str
+    first_expires_s: int
+
+
+def _write(
+    archive: Archive, pending: Pending, row: ArchivedHour | None, now_ms: int, files: ExitStack
+) -> _Made:
+    """Write an hour's files. What the table no longer has comes from the archive, which must not shrink."""
+    topic, hour = pending.topic, parse_hour(pending.period)
+    may_have_expired = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
+    while True:
+        into, refused, scratch = [files.enter_context(TemporaryFile()) for _ in range(3)]  # noqa: SIM115 - it is
+        keys = starting_between(hour.start_us, hour.end_us - 1)
+        pages = archive.telemetry.pages(topic, keys)
+        items: Iterator[Item] = (item for page in pages for item in page.items)
+        expiries = [row.first_expires_s] if row is not None and row.first_expires_s else []
+        if row is not None and may_have_expired:
+            items = _with_archived(items, archive, row, files)
+        written = write_hour(
+            items,
+            into,
+            hour=hour,
+            refused=refused,
+            scratch=scratch,
+            describe=describe_of(parse_topic(topic).name),
+        )
+        count = sum(written.refused.values())
+        if row is None or may_have_expired or written.batches + count >= row.batches + row.refused:
+            expiries += [written.first_expires_s] if written.first_expires_s else []
+            first_s = min(expiries, default=0)
+            return _Made(into, refused, written.batches, written.samples, count, written.content, first_s)
+        may_have_expired = True
+
+
+def _with_archived(
+    stored: Iterator[Item], archive: Archive, row: ArchivedHour, files: ExitStack
+) -> Iterator[Item]:
+    """The stored items of an hour, and those that only the archive has, in the order of their ids."""
+    hour = parse_hour(row.hour)
+    sources = [stored]
+    if row.key:
+        file = files.enter_context(archive.objects.read(row.key)[0])
+        sources.append(archived_items(ArchiveFile(file), row.topic, hour))
+    if row.refused:
+        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour))[0])
+        sources.append(iter(sorted(map(json.loads, lines), key=_id)))
+    # The stored one is the first of a kind.
+    for _, same in groupby(merge(*sources, key=_id), key=_id):
+        yield next(same)
+
+
+def _id(item: Item) -> str:
+    return str(item[BATCH]["S"])
+
+
+def _keep(archive: Archive, row: ArchivedHour, before: ArchivedHour | None) -> None:
+    """Write the row, if the hour still has the content from before; raises `ClientError` if it has not."""
+    unchanged: dict[str, Any] = {"ConditionExpression": "attribute_not_exists(content)"}
+    if before is not None:
+        unchanged = {
+            "ConditionExpression": "content = :content",
+            "ExpressionAttributeValues": {":content": {"S": before.content}},
+        }
+    archive.client.put_item(TableName=archive.manifest.name, Item=row.item(), **unchanged)
+
+
+def describe_of(stream: str) -> Describe:
+    """What the catalogue knows of a stream's fields."""
+    known = CATALOG[stream].fields if stream in CATALOG else ()
+    described = {field.name: (field.unit, field.meaning) for field in known}
+    return lambda name: described.get(name, ("", ""))

@@ -1,0 +1,97 @@
+"""The pending rows of the archive's manifest: what is to be archived, and when."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.archive import DUE_MS, PENDING, ArchiveTable, Pending, hour_of, parse_pending
+from iort_contract.dynamodb import Item
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
+
+_log = logging.getLogger(__name__)
+# How many hours an environment remembers to have marked.
+_KNOWN = 50_000
+
+
+class Marks:
+    """The pending rows."""
+
+    def __init__(self, client: DynamoDBClient, table: str) -> None:
+        self._client, self._table = client, table
+        self._known: dict[Pending, int] = {}
+
+    def note(self, topic: str, times_us: Iterable[int], now_ms: int) -> None:
+        """Mark the hours of batches that start at these times. A mark covers all batches that follow before
+        it is due, so a live stream costs a write an hour.
+
+        A failure is logged: the next batch tries again, and the daily sweep finds what has no mark.
+        """
+        for hour in {hour_of(t_us) for t_us in times_us}:
+            pending = Pending(topic, str(hour))
+            if now_ms < self._known.get(pending, 0):
+                continue
+            try:
+                due_ms = self.add(pending, now_ms)
+            except (BotoCoreError, ClientError) as error:
+                _log.warning("%s of %s is not marked for the archive: %s", hour, topic, error)
+                continue
+            if len(self._known) >= _KNOWN:
+                self._known.clear()
+            self._known[pending] = due_ms
+
+    def add(self, pending: Pending, now_ms: int) -> int:
+        """Mark one, or move its mark to a later time; returns when it is due."""
+        due_ms = pending.due_ms(now_ms)
+        # A row with a later time stays.
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._client.update_item(
+                TableName=self._table,
+                Key=pending.key,
+                UpdateExpression="SET #due = :due",
+                ConditionExpression="attribute_not_exists(#due) OR #due < :due",
+                ExpressionAttributeNames={"#due": DUE_MS},
+                ExpressionAttributeValues={":due": {"N": str(due_ms)}},
+            )
+        return due_ms
+
+    def due_ms(self, pending: Pending) -> int | None:
+        """When one is due; None if it has no mark."""
+        answer = self._client.get_item(TableName=self._table, Key=pending.key, ConsistentRead=True)
+        return int(answer["Item"][DUE_MS]["N"]) if "Item" in answer else None
+
+    def remove(self, pending: Pending, due_ms: int) -> None:
+        """Remove a mark that is done, unless it has moved since."""
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._client.delete_item(
+                TableName=self._table,
+                Key=pending.key,
+                ConditionExpression="#due = :due",
+                ExpressionAttributeNames={"#due": DUE_MS},
+                ExpressionAttributeValues={":due": {"N": str(due_ms)}},
+            )
+
+    def every(self) -> Iterator[tuple[Pending, Item]]:
+        """All marks, oldest hours first."""
+        for page in ArchiveTable(self._client, self._table).pages(PENDING):
+            for item in page.items:
+                yield parse_pending(item), item
+
+    def keep(self, pending: Pending, **values: Any) -> None:
+        """Add numbers to a mark that is there."""
+        names = {f"#{name}": name for name in values}
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._client.update_item(
+                TableName=self._table,
+                Key=pending.key,
+                UpdateExpression="SET " + ", ".join(f"#{name} = :{name}" for name in values),
+                ConditionExpression="attribute_exists(#due)",
+                ExpressionAttributeNames={**names, "#due": DUE_MS},
+                ExpressionAttributeValues={f":{name}": {"N": str(value)} for name, value in values.items()},
+            )

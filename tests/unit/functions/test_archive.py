@@ -1,0 +1,427 @@
+"""Every hour is archived once, whatever fails, comes late, or happens at the same time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import boto3
+import pytest
+from botocore.exceptions import ClientError
+
+from functions import archive as function
+from functions.quarantine import entries
+from functions.shared.archive import hours
+from functions.shared.archive.archive import archive as archive_of_environment
+from functions.shared.archive.expiry import PUT_OFF_S, margin_s
+from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.samples.batches import in_order
+from iort_analysis.samples.blocks import join, values
+from iort_contract.archive import (
+    ALL,
+    ARCHIVE,
+    DUE,
+    HOUR,
+    HOUR_REST_MS,
+    JOIN,
+    PUT_OFF,
+    SWEEP,
+    TASK,
+    Hour,
+    Pending,
+    content_hash,
+    day_key,
+    hour_key,
+    item_hash,
+    refused_key,
+)
+from iort_contract.catalog.environments import ArchiveEnvironment
+from iort_contract.dynamodb import starting_between
+from iort_contract.messages.batch import Batch
+from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
+from iort_contract.topics import parse_topic
+from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message
+from tests.unit.contract.contract_values import BOOT
+
+DAY_S = 86_400
+RETENTION_S = 90 * DAY_S
+# The first hour of a day.
+HOUR_0 = Hour(472_224)
+NOW_MS = HOUR_0.end_us // 1000 + HOUR_REST_MS + 1
+PENDING = Pending(TOPIC_OF_CAR, str(HOUR_0))
+DAY = Pending(TOPIC_OF_CAR, HOUR_0.date)
+CAR = parse_topic(TOPIC_OF_CAR)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.fixture
+def cloud(dynamodb, monkeypatch):
+    """An empty deployment; its queue's tasks are done by `Cloud.work`."""
+    boto3.client("s3").create_bucket(
+        Bucket="files", CreateBucketConfiguration={"LocationConstraint": "eu-west-1"}
+    )
+    url = boto3.client("sqs").create_queue(QueueName="tasks")["QueueUrl"]
+    given = ArchiveEnvironment("iort", TELEMETRY, "archive", ROBOTS, "files", url, RETENTION_S)
+    for name, value in given.variables().items():
+        monkeypatch.setenv(name, value)
+    return Cloud(dynamodb)
+
+
+class Cloud:
+    def __init__(self, dynamodb):
+        self.dynamodb, self.s3, self.sqs = dynamodb, boto3.client("s3"), boto3.client("sqs")
+        self.archive = archive_of_environment()
+        self.marks = self.archive.marks
+
+    def store(self, second, speed, hour=HOUR_0, seq=0, now_ms=None):
+        """Put a batch of three samples into the table, and mark its hour as Lambda 2 does."""
+        start = hour.start_us + second * 1_000_000
+        batch = Batch(BOOT, seq, [start, start + 1, start + 2], {"speed": speed})
+        item = item_of(batch, expires_s=hour.start_us // 1_000_000 + RETENTION_S)
+        self.dynamodb.put_item(TableName=TELEMETRY, Item=item)
+        self.marks.note(TOPIC_OF_CAR, [start], now_ms or start // 1000)
+        return item
+
+    def forget(self, item):
+        self.dynamodb.delete_item(TableName=TELEMETRY, Key={name: item[name] for name in (TOPIC, BATCH)})
+
+    def row(self, hour=HOUR_0):
+        return self.archive.row(TOPIC_OF_CAR, hour)
+
+    def archived(self, hour=HOUR_0, now_ms=NOW_MS):
+        return function.perform({TASK: ARCHIVE, TOPIC: TOPIC_OF_CAR, HOUR: str(hour)}, now_ms)
+
+    def speeds(self, hour=HOUR_0):
+        """What the row's object says."""
+        body = self.s3.get_object(Bucket="files", Key=self.row(hour).key)["Body"].read()
+        assert hashlib.sha256(body).hexdigest() == self.row(hour).sha256
+        assert len(body) == self.row(hour).size_bytes
+        return values(join(list(in_order(ArchiveFile(body).pages(hour)))).columns["speed"])
+
+    def keys(self):
+        return sorted(one["Key"] for one in self.s3.list_objects_v2(Bucket="files").get("Contents", ()))
+
+    def pending(self):
+        return [pending for pending, _ in self.marks.every()]
+
+    def tasks(self):
+        """Take the tasks that wait."""
+        url = self.archive.given.archive_queue
+        found = []
+        while messages := self.sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10).get("Messages"):
+            for message in messages:
+                found.append(json.loads(message["Body"]))
+                self.sqs.delete_message(QueueUrl=url, ReceiptHandle=message["ReceiptHandle"])
+        return found
+
+    def expiries(self, hour=HOUR_0):
+        keys = starting_between(hour.start_us, hour.end_us - 1)
+        pages = self.archive.telemetry.pages(TOPIC_OF_CAR, keys)
+        return [int(item[EXPIRES_S]["N"]) for page in pages for item in page.items]
+
+
+def test_an_hour_is_archived_once_and_nothing_changes_afterwards(cloud, capsys):
+    items = [cloud.store(second, [second, 1.5, None], seq=second) for second in (0, 5)]
+    cloud.archived()
+    row = cloud.row()
+    assert (row.batches, row.samples, row.refused, row.key) == (2, 6, 0, hour_key(CAR, HOUR_0))
+    assert row.content == content_hash((item[BATCH]["S"], item_hash(item)) for item in items)
+    assert row.first_expires_s == HOUR_0.start_us // 1_000_000 + RETENTION_S
+    assert cloud.speeds() == [0, 1.5, None, 5, 1.5, None]
+    # What is left to do is to join the day.
+    assert cloud.pending() == [DAY]
+    assert '"HoursArchived":1' in capsys.readouterr().out
+    before = cloud.s3.head_object(Bucket="files", Key=row.key)
+    cloud.archived(now_ms=NOW_MS + 5)
+    assert cloud.row() == row
+    assert cloud.s3.head_object(Bucket="files", Key=row.key)["LastModified"] == before["LastModified"]
+    assert not capsys.readouterr().out
+
+
+def test_a_late_batch_rewrites_its_hour_also_after_the_others_have_expired(cloud):
+    first = cloud.store(0, [1, 1, 1])
+    refused = {
+        **item_of_message(b'{"batch": "%016d-x", "n": 3}' % (HOUR_0.start_us + 7)),
+        EXPIRES_S: first[EXPIRES_S],
+    }
+    cloud.dynamodb.put_item(TableName=TELEMETRY, Item=refused)
+    cloud.archived()
+    assert cloud.s3.get_object(Bucket="files", Key=refused_key(CAR, HOUR_0))["Body"].read() == (
+        json.dumps(refused, separators=(",", ":")).encode() + b"\n"
+    )
+    assert cloud.row().refused == 1
+    before = cloud.row().content
+    # The late batch comes on the day that the others go.
+    late_ms = cloud.row().first_expires_s * 1000
+    cloud.forget(first)
+    cloud.forget(refused)
+    late = cloud.store(3, [2, 2, 2], seq=1)
+    cloud.archived(now_ms=late_ms)
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+    assert cloud.row().content == content_hash(
+        (item[BATCH]["S"], item_hash(item))
+        for item in sorted((first, refused, late), key=lambda i: i[BATCH]["S"])
+    )
+    assert (cloud.row().batches, cloud.row().refused) == (2, 1)
+    assert cloud.row().content != before
+
+
+def test_an_hour_never_shrinks(cloud):
+    """Somebody has deleted items by hand, before their time."""
+    first = cloud.store(0, [1, 1, 1])
+    cloud.store(1, [2, 2, 2], seq=1)
+    cloud.archived()
+    cloud.forget(first)
+    cloud.archived()
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("where", ["put_object", "put_item"])
+@pytest.mark.parametrize("late", [False, True])
+def test_killed_in_the_middle_the_next_run_ends_the_work(cloud, monkeypatch, where, late):
+    cloud.store(0, [1, 1, 1])
+    if late:
+        cloud.archived()
+        cloud.store(1, [2, 2, 2], seq=1, now_ms=NOW_MS)
+    before = cloud.row()
+    client = cloud.archive.objects._client if where == "put_object" else cloud.archive.client
+    with monkeypatch.context() as patched:
+        patched.setattr(client, where, kill)
+        with pytest.raises(Killed):
+            cloud.archived()
+    assert cloud.row() == before
+    assert PENDING in cloud.pending()
+    cloud.archived(now_ms=NOW_MS + HOUR_REST_MS)
+    assert cloud.speeds() == ([1, 1, 1, 2, 2, 2] if late else [1, 1, 1])
+    assert cloud.pending() == [DAY]
+
+
+def kill(**_):
+    raise Killed
+
+
+def test_of_two_runs_at_once_the_slower_one_changes_nothing(cloud, monkeypatch):
+    """A run has read the table, then a batch comes, and another run is faster."""
+    cloud.store(0, [1, 1, 1])
+    real, other = hours.write_hour, []
+
+    def slow(*args, **kwargs):
+        written = real(*args, **kwargs)
+        if not other:
+            other.append(True)
+            cloud.store(1, [2, 2, 2], seq=1)
+            cloud.archived()
+        return written
+
+    monkeypatch.setattr(hours, "write_hour", slow)
+    with pytest.raises(ClientError, match="pre-conditions"):
+        cloud.archived()
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+    # The queue delivers the task again.
+    cloud.archived()
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+
+
+def test_a_batch_that_comes_during_the_run_keeps_its_mark(cloud, monkeypatch):
+    cloud.store(0, [1, 1, 1])
+    real = hours.write_hour
+
+    def meanwhile(*args, **kwargs):
+        written = real(*args, **kwargs)
+        cloud.store(1, [2, 2, 2], seq=1, now_ms=NOW_MS)
+        return written
+
+    with monkeypatch.context() as patched:
+        patched.setattr(hours, "write_hour", meanwhile)
+        cloud.archived()
+    assert cloud.speeds() == [1, 1, 1]
+    assert PENDING in cloud.pending()
+    cloud.archived(now_ms=NOW_MS + HOUR_REST_MS)
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+    assert cloud.pending() == [DAY]
+
+
+# --- days -------------------------------------------------------------------------------------------
+
+HOUR_1 = Hour(HOUR_0.number + 1)
+LATER_MS = NOW_MS + 3 * DAY_S * 1000
+OBJECT_OF_DAY = day_key(CAR, HOUR_0)
+
+
+def join_day(cloud):
+    return function.perform({TASK: JOIN, TOPIC: TOPIC_OF_CAR, HOUR: HOUR_0.date}, LATER_MS)
+
+
+@pytest.fixture
+def two_hours(cloud):
+    for i, hour in enumerate((HOUR_0, HOUR_1)):
+        cloud.store(0, [i, i, i], hour)
+        cloud.archived(hour, LATER_MS)
+    return cloud
+
+
+def test_a_day_becomes_one_object_and_a_late_batch_another_one(two_hours, monkeypatch):
+    cloud = two_hours
+    cloud.marks.remove(DAY, cloud.marks.due_ms(DAY))
+    cloud.marks.add(DAY, 0)
+    assert join_day(cloud) == {"joined": True}
+    assert cloud.keys() == [OBJECT_OF_DAY]
+    assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1])
+    assert not cloud.pending()
+    # A run of an hour in it finds nothing to do.
+    cloud.archived(HOUR_0, LATER_MS)
+    assert cloud.keys() == [OBJECT_OF_DAY]
+
+    cloud.store(5, [7, 7, 7], HOUR_1, seq=1)
+    cloud.archived(HOUR_1, LATER_MS)
+    assert cloud.keys() == [hour_key(CAR, HOUR_1), OBJECT_OF_DAY]
+    assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7]
+    join_day(cloud)
+    assert cloud.keys() == [OBJECT_OF_DAY]
+    assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1, 7, 7, 7])
+    # Days above the limit stay as hours.
+    cloud.store(6, [8, 8, 8], HOUR_1, seq=2)
+    cloud.archived(HOUR_1, LATER_MS)
+    monkeypatch.setattr("functions.shared.archive.days.MOST_BYTES", 1)
+    assert join_day(cloud) == {"joined": False}
+    assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7, 8, 8, 8]
+
+
+@pytest.mark.parametrize("where", ["put_object", "transact_write_items", "delete_object"])
+def test_a_day_is_whole_whenever_its_join_is_killed(two_hours, monkeypatch, where):
+    cloud = two_hours
+    client = cloud.archive.client if where == "transact_write_items" else cloud.archive.objects._client
+    with monkeypatch.context() as patched:
+        patched.setattr(client, where, kill)
+        with pytest.raises(Killed):
+            join_day(cloud)
+    assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1])
+    join_day(cloud)
+    assert cloud.keys() == [OBJECT_OF_DAY]
+    assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1])
+
+
+def test_a_late_batch_during_the_join_is_not_lost(two_hours, monkeypatch):
+    """Its run writes the hour's object again, just before the join removes it."""
+    cloud = two_hours
+    real = cloud.archive.client.transact_write_items
+
+    def meanwhile(**request):
+        answer = real(**request)
+        cloud.store(5, [7, 7, 7], HOUR_1, seq=1)
+        cloud.archived(HOUR_1, LATER_MS)
+        return answer
+
+    monkeypatch.setattr(cloud.archive.client, "transact_write_items", meanwhile)
+    join_day(cloud)
+    assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7]
+    assert cloud.speeds(HOUR_0) == [0, 0, 0]
+
+
+# --- what is due ------------------------------------------------------------------------------------
+
+
+def test_a_live_stream_is_marked_once_an_hour_and_is_due_when_it_is_over(cloud, monkeypatch):
+    writes = []
+    real = cloud.archive.client.update_item
+    monkeypatch.setattr(
+        cloud.archive.client, "update_item", lambda **update: writes.append(update) or real(**update)
+    )
+    for second in range(0, 3600, 600):
+        cloud.store(second, [1, 1, 1], seq=second)
+    assert len(writes) == 1
+    assert function.perform({TASK: DUE}, NOW_MS - 2) == {"tasks": 0, "overdue": 0}
+    assert function.perform({TASK: DUE}, NOW_MS) == {"tasks": 1, "overdue": 0}
+    (task,) = cloud.tasks()
+    function.handler({"Records": [{"body": json.dumps(task)}]}, None)
+    assert cloud.row().batches == 6
+    # A late batch marks its hour again, for some minutes.
+    cloud.store(3599, [2, 2, 2], seq=9)
+    cloud.marks.note(TOPIC_OF_CAR, [HOUR_0.start_us], NOW_MS + 1)
+    assert cloud.marks.due_ms(PENDING) == NOW_MS + 1 + HOUR_REST_MS
+    assert len(writes) == 1 + 2  # and the day's
+
+
+def test_the_hours_of_a_clock_that_is_ahead_do_not_wait_for_their_time(cloud):
+    ahead = Hour(HOUR_0.number + 1000)
+    cloud.marks.note(TOPIC_OF_CAR, [ahead.start_us], NOW_MS)
+    assert cloud.marks.due_ms(Pending(TOPIC_OF_CAR, str(ahead))) == NOW_MS + HOUR_REST_MS
+
+
+def test_a_sweep_finds_hours_without_a_mark(cloud):
+    cloud.dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}, STREAMS: {"SS": ["vesc", "lidar"]}})
+    for hour in (HOUR_0, HOUR_1):
+        cloud.store(0, [1, 1, 1], hour)
+        cloud.marks.remove(
+            Pending(TOPIC_OF_CAR, str(hour)), cloud.marks.due_ms(Pending(TOPIC_OF_CAR, str(hour)))
+        )
+    assert not cloud.pending()
+    assert function.perform({TASK: SWEEP}, LATER_MS)["tasks"] > 2
+    sweeps = cloud.tasks()
+    assert {TASK: SWEEP, TOPIC: TOPIC_OF_CAR} in sweeps
+    # Nothing expires soon.
+    assert function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR}, LATER_MS) == {"tasks": 0}
+    expiring_ms = (HOUR_0.end_us // 1_000_000 + RETENTION_S - margin_s(RETENTION_S)) * 1000
+    assert function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR}, expiring_ms) == {"tasks": 2}
+    assert cloud.pending() == [Pending(TOPIC_OF_CAR, str(hour)) for hour in (HOUR_0, HOUR_1)]
+    # The operator asks for all, at any time; the hour that is not over stays.
+    now_ms = HOUR_1.start_us // 1000 + HOUR_REST_MS
+    assert function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR, ALL: True}, now_ms) == {"tasks": 1}
+
+
+def test_what_cannot_be_archived_does_not_expire(cloud, monkeypatch, capsys):
+    """The bucket fails for 90 days, and a task after five attempts goes to quarantine every hour."""
+    cloud.store(0, [1, 1, 1])
+    expires_s = cloud.expiries()[0]
+
+    def failing(**_):
+        raise ClientError({"Error": {"Code": "InternalError", "Message": "no bucket"}}, "PutObject")
+
+    def plan(now_s):
+        function.perform({TASK: DUE}, now_s * 1000)
+        tasks = cloud.tasks()
+        for task in tasks:
+            if task[TASK] == ARCHIVE:
+                with pytest.raises(ClientError, match="no bucket"):
+                    function.perform(task, now_s * 1000)
+            else:
+                function.perform(task, now_s * 1000)
+        return [task[TASK] for task in tasks]
+
+    monkeypatch.setattr(cloud.archive.objects._client, "put_object", failing)
+    assert plan(NOW_MS // 1000) == [ARCHIVE]
+    capsys.readouterr()
+    # The alarm's metric, after three hours. The expiry is looked up once, and is far away.
+    late_s = NOW_MS // 1000 + 4 * 3600
+    assert plan(late_s) == [PUT_OFF, ARCHIVE]
+    assert plan(late_s + 3600) == [ARCHIVE]
+    assert '"TasksOverdue":1' in capsys.readouterr().out
+    assert cloud.expiries() == [expires_s]
+    near_s = expires_s - margin_s(RETENTION_S)
+    assert plan(near_s) == [PUT_OFF, ARCHIVE]
+    assert cloud.expiries() == [near_s + PUT_OFF_S]
+    assert '"ExpiriesPutOff":1' in capsys.readouterr().out
+    assert plan(near_s + 3600) == [ARCHIVE]
+    # Months later it is still there, and is archived once the bucket is back.
+    again_s = near_s + PUT_OFF_S - margin_s(RETENTION_S)
+    assert plan(again_s) == [PUT_OFF, ARCHIVE]
+    monkeypatch.undo()
+    cloud.archived(now_ms=again_s * 1000)
+    assert cloud.speeds() == [1, 1, 1]
+    assert PENDING not in cloud.pending()
+
+
+def test_expiries_are_put_off_even_where_pyarrow_fails_to_load():
+    code = "import sys; sys.modules['pyarrow'] = None; import functions.archive as a; a.plan_due, a.put_off"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_task_that_failed_for_good_is_in_quarantine_under_its_robot():
+    body = json.dumps({TASK: ARCHIVE, TOPIC: TOPIC_OF_CAR, HOUR: str(HOUR_0)})
+    (entry,) = entries(body, lambda _: [])
+    assert (entry.robot, entry.reason) == ("car", f"the archive failed in five attempts: {ARCHIVE} {HOUR_0}")
