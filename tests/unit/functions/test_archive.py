@@ -357,9 +357,7 @@ def test_a_sweep_finds_hours_without_a_mark(cloud):
     cloud.dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}, STREAMS: {"SS": ["vesc", "lidar"]}})
     for hour in (HOUR_0, HOUR_1):
         cloud.store(0, [1, 1, 1], hour)
-        cloud.marks.remove(
-            Pending(TOPIC_OF_CAR, str(hour)), cloud.marks.due_ms(Pending(TOPIC_OF_CAR, str(hour)))
-        )
+        lose_mark(cloud, hour)
     assert not cloud.pending()
     assert function.perform({TASK: SWEEP}, LATER_MS)["tasks"] > 2
     sweeps = cloud.tasks()
@@ -372,6 +370,47 @@ def test_a_sweep_finds_hours_without_a_mark(cloud):
     # The operator asks for all, at any time; the hour that is not over stays.
     now_ms = HOUR_1.start_us // 1000 + HOUR_REST_MS
     assert function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR, ALL: True}, now_ms) == {"tasks": 1}
+
+
+def lose_mark(cloud, hour=HOUR_0):
+    pending = Pending(TOPIC_OF_CAR, str(hour))
+    cloud.marks.remove(pending, cloud.marks.due_ms(pending))
+
+
+def swept(cloud, now_ms=LATER_MS, **more):
+    function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR, **more}, now_ms)
+    return [task[HOUR] for task in cloud.tasks()]
+
+
+def test_a_sweep_finds_a_late_batch_without_a_mark_before_the_hour_expires(cloud):
+    cloud.store(0, [1, 1, 1])
+    cloud.archived()
+    begins_ms = NOW_MS + (RETENTION_S - 2 * margin_s(RETENTION_S)) * 1000
+    night_ms = begins_ms + 20 * 3_600_000
+    assert not swept(cloud, night_ms)
+    cloud.store(1, [2, 2, 2], seq=1)
+    assert PENDING not in cloud.pending()
+    assert not swept(cloud, begins_ms - 2)
+    assert swept(cloud, night_ms) == [str(HOUR_0)]
+    cloud.archived(now_ms=night_ms)
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+
+
+def test_a_sweep_finds_hours_of_a_clock_that_is_ahead(cloud):
+    ahead = Hour(HOUR_0.number + 365 * 24)
+    cloud.store(0, [1, 1, 1], ahead)
+    lose_mark(cloud, ahead)
+    assert swept(cloud, NOW_MS) == [str(ahead)]
+
+
+@pytest.mark.parametrize("key", ["1", "12abc", "0000000000000000"])
+def test_a_key_without_a_time_does_not_stop_a_sweep(cloud, key):
+    cloud.dynamodb.put_item(
+        TableName=TELEMETRY, Item={TOPIC: {"S": TOPIC_OF_CAR}, BATCH: {"S": key}, "codec": {"NULL": True}}
+    )
+    cloud.store(0, [1, 1, 1])
+    epoch = ["1970-01-01T00"] if len(key) == 16 else []
+    assert swept(cloud, **{ALL: True}) == [*epoch, str(HOUR_0)]
 
 
 def test_what_cannot_be_archived_does_not_expire(cloud, monkeypatch, capsys):
