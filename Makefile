@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-analysis bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -62,6 +62,9 @@ bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: 
 
 bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysis $(if $(QUICK),--quick) $(if $(OUT),--out $(OUT))
+
+bench-analysis-cloud: setup ## analyse 50 robot-hours on an embedded cloud, with progress: HOURS=50 REPORT=figures.json
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysed_fleet $(if $(HOURS),--hours $(HOURS)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")

@@ -15,6 +15,7 @@ from functions.shared import clients
 from functions.shared.environment import variables
 from functions.shared.kept import Kept
 from functions.shared.recordings import Recordings
+from iort_analysis.archive.tables import write_table
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, encode_result
@@ -70,6 +71,9 @@ def handler(event: Mapping[str, Any], _context: object) -> None:
     given = variables(PlanEnvironment)
     result = analysed(decode_planned(event["planned"]), _recordings())
     kept = Kept(clients.s3(), given.files_bucket)
-    kept.put_json(f"{drive_prefix(result.drive)}result.json", encode_result(result))
+    prefix = drive_prefix(result.drive)
+    kept.put_json(f"{prefix}result.json", encode_result(result))
+    for name, table in result.mined.tables.items():
+        kept.put(f"{prefix}{name}.parquet", write_table(table), "application/vnd.apache.parquet")
     # The row comes last: it says that the result is there.
     FindingsTable(clients.dynamodb(), given.findings_table).put_drive(row(result, event["job"]))

@@ -14,7 +14,7 @@ from iort_contract.dynamodb import Item, TelemetryTable, plain, with_samples_bet
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import decode_batch
 from iort_contract.tables import ROBOT, STREAMS
-from iort_contract.topics import record_topic
+from iort_contract.topics import RECORD, build_topic
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
@@ -61,7 +61,7 @@ class Recordings:
         self, robot: str, stream: str, start_us: int, end_us: int, *, page_items: int | None = None
     ) -> Iterator[Item]:
         """The stored batches with samples from ``start_us`` to ``end_us`` (exclusive), in order of time."""
-        topic = record_topic(robot, stream, self._namespace)
+        topic = build_topic(RECORD, robot, stream, self._namespace)
         keys = with_samples_between(start_us, end_us)
         for page in self._telemetry.pages(topic, keys, page_items=page_items):
             yield from page.items

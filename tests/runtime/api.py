@@ -95,7 +95,7 @@ class Services:
             if operation == "GetParameter":
                 keys = {"publish_key": PUBNUB_KEY, "subscribe_key": PUBNUB_KEY, "origin": host, "tls": False}
                 given = {"Parameter": {"Name": "keys", "Value": json.dumps(keys)}}
-            elif operation == "Query":
+            elif operation in {"Query", "Scan"}:
                 given = {"Items": self.items, "Count": len(self.items), "ScannedCount": len(self.items)}
             self._answer(asked, operation, json.dumps(given).encode())
         elif path.startswith("/publish/"):
@@ -108,8 +108,9 @@ class Services:
         elif "list-type=2" in asked.path:
             self._answer(asked, "Objects", b"<ListBucketResult/>")
         else:
-            # The bucket has nothing yet.
-            self._answer(asked, "Object", b"", status=404)
+            # The bucket takes everything, and has nothing yet.
+            written = asked.command == "PUT"
+            self._answer(asked, "Write" if written else "Object", b"", status=200 if written else 404)
 
     def _answer(self, asked: BaseHTTPRequestHandler, operation: str, body: bytes, status: int = 200) -> None:
         self.asked.append(operation)

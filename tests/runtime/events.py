@@ -11,12 +11,15 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.analysis import PlannedDrive, encode_planned
+from iort_contract.messages.ask import Ask, encode_ask
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import File, FileRequest, encode_file_request
+from iort_contract.messages.findings import DriveKey
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
-from iort_contract.topics import FILE, LAMBDA, LIVE, PING, RECORD, build_topic
+from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, RECORD, build_topic
 
 ROBOT = "car"
 
@@ -30,6 +33,8 @@ def events() -> dict[str, dict[str, Any]]:
     live = LiveSample("aaaaaaaa", 0, now_us, now_us, sample, 0)
     file = File("a.bag", "recording", "application/octet-stream", 1, hashlib.sha256(b"a").hexdigest(), now_us)
     request = FileRequest("0123456789abcdef", file, {1: file.sha256})
+    drive = PlannedDrive(DriveKey(ROBOT, now_us - 1_000_000, "aaaaaaaa"), now_us, (VESC_STREAM,), VESC_STREAM)
+    ask = Ask("0123456789abcdef", now_us, 5_000, {})
     return {
         "admit": {
             "claimCertificateId": "0" * 64,
@@ -40,10 +45,14 @@ def events() -> dict[str, dict[str, Any]]:
             "parameters": {ROBOT_PARAMETER: ROBOT, SERIAL_PARAMETER: "0123456789abcdef"},
         },
         "alert": {TOPIC: build_topic(RECORD, ROBOT, VESC_STREAM), RECEIVED_MS: now_ms, **sample},
+        "analyse": {"job": "night", "planned": encode_planned(drive)},
+        "answer": rule_event(encode_ask(ask), build_topic(ASK, ROBOT, "calibration"), now_ms),
         "echo": rule_event(encode_ping(1, now_us), build_topic(PING, ROBOT, LAMBDA), now_ms),
+        "evaluate": {"job": "night", "robots": [ROBOT]},
         # A batch that expired while it waited.
         "later": {"Records": [{"messageId": "1", "body": json.dumps({PUT_OFF: [[topic, "1-0-0"]]})}]},
         "live": rule_event(encode_live(live), build_topic(LIVE, ROBOT, VESC_STREAM), now_ms),
+        "plan": {"job": "night", "robot": ROBOT, "start_us": now_us - 1_000_000, "end_us": now_us},
         "presence": {
             "clientId": ROBOT,
             "timestamp": now_ms,
@@ -51,6 +60,7 @@ def events() -> dict[str, dict[str, Any]]:
             "principalIdentifier": "1" * 64,
             "versionNumber": 0,
         },
+        "present": {"failed": encode_planned(drive), "error": {"Error": "States.Timeout", "Cause": ""}},
         "quarantine": {"Records": [{"messageId": "1", "body": _rule_error(), "attributes": {}}]},
         "query": {"robot": ROBOT, "stream": VESC_STREAM},
         "summarize": {"Records": [_record(now_us)]},

@@ -1,81 +1,80 @@
-"""The archive on the embedded cloud, by its schedule, its queue and its own role."""
+"""Hours go to the archive by the deployed function, with its own rights, and are read from there."""
 
 from __future__ import annotations
 
 import json
-from datetime import datetime, timezone
+import time
+from pathlib import Path
 
-from iort_contract.archive import DUE_MS, HOUR, PENDING, ArchiveTable, archived_hour, parse_pending
-from iort_contract.tables import TOPIC
-from iort_contract.topics import RECORD, build_topic
-from tests.local.conftest import run_agent, until
-from tests.local.data.drives import RATE_HZ, counter_log
+import pytest
+from boto3.dynamodb.types import TypeSerializer
 
-SECONDS = 3
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
+from iort_station import data
+from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.errors import StationError
+from iort_station.operations import archive, audit
+from iort_station.recordings import export, recordings
+from local.cloud import EmbeddedCloud
 
-
-def rows(embedded, topic):
-    table = ArchiveTable(embedded.cloud.client("dynamodb"), embedded.cloud.output("storage", "ArchiveTable"))
-    return [item for page in table.pages(topic) for item in page.items]
-
-
-def fire(embedded, name):
-    """Let EventBridge Scheduler call what a schedule calls, once, now."""
-    client = embedded.cloud.client("scheduler")
-    (found,) = [
-        one["Name"] for one in client.list_schedules()["Schedules"] if f"-archive-{name}-" in one["Name"]
-    ]
-    schedule = client.get_schedule(Name=found)
-    assert schedule["State"] == "ENABLED"
-    client.create_schedule(
-        Name=f"{found}-now",
-        ScheduleExpression=f"at({datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S})",
-        FlexibleTimeWindow=schedule["FlexibleTimeWindow"],
-        Target=schedule["Target"],
-        ActionAfterCompletion="DELETE",
-    )
+HOUR_US, S = 3_600_000_000, 1_000_000
+START = 1_700_000_000_000_000 // HOUR_US * HOUR_US
+ROBOT, STREAM = "archived", "vesc"
 
 
-def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundle, iort, tmp_path):
-    log = counter_log(tmp_path / "2026-05-04_10-00-00.csv", SECONDS)
-    source = {"type": "bag", "path": str(log), "speed": 0, "stamps": "original"}
-    car = bundle(sources=[source], live={"enabled": False}, record={"batch_s": 0.2})
-    run_agent(car)
-    topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
+def batches() -> list[Batch]:
+    """Batches in two hours, of which the first ends in the second one."""
+    made = []
+    for seq in range(60):
+        begin = START + HOUR_US + (seq - 30) * S - S // 2
+        times = [begin + i * 20_000 for i in range(50)]
+        made.append(
+            Batch("0badcafe", seq, times, {"speed": [seq + i / 50 for i in range(50)], "on": [True] * 50})
+        )
+    return made
 
-    def marked():
-        return [one for one in rows(embedded, PENDING) if parse_pending(one).topic == topic]
 
-    # The operator need not wait until no batch may follow.
-    (mark,) = until(marked)
-    ran = iort("archive", "run", car.robot, "vesc", "--json")
-    assert (ran.exit_code, json.loads(ran.stdout)) == (0, {"hours": 1}), ran.output
-    row = archived_hour(rows(embedded, topic)[0])
-    assert (row.samples, row.refused) == (SECONDS * RATE_HZ, 0)
-    verified = iort("archive", "verify", car.robot, "vesc", "--json")
-    assert verified.exit_code == 0, verified.output
-    assert json.loads(verified.stdout)["samples"] == SECONDS * RATE_HZ
+@pytest.fixture(scope="module")
+def items(embedded: EmbeddedCloud) -> list[dict]:
+    """The stored items; they expire in an hour, so that they are read from the archive."""
+    serialize, cloud = TypeSerializer().serialize, embedded.cloud
+    more = {
+        TOPIC: topic_of(cloud, ROBOT, STREAM),
+        EXPIRES_S: int(time.time()) + 3600,
+        RECEIVED_MS: START // 1000,
+    }
+    stored = []
+    for batch in batches():
+        item = {**json.loads(encode_batch(batch)), **more}
+        stored.append({name: serialize(value) for name, value in item.items()})
+    telemetry_table(cloud).put(stored)
+    return stored
 
-    # The car sends more of the same hour, and then no batch follows for ten minutes.
-    run_agent(car)
-    embedded.cloud.client("dynamodb").update_item(
-        TableName=embedded.cloud.output("storage", "ArchiveTable"),
-        Key={name: mark[name] for name in (TOPIC, HOUR)},
-        UpdateExpression="SET #due = :due",
-        ExpressionAttributeNames={"#due": DUE_MS},
-        ExpressionAttributeValues={":due": {"N": "0"}},
-    )
-    fire(embedded, "Hourly")
-    until(lambda: [parse_pending(one).is_day for one in marked()] == [True])
-    (shown,) = map(json.loads, iort("archive", "show", car.robot, "--json").stdout.splitlines())
-    assert (shown["samples"], shown["hours"]) == (2 * SECONDS * RATE_HZ, 1)
-    assert iort("archive", "verify", car.robot, "vesc").exit_code == 0
 
-    # An object that is gone, or not what was written, is found.
-    key = archived_hour(rows(embedded, topic)[0]).key
-    embedded.cloud.client("s3").put_object(
-        Bucket=embedded.cloud.output("storage", "FilesBucket"), Key=key, Body=b"something else"
-    )
-    wrong = iort("archive", "verify", car.robot, "vesc")
-    assert wrong.exit_code == 1
-    assert f"{key} is not the object that was written" in wrong.output
+def answers(embedded: EmbeddedCloud, folder: Path) -> tuple:
+    """What the operator gets of the stream."""
+    cloud = embedded.cloud
+    found = data.query(cloud, ROBOT, STREAM, fields=["speed", "on"], where="speed > 10")
+    with recordings.mcap(folder / "ride.mcap", force=True) as file:
+        export.write(cloud, data.select(ROBOT, STREAM), file)
+    columns = {name: column.tolist() for name, column in found.columns.items()}
+    audited = audit.audit(STREAM, audit.headers(cloud, ROBOT, STREAM))
+    return found.times_us.tolist(), columns, (folder / "ride.mcap").read_bytes(), audited
+
+
+def test_what_was_archived_is_read_once_it_has_expired(embedded, items, tmp_path):
+    cloud, topic = embedded.cloud, topic_of(embedded.cloud, ROBOT, STREAM)
+    before = answers(embedded, tmp_path)
+    assert archive.run(cloud, topic) >= 2
+    archive.wait(cloud, lambda _left: None)
+    # In the table and in the archive, each sample counts once.
+    assert answers(embedded, tmp_path) == before
+    for item in items:
+        key = {name: item[name] for name in (TOPIC, BATCH)}
+        cloud.client("dynamodb").delete_item(TableName=cloud.output("storage", "TelemetryTable"), Key=key)
+    assert answers(embedded, tmp_path) == before
+    found = data.query(cloud, ROBOT, STREAM)
+    assert [str(hour) for hour in found.origin.hours] == ["2023-11-14T22", "2023-11-14T23"]
+    with pytest.raises(StationError, match="2 hours of this range have expired"):
+        data.query(cloud, ROBOT, STREAM, on=data.LAMBDA)

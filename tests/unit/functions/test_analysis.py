@@ -11,6 +11,7 @@ import pytest
 
 from functions import analyse, evaluate, plan, present
 from functions.shared.kept import Kept
+from iort_analysis.archive.tables import read_table
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
@@ -23,7 +24,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.messages.findings import DriveKey, Estimate, Finding
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
-from iort_contract.topics import record_topic
+from iort_contract.topics import RECORD, build_topic
 from tests.fakes import item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
@@ -63,7 +64,7 @@ class Deployed:
                 part = block.take(seconds == second)
                 columns = {name: values(column) for name, column in part.columns.items()}
                 batches.append(Batch(run, first_seq + seq, part.times_us.tolist(), columns))
-            items = (item_of(batch, record_topic(robot, stream)) for batch in batches)
+            items = (item_of(batch, build_topic(RECORD, robot, stream)) for batch in batches)
             TelemetryTable(self.dynamodb, TELEMETRY).put(items)
 
     def run(self, **asked: object) -> list[dict]:
@@ -127,6 +128,10 @@ def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) 
     assert first.estimates["lap_mean_s"].unit == "s"
     result = cloud.json(f"{drive_prefix(first.drive)}result.json")
     assert result["estimates"].keys() == first.estimates.keys()
+    file = cloud.s3.get_object(Bucket=BUCKET, Key=f"{drive_prefix(first.drive)}laps.parquet")
+    laps = read_table(file["Body"].read())
+    assert laps["time_s"][laps["best"]] == pytest.approx([first.estimates["lap_best_s"].value])
+    assert set(laps["method"]) == {"gate"}
 
 
 def test_only_new_drives_are_analysed_unless_again(cloud: Deployed) -> None:
@@ -173,7 +178,7 @@ def test_no_state_of_a_recording_stops_the_others(cloud: Deployed) -> None:
     cloud.register("quarantine")
     cloud.record({"vesc": streams(20)["vesc"]}, robot="quarantine")
     gone = {
-        TOPIC: {"S": record_topic("quarantine", "vesc")},
+        TOPIC: {"S": build_topic(RECORD, "quarantine", "vesc")},
         "batch": {"S": f"{START_US + 5 * S:016d}-{RUN}-5"},
     }
     cloud.dynamodb.delete_item(TableName=TELEMETRY, Key=gone)

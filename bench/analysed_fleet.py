@@ -1,0 +1,160 @@
+"""`make bench-analysis-cloud`: robot-hours through the deployed analysis, on an embedded cloud of its own.
+
+    python -m bench.analysed_fleet [--hours 50] [--json FILE]
+
+Every robot has an hour of a simulated car, its motor controller at 50 Hz and its poses. The batches are
+written to the telemetry table, and the state machine analyses them as at night, with its progress shown.
+Lambda 2, which would summarise them all, is switched off. The processor time is that of the functions'
+processes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from bench.command import made, parser, write
+from bench.proof.cars import drive_of
+from bench.proof.drives import simulated
+from bench.proof.speed import HOUR_S
+from iort_analysis.samples.blocks import values
+from iort_contract.dynamodb import Item, TelemetryTable
+from iort_contract.messages.analysis import AnalysisRequest
+from iort_contract.messages.batch import Batch
+from iort_contract.tables import ROBOT, STREAMS, TOPIC
+from iort_contract.topics import RECORD, build_topic
+from iort_station.cloud import Cloud
+from iort_station.operations import analysis
+from local.cloud import EmbeddedCloud
+from tests.fakes import item_of
+
+_S = 1_000_000
+_FUNCTIONS = ("Plan", "Analyse", "Evaluate", "Present")
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a run took: ``cpu_s`` by function. ``samples`` are all samples of all robots."""
+
+    robot_hours: int
+    samples: int
+    drives: int
+    findings: int
+    seconds: float
+    cpu_s: dict[str, float]
+
+
+def main() -> None:
+    """Measure, and print."""
+    arguments = parser(__doc__)
+    arguments.add_argument("--hours", type=int, default=50, help="robot-hours, each a robot's")
+    given = arguments.parse_args()
+    console = Console()
+    with TemporaryDirectory() as folder, EmbeddedCloud(Path(folder), progress=console.print) as embedded:
+        figures = measure(embedded.cloud, given.hours, console)
+    of_all = sum(figures.cpu_s.values())
+    console.print(
+        f"{figures.robot_hours} robot-hours, {figures.samples:,} samples: {figures.seconds:.1f} s, "
+        f"{figures.drives} drives, {figures.findings} findings"
+    )
+    console.print(f"{of_all / figures.robot_hours:.2f} s of processor a robot-hour: {figures.cpu_s}")
+    write(given.json, {**made(), **asdict(figures)})
+
+
+def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
+    """Write the hours, and analyse them."""
+    _without_lambda_2(cloud)
+    batches, samples, start_us = _hour()
+    with Progress(console=console) as progress:
+        writing = progress.add_task("write", total=hours)
+        for number in range(hours):
+            _record(cloud, f"car{number}", batches)
+            progress.advance(writing)
+        before, began = _cpu_s(), time.monotonic()
+        run = analysis.start(cloud, AnalysisRequest((), start_us, start_us + round(HOUR_S) * _S, again=True))
+        analysing = progress.add_task("analyse", total=None)
+        for last in analysis.watch(cloud, run):
+            progress.update(analysing, total=last.drives, completed=last.done)
+        took_s, after = time.monotonic() - began, _cpu_s()
+    return Figures(
+        robot_hours=hours,
+        samples=samples * hours,
+        drives=last.drives or 0,
+        findings=last.findings,
+        seconds=took_s,
+        cpu_s={name: round(after[name] - before[name], 2) for name in _FUNCTIONS},
+    )
+
+
+def _hour() -> tuple[dict[str, list[Item]], int, int]:
+    """The stored batches of an hour's drive by stream, the number of samples, and its start."""
+    spec = drive_of(0, 0, seconds=HOUR_S)
+    streams, _ = simulated(spec)
+    found: dict[str, list[Item]] = {}
+    for stream, block in streams.items():
+        seconds = (block.times_us - block.times_us[0]) // _S
+        edges = np.searchsorted(seconds, np.arange(int(seconds[-1]) + 2))
+        parts = (block.take(slice(*edges[i : i + 2])) for i in range(len(edges) - 1))
+        found[stream] = [
+            item_of(
+                Batch(
+                    spec.key.run,
+                    seq,
+                    part.times_us.tolist(),
+                    {name: values(column) for name, column in part.columns.items()},
+                )
+            )
+            for seq, part in enumerate(part for part in parts if len(part.times_us))
+        ]
+    first_us = min(int(block.times_us[0]) for block in streams.values())
+    return found, sum(len(block.times_us) for block in streams.values()), first_us
+
+
+def _record(cloud: Cloud, robot: str, batches: dict[str, list[Item]]) -> None:
+    client = cloud.client("dynamodb")
+    row = {ROBOT: {"S": robot}, STREAMS: {"SS": list(batches)}, "speed_to_erpm_gain": {"N": "4614"}}
+    client.put_item(TableName=cloud.output("storage", "RobotsTable"), Item=row)  # type: ignore[arg-type]  # plain
+    table = TelemetryTable(client, cloud.output("storage", "TelemetryTable"))
+    for stream, items in batches.items():
+        topic = {"S": build_topic(RECORD, robot, stream, cloud.namespace)}
+        table.put({**item, TOPIC: topic} for item in items)
+
+
+def _without_lambda_2(cloud: Cloud) -> None:
+    client = cloud.client("lambda")
+    function = cloud.output("processing", "SummarizeFunction")
+    for mapping in client.list_event_source_mappings(FunctionName=function)["EventSourceMappings"]:
+        client.update_event_source_mapping(UUID=mapping["UUID"], Enabled=False)
+
+
+def _cpu_s() -> dict[str, float]:
+    """The processor time of the functions' processes so far."""
+    spent = dict.fromkeys(_FUNCTIONS, 0.0)
+    for name, process in _workers():
+        # A process may end meanwhile.
+        with suppress(OSError):
+            fields = (process / "stat").read_text().rpartition(")")[2].split()
+            spent[name] += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return spent
+
+
+def _workers() -> Iterator[tuple[str, Path]]:
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            command = (process / "cmdline").read_bytes().decode(errors="replace")
+            for name in _FUNCTIONS:
+                if f"-analysis-{name}" in command:
+                    yield name, process
+
+
+if __name__ == "__main__":
+    main()
