@@ -27,7 +27,7 @@ from rich.progress import (
 )
 
 from bench import ROOT
-from bench.proof import report, speed
+from bench.proof import recordings, report, speed
 from bench.proof.analysing import Analysed, analysed, on_all_cores
 from bench.proof.cars import DriveSpec
 from bench.proof.judging import Car, Judged, coverage, detection, judge
@@ -97,11 +97,13 @@ def _sections(
     cpu_s, samples = hour
     truths = [drives[spec] for spec in plan.covered_drives()]
     estimated = {name for drive in truths for name in drive.result.mined.estimates}
+    real = recordings.section()
     return [
         report.detected(plan, detection(judged)),
         report.alarms(plan, judged),
         report.covered(plan.covered, coverage(truths), sorted(estimated - TRUTHS.keys())),
         report.speed(cpu_s, samples, _ROBOT_HOURS, speed.bill(_ROBOT_HOURS, cpu_s, plan.seconds)),
+        *([] if real is None else [real]),
     ]
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.fitting import Fit, Prior, fit
-from iort_analysis.mining.signals import binned, bridged, lagged, resolution, smooth_basis
+from iort_analysis.mining.signals import averaged, binned, bridged, lagged, resolution, smooth_basis
 from iort_analysis.results import Mined, Table
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
 from iort_contract.messages.findings import Estimate
@@ -35,6 +35,8 @@ _PIECE_S = 450.0
 # Shorter drives, and such with a steadier current, say too little.
 _LEAST_S, _LEAST_A = 60.0, 0.5
 _MOST_ROWS = 30_000
+# Long beside what filters in a controller or logger delay.
+_MEAN_S = 1.5
 _CURVE_POINTS = 21
 _NAMES = (
     "battery_resistance_ohm",
@@ -98,15 +100,20 @@ def fit_battery(drive: Drive) -> Battery | str:
     open_columns = np.column_stack(smooth_basis(charge_ah, math.ceil(float(seconds[-1]) / _PIECE_S)))
     design = np.column_stack([open_columns, -current_a, *(-lag for lag in lags)])
     rows = slice(None, None, -(-len(seconds) // _MOST_ROWS))
-    fitted = _with_slow(design[rows], voltage_v[rows], open_columns.shape[1])
+    at = open_columns.shape[1]
+    fitted = _with_slow(design[rows], voltage_v[rows], at, resolution(voltage_v))
     if fitted is None:
         return "the drive's currents do not tell the resistance from the open voltage"
+    # Voltage and current that are not of the same moment make the resistance small; their means do not.
+    *slow, means_v = averaged(seconds, [*design.T, voltage_v], _MEAN_S)
+    slower = _with_slow(np.column_stack(slow), means_v, at, 0.0)
+    if slower is not None and slower.of(at, "ohm").low > fitted.of(at, "ohm").high:
+        fitted = slower
     return Battery(fitted, open_columns, charge_ah)
 
 
-def _with_slow(design: Array, voltage_v: Array, resistance: int) -> Fit | None:
+def _with_slow(design: Array, voltage_v: Array, resistance: int, step_v: float) -> Fit | None:
     """The fit whose priors of the slow resistances are in proportion to the resistance that it finds."""
-    step_v = resolution(voltage_v)
     columns = list(design.T)
     rough = fit(columns[: resistance + 1], voltage_v)
     if rough is None:

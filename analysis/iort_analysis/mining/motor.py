@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.fitting import Fit, Prior, fit, propagated
-from iort_analysis.mining.signals import binned, bridged, lagged
+from iort_analysis.mining.signals import averaged, binned, bridged, lagged
 from iort_analysis.results import Mined
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
 from iort_contract.messages.findings import Estimate
@@ -40,10 +40,15 @@ _WINDING, _WINDING_DEVIATION = 0.8, 0.15
 _FOC, _SIX_STEP = math.sqrt(3) / 2, 1.0
 # Slower, the modulation is mostly the controller's dead time; faster, it is cut off.
 _LEAST_ERPM, _MOST_DUTY = 500.0, 0.94
-_LEAST_A = 1.0
+_LEAST_A, _LEAST_V = 1.0, 0.1
+# Samples, and the correlation of currents that one controller calculated from another.
+_LEAST_ROWS, _LEAST_CORRELATION = 100, 0.8
 _MOST_ROWS = 60_000
+# The time between samples by which speed and voltage may be apart, as a share; and that of means.
+_LATE, _MEAN_S = 0.5, 0.1
 # The time in which a motor warms, where no sensor tells.
 _HEAT_S, _HEAT_STEP_S = 300.0, 1.0
+UNKNOWN_OHM = "speed and voltage may be too far apart in time for the resistance"
 _NAMES = ("motor_resistance_ohm", "motor_flux_linkage_wb", "motor_inductance_h", "motor_torque_nm_per_a")
 
 
@@ -69,18 +74,20 @@ def mine(drive: Drive) -> Mined:
     """The motor's resistance, flux linkage and inductance."""
     motor = fit_motor(drive)
     if isinstance(motor, str):
-        return Mined(missing=dict.fromkeys(_NAMES, motor))
-    estimates = {
-        "motor_resistance_25_ohm" if motor.at_reference else "motor_resistance_ohm": motor.resistance,
-        "motor_flux_linkage_wb": motor.flux_linkage,
-    }
+        return Mined(_ratios(drive), dict.fromkeys(_NAMES, motor))
+    estimates = {"motor_flux_linkage_wb": motor.flux_linkage}
     missing = {}
+    name = "motor_resistance_25_ohm" if motor.at_reference else "motor_resistance_ohm"
+    if motor.resistance.low > 0:
+        estimates[name] = motor.resistance
+    else:
+        missing[name] = UNKNOWN_OHM
     if not motor.at_reference:
         missing["motor_resistance_25_ohm"] = (
             "needs temp_motor: the resistance is that of the drive's mean heat"
         )
     if motor.inductance is None:
-        missing["motor_inductance_h"] = "needs avg_vd and avg_iq: duty_cycle hardly depends on it"
+        missing["motor_inductance_h"] = "needs avg_vd and avg_iq that depend on it: duty_cycle hardly does"
     else:
         estimates["motor_inductance_h"] = motor.inductance
     pairs = drive.known.get("pole_pairs")
@@ -106,15 +113,28 @@ def fit_motor(drive: Drive) -> Motor | str:
 
 
 def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) -> Motor | str:
-    omega = np.where(np.abs(speed) > _LEAST_ERPM, speed, np.nan) * RAD_S_PER_ERPM
+    # A motor that stands under current shows its resistance best.
+    usable = (np.abs(speed) > _LEAST_ERPM) | (np.abs(iq) > np.nanmax(np.abs(iq)) / 2)
+    omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
     if np.nanstd(iq) < _LEAST_A:
         return "the motor's current hardly changes"
-    found = _with_winding(drive, [omega, iq], vq, rows)
+    vd = drive.of(drive.vesc, "avg_vd")
+    # The length of the voltage is right even where the controller's angle is late.
+    volts = vq if vd is None else np.copysign(np.hypot(vd[rows], vq), vq)
+    found = _with_winding(
+        drive, [omega, iq], volts, rows, *([] if vd is None else [_square(omega, iq, volts)])
+    )
     if found is None:
         return "the drive's speeds and currents do not tell resistance from flux linkage"
+    return Motor(*found, _inductance(drive, omega, iq, rows))
+
+
+def _inductance(drive: Drive, omega: Array, iq: Array, rows: slice) -> Estimate | None:
+    """The inductance from vd, beside what a controller adds to it whose angle is late: flux * delay * w^2."""
     vd = drive.of(drive.vesc, "avg_vd")
-    inductance = None if vd is None else fit([-omega * iq], vd[rows])
-    return Motor(*found, None if inductance is None else inductance.of(0, "H"))
+    found = None if vd is None else fit([-omega * iq, omega * np.abs(omega)], vd[rows])
+    inductance = None if found is None else found.of(0, "H")
+    return inductance if inductance is not None and inductance.low > 0 else None
 
 
 def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor | str:
@@ -128,44 +148,94 @@ def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor | str:
     if battery is None:
         return "needs current_input: without it the control mode, and so the scale, is not known"
     usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
-    mode = fit([np.where(usable, duty * current, np.nan), np.ones(len(duty))], battery[rows])
-    if mode is None:
-        return "the drive's currents do not tell the control mode"
-    ratio = float(mode.coefficients[0])
-    if abs(ratio - _FOC) > (_SIX_STEP - _FOC) / 2:
-        return (
-            f"current_input is {ratio:.2f} of duty_cycle times current_motor, field-oriented control gives"
-            f" {_FOC:.2f}: only sums of phases are known"
-        )
+    if reason := _not_field_oriented(np.where(usable, duty * current, np.nan), battery[rows]):
+        return reason
     omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
     volts = duty * voltage / math.sqrt(3)
-    squares = (omega * current) ** 2 / (2 * np.where(np.abs(volts) > 0.1, volts, np.nan))
-    found = _with_winding(drive, [omega, current], volts, rows, squares)
+    found = _with_winding(drive, [omega, current], volts, rows, _square(omega, current, volts))
     if found is None:
         return "the drive's speeds and currents do not tell resistance from flux linkage"
     return Motor(*found, None)
+
+
+def _square(omega: Array, current: Array, volts: Array) -> Array:
+    """What the inductance adds to the length of the voltage, for its square."""
+    known = np.where(np.abs(volts) > _LEAST_V, volts, np.nan)
+    return np.asarray((omega * current) ** 2 / (2 * known), dtype=np.float64)
+
+
+def _ratios(drive: Drive) -> dict[str, Estimate]:
+    """What is left where the voltages' scale is not known: the shares of speed and current in them."""
+    names = ("speed", "duty_cycle", VOLTAGE_FIELD, "current_motor", "current_input")
+    speed, duty, voltage, current, battery = (drive.of(drive.vesc, name) for name in names)
+    if speed is None or duty is None or voltage is None or current is None or battery is None:
+        return {}
+    usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
+    if not _follows(np.where(usable, duty * current, np.nan), battery):
+        return {}
+    found = fit([np.where(usable, speed / 1000, np.nan), current], duty * voltage)
+    if found is None:
+        return {}
+    return {"motor_volts_per_krpm": found.of(0, "V/krpm"), "motor_volts_per_a": found.of(1, "V/A")}
+
+
+def _follows(modulated: Array, battery: Array) -> bool:
+    """Whether the battery's current follows duty cycle times motor current, as the firmware calculates it."""
+    known = np.isfinite(modulated) & np.isfinite(battery)
+    if known.sum() < _LEAST_ROWS:
+        return False
+    return float(np.corrcoef(modulated[known], battery[known])[0, 1]) > _LEAST_CORRELATION
+
+
+def _not_field_oriented(modulated: Array, battery: Array) -> str:
+    """Why the scale of the voltages is not known; empty if it is."""
+    if not _follows(modulated, battery):
+        return (
+            "current_input does not follow duty_cycle times current_motor, as the firmware calculates it:"
+            " the driver's currents are other ones"
+        )
+    mode = fit([modulated, np.ones(len(modulated))], battery)
+    ratio = math.nan if mode is None else float(mode.coefficients[0])
+    if abs(ratio - _FOC) <= (_SIX_STEP - _FOC) / 2:
+        return ""
+    return (
+        f"current_input is {ratio:.2f} of duty_cycle times current_motor, field-oriented control gives"
+        f" {_FOC:.2f}: only sums of phases are known"
+    )
 
 
 def _with_winding(
     drive: Drive, columns: list[Array], volts: Array, rows: slice, *more: Array
 ) -> tuple[Fit, bool] | None:
     """The fit, whose resistance grows with the motor's temperature where that is known; and if so."""
-    degc = drive.of(drive.vesc, "temp_motor")
-    if degc is None or not np.nanstd(degc):
-        # The winding warms with the current's square, some minutes late.
-        squares = columns[1] ** 2
-        heat = _late(drive.seconds[rows], squares)
-        heat -= np.nansum(squares * heat) / np.nansum(squares)
-        found = fit([*columns, columns[1] * heat, *more], volts)
-        return None if found is None else (found, False)
-    warmer = columns[1] * COPPER_PER_K * (degc[rows] - REFERENCE_DEGC)
+    omega, current = columns
     rough = fit([*columns, *more], volts)
     if rough is None:
         return None
-    size = abs(float(rough.coefficients[1]))
-    prior = Prior(_WINDING * size, _WINDING_DEVIATION * size)
-    found = fit([*columns, warmer, *more], volts, priors={2: prior})
+    flux, size = (abs(float(one)) for one in rough.coefficients[:2])
+    seconds = drive.seconds[rows]
+    # The speed may be older or newer than the voltage by part of the time between samples.
+    apart_s = float(np.median(np.diff(drive.seconds)))
+    late = np.gradient(omega, seconds)
+    priors = {2: Prior(0.0, _LATE * apart_s * flux)}
+    degc = drive.of(drive.vesc, "temp_motor")
+    if degc is None or not np.nanstd(degc):
+        # The winding warms with the current's square, some minutes late.
+        squares = current**2
+        heat = _late(seconds, squares)
+        heat -= np.nansum(squares * heat) / np.nansum(squares)
+        found = _averaged_fit(seconds, [*columns, late, current * heat, *more], volts, priors)
+        return None if found is None else (found, False)
+    warmer = current * COPPER_PER_K * (degc[rows] - REFERENCE_DEGC)
+    priors[3] = Prior(_WINDING * size, _WINDING_DEVIATION * size)
+    found = _averaged_fit(seconds, [*columns, late, warmer, *more], volts, priors)
     return None if found is None else (found, True)
+
+
+def _averaged_fit(seconds: Array, columns: list[Array], volts: Array, priors: dict[int, Prior]) -> Fit | None:
+    """The fit of means: noise of a current that follows the acceleration makes the resistance small."""
+    *means, volts = averaged(seconds, [*columns, volts], _MEAN_S)
+    return fit(means, volts, priors=priors)
 
 
 def _late(seconds: Array, values: Array) -> Array:

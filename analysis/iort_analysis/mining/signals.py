@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,18 @@ def binned(times_s: Array, values: Array, width_s: float) -> Array:
     total = np.bincount(at[known], weights=values[known], minlength=n)
     with np.errstate(invalid="ignore"):
         return np.asarray(total / np.where(count == 0, np.nan, count), dtype=np.float64)
+
+
+def averaged(times_s: Array, columns: Sequence[Array], width_s: float) -> list[Array]:
+    """The means of columns over ``width_s``, of the samples in which all are known."""
+    rows = np.column_stack(columns)
+    known = np.isfinite(rows).all(axis=1)
+    if not known.any():
+        return list(rows[:0].T)
+    at = (times_s[known] / width_s).astype(np.int64)
+    starts = np.flatnonzero(np.append(True, at[1:] != at[:-1]))
+    counts = np.diff(np.append(starts, len(at)))
+    return list((np.add.reduceat(rows[known], starts, axis=0) / counts[:, None]).T)
 
 
 def bridged(values: Array) -> Array:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.fitting import Fit, Prior, fit, propagated
-from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, fit_motor
+from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, UNKNOWN_OHM, fit_motor
 from iort_analysis.mining.signals import binned, bridged, lagged
 from iort_analysis.results import Mined
 from iort_contract.messages.findings import Estimate
@@ -150,6 +150,8 @@ def mine(drive: Drive) -> Mined:
         "controller": _fit_body(load._replace(copper=None), controller, motor),
     }
     resistance = fit_motor(drive)
+    if not isinstance(resistance, str) and resistance.resistance.low <= 0:
+        resistance = UNKNOWN_OHM
     estimates: dict[str, Estimate] = {}
     missing: dict[str, str] = {}
     finals = _finals(found)

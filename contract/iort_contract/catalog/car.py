@@ -64,6 +64,20 @@ MOTOR = (
         fields=_MOTOR,
     ),
     Parameter(
+        "motor_volts_per_krpm",
+        "V/krpm",
+        "voltage across two phases (duty cycle times battery voltage) for 1000 erpm, where the control is not"
+        " field-oriented",
+        fields=("duty_cycle", "voltage_input", "speed"),
+    ),
+    Parameter(
+        "motor_volts_per_a",
+        "V/A",
+        "the same voltage for an ampere of the motor",
+        worse="up",
+        fields=("duty_cycle", "voltage_input", "current_motor"),
+    ),
+    Parameter(
         "motor_inductance_h", "H", "inductance of a motor's phase", fields=("avg_vd", "avg_iq", "speed")
     ),
     Parameter(

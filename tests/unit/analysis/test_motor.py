@@ -38,12 +38,15 @@ def test_the_basic_fields_give_the_warm_resistance_and_the_flux() -> None:
 
 
 def test_a_motor_in_six_step_control_is_not_taken_for_one_in_field_oriented_control() -> None:
-    drive = proven(0).drive
+    drive, truth = proven(0)
     columns = dict(drive.samples.columns)
     columns["vesc.current_input"] = columns["vesc.duty_cycle"] * columns["vesc.current_motor"]
     mined = motor.mine(replace(drive, samples=drive.samples._replace(columns=columns)))
 
-    assert not mined.estimates
+    # Duty cycle times voltage is the voltage between two phases, in either mode.
+    volts = np.sqrt(3) * truth["flux_linkage_wb"] * motor.RAD_S_PER_ERPM * 1000
+    assert mined.estimates.keys() == {"motor_volts_per_krpm", "motor_volts_per_a"}
+    assert mined.estimates["motor_volts_per_krpm"].value == pytest.approx(volts, rel=0.002)
     assert "1.00 of duty_cycle times current_motor" in mined.missing["motor_resistance_ohm"]
 
 
