@@ -152,8 +152,8 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "analysis/PresentRole/DefaultPolicy": {**a_run},
         "analysis/MachineRole/DefaultPolicy": {**a_run},
         "analysis/Machine": {
-            "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role that "
-            "may change every log's delivery",
+            "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role "
+            "that may change every log's delivery",
             "AwsSolutions-SF2": "as Serverless-LambdaTracing of the functions",
             "Serverless-StepFunctionStateMachineXray": "as AwsSolutions-SF2",
             "CKV_AWS_284": "as AwsSolutions-SF2",

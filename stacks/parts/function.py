@@ -21,6 +21,9 @@ RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON
 # The emulator runs functions on its host, so the architecture has no effect there.
 ARCHITECTURE = lambda_.Architecture.custom(target.ARCHITECTURE)
 
+# numpy's linear algebra; more threads than cores wait for each other, and the waiting is paid.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+
 
 def function(
     stack: PlatformStack,
@@ -61,7 +64,7 @@ def function(
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
         ephemeral_storage_size=Size.mebibytes(scratch_mb) if scratch_mb else None,
-        environment=environment.variables(),
+        environment={**environment.variables(), **(_ONE_THREAD if arrays else {})},
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,
     )
