@@ -84,9 +84,10 @@ def detection(judged: Sequence[Judged]) -> dict[Case, Detected]:
 
 @dataclass
 class Coverage:
-    """How often a parameter's interval holds the truth, how wide it is, and how far off its value: as shares
-    of the truth, or in its unit where the truth is 0."""
+    """How often a parameter's interval holds the truth, how wide it is, and how far off its value: both in
+    ``unit``, % of the truth or the parameter's own where the truth is 0."""
 
+    unit: str
     drives: int = 0
     held: int = 0
     widths: list[float] = field(default_factory=list)
@@ -105,10 +106,12 @@ def coverage(drives: Sequence[Analysed]) -> dict[str, Coverage]:
         for name, estimate in drive.result.mined.estimates.items():
             if name not in TRUTHS:
                 continue
-            truth, one = TRUTHS[name](drive.truth), made.setdefault(name, Coverage())
+            truth, one = TRUTHS[name](drive.truth), made.setdefault(name, Coverage("%"))
             one.drives += 1
             one.held += estimate.low <= truth <= estimate.high
-            unit = abs(truth) or 1.0
-            one.widths.append((estimate.high - estimate.low) / unit)
-            one.off.append((estimate.value - truth) / unit)
+            if not truth:
+                one.unit = estimate.unit
+            scale = 100 / abs(truth) if truth else 1.0
+            one.widths.append((estimate.high - estimate.low) * scale)
+            one.off.append((estimate.value - truth) * scale)
     return made

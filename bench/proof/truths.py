@@ -7,6 +7,18 @@ from collections.abc import Callable, Mapping
 from iort_agent.sources.sim.heat import WIND_MPS
 from iort_agent.sources.sim.parameters import AIR_KG_PER_M3, G_MPS2
 
+# Estimates that are only compared with the car's own earlier drives, in a VESC's units: their interval says
+# how well a drive repeats, and a bias that all drives share changes no finding.
+INDICATORS = frozenset(
+    {
+        "inertia_a_per_krpm_s",
+        "rolling_current_a",
+        "brake_drag_a",
+        "voltage_drift_v",
+        "motor_current_drift_a",
+        "temperature_drift_k",
+    }
+)
 Truth = Callable[[Mapping[str, float]], float]
 
 
@@ -68,10 +80,7 @@ TRUTHS: dict[str, Truth] = {
     "motor_inductance_h": _same("motor_inductance_h"),
     "motor_torque_nm_per_a": lambda truth: 1.5 * truth["pole_pairs"] * truth["flux_linkage_wb"],
     "speed_to_erpm_gain": _same("driven_erpm_per_mps"),
-    # By the tyres' effective radius, which their creep is part of.
-    "motor_force_n_per_a": lambda truth: (
-        truth["newtons_per_amp"] * truth["driven_erpm_per_mps"] / truth["speed_to_erpm_gain"]
-    ),
+    "motor_force_n_per_a": _same("newtons_per_amp"),
     "effective_mass_kg": _moved_kg,
     "rotating_mass_kg": _same("rotating_mass_kg"),
     "friction_n": _friction_n,

@@ -22,6 +22,7 @@ MIN_DRIVES = MIN_ROBOTS = 3
 _RECENT = 50
 # A drive as unlikely as this takes no part in the baseline of the next one.
 _UNUSUAL = 1e-3
+_PLACES = {name: place for place, name in enumerate(PARAMETERS)}
 # A trend needs so many drives, over so many days.
 _TREND_DRIVES, _TREND_DAYS = 8, 5
 
@@ -187,8 +188,9 @@ def _explained(findings: Iterable[Finding]) -> list[Finding]:
         for kind in kinds.keys() - explained:
             changes = [finding for finding in kinds[kind] if _is_change(finding)]
             events = [finding for finding in kinds[kind] if not _is_change(finding)]
-            # Several parameters that changed are one cause; events have their own times.
-            first, *beside = sorted(changes, key=lambda finding: finding.p or 0.0) or events
+            # Several parameters that changed are one cause; events have their own times. The catalogue's
+            # order keeps the finding's id when the drive is analysed again with more history.
+            first, *beside = sorted(changes, key=_place) or events
             beside = [] if first in events else beside
             beside += [other for name in KINDS[kind].explains for other in kinds.get(name, ())]
             kept += [replace(first, text=texts.complete(first, beside))]
@@ -198,6 +200,10 @@ def _explained(findings: Iterable[Finding]) -> list[Finding]:
 
 def _is_change(finding: Finding) -> bool:
     return finding.subject.removesuffix("_trend") in PARAMETERS
+
+
+def _place(finding: Finding) -> tuple[int, str]:
+    return _PLACES[finding.subject.removesuffix("_trend")], finding.subject
 
 
 def _before(measured: Iterable[Measured], drive: DriveKey) -> list[Measured]:

@@ -27,7 +27,7 @@ HEALTHY = FaultConfig("payload", 1e-9)
 
 @cache
 def driven(fault: FaultConfig = HEALTHY) -> tuple[Drive, dict[str, float]]:
-    spec = drive_of(_CAR, 0, [fault], seconds=300.0)
+    spec = drive_of(_CAR, 0, [fault], seconds=250.0)
     made = simulated(spec, None)
     return build(spec.key, made.streams), made.truth
 
@@ -73,8 +73,8 @@ def test_a_loose_pinion_slips_under_torque() -> None:
 
 def test_a_current_that_drifts_is_told_from_the_voltage() -> None:
     found = mined(FaultConfig("sensor_drift", "strong", field="current_motor")).estimates
-    # 4 A in ten minutes, over five.
-    assert found["motor_current_drift_a"].value == pytest.approx(2.0, rel=0.1)
+    # 4 A in ten minutes, over a good four.
+    assert found["motor_current_drift_a"].value == pytest.approx(4 * 250 / 600, rel=0.1)
     assert abs(found["voltage_drift_v"].value) < 0.1
 
 
@@ -176,11 +176,11 @@ def test_an_hour_takes_less_than_a_second() -> None:
     drive = driven()[0]
     hours = {}
     for name, block in drive.raw.items():
-        n, length = 12, drive.end_us - drive.key.start_us + 20_000
+        n, length = 15, drive.end_us - drive.key.start_us + 20_000
         times = np.concatenate([block.times_us + i * length for i in range(n)])
         hours[name] = Block(times, {field: np.tile(c, n) for field, c in block.columns.items()})
     hour = build(drive.key, hours)
-    assert len(hour.samples.times_us) == 180_000
+    assert len(hour.samples.times_us) >= 180_000
     began = time.process_time()
     with np.errstate(all="ignore"):
         anomalies.mine(hour)

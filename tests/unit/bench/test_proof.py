@@ -98,7 +98,7 @@ def test_an_interval_beside_the_truth_does_not_cover_it():
     drives = [drive(battery_resistance_ohm=value) for value in (0.030, 0.031, 0.04, 0.02)]
     found = coverage([*drives, drive()])["battery_resistance_ohm"]
     assert (found.drives, found.share) == (4, 0.5)
-    assert found.off[2] == pytest.approx(1 / 3)
+    assert (found.unit, found.off[2]) == ("%", pytest.approx(100 / 3))
 
 
 def test_every_truth_is_of_a_parameter_and_in_its_unit():
