@@ -35,11 +35,13 @@ def function(
     scratch_mb: int | None = None,
     layers: list[lambda_.ILayerVersion] | None = None,
     reserved_concurrency: int = 0,
+    arrays: bool = False,
 ) -> lambda_.Function:
     """The handler of ``functions/<name in lower case>.py``. Its role may only write its own log so far.
 
     The stack outputs its name as ``<name>Function``. ``scratch_mb`` is the size of /tmp, 512 without one. A
-    ``reserved_concurrency`` of 0 reserves nothing.
+    ``reserved_concurrency`` of 0 reserves nothing. One that computes with ``arrays`` does so in one thread,
+    since it has one core.
     """
     log = logs.LogGroup(
         stack,
