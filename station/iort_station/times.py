@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timedelta, timezone
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from iort_contract.messages.insights import Extent
-from iort_contract.messages.page import Archived
 from iort_station.errors import UsageError
+
+if TYPE_CHECKING:
+    from iort_contract.messages.insights import Extent
+    from iort_contract.messages.page import Archived
 
 Time: TypeAlias = int | str | datetime
 

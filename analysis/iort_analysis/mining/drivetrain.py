@@ -33,7 +33,7 @@ _LEAST_MPS = 0.3
 _BRAKES_A, _RELEASE_S = 2.0, 4.0
 _LEAST_A = 1.0
 # The share of the friction that the tyres carry, about half of it: no field tells. Mean and variance.
-_BEYOND = (np.array([0.5]), np.array([[0.12**2]]))
+_BEYOND = (np.array([0.5]), np.array([[0.08**2]]))
 _GAIN = "speed_to_erpm_gain"
 _FORCES = (
     "motor_force_n_per_a",
@@ -132,9 +132,14 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
         return mass_kg(c) * c[index] * (1 + _slipped(c[2:]))
 
     parts = (flux, gains, moved, _BEYOND)
+    speed = drive.of(drive.vesc, "speed")
+    speed2 = 0.0 if speed is None else float(np.nanmean((speed / used_gain) ** 2))
     estimates = {
         "motor_force_n_per_a": propagated(
-            lambda c: per_amp(c[0], c[1]) / (1 + _slipped(c[2:]) * c[-1]), *parts, unit="N/A"
+            # Rolling wheels carry the air's drag too.
+            lambda c: per_amp(c[0], c[1]) / (1 + _slipped(c[2:]) * (c[-1] + c[5] * speed2 / c[4])),
+            *parts,
+            unit="N/A",
         ),
         "effective_mass_kg": propagated(mass_kg, *parts, unit="kg"),
         "friction_n": propagated(lambda c: force_n(c, 4), *parts, unit="N"),

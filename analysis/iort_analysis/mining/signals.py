@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_CHUNK = 64
+_FADES = 8
 
 
 def binned(times_s: Array, values: Array, width_s: float) -> Array:
@@ -45,19 +45,22 @@ def bridged(values: Array) -> Array:
 
 
 def lagged(values: Array, steps: float) -> Array:
-    """The response of a first-order lag of so many steps, from rest, at the end of each step."""
+    """The response of a first-order lag of so many steps, from rest, at the end of each step; along the last
+    axis."""
     keep = float(np.exp(-1 / steps))
-    at = np.arange(_CHUNK)
-    powers = keep**at
-    kernel = np.tril(powers[np.abs(np.subtract.outer(at, at))]) * (1 - keep)
-    padded = np.zeros(-(-len(values) // _CHUNK) * _CHUNK)
-    padded[: len(values)] = values
-    answer = padded.reshape(-1, _CHUNK) @ kernel.T
-    state = 0.0
-    for i in range(len(answer)):
-        answer[i] += state * keep * powers
-        state = answer[i, -1]
-    return np.asarray(answer.reshape(-1)[: len(values)], dtype=np.float64)
+    # The sum of a chunk's values, each divided by how far it has faded: by e^8 at most.
+    chunk = max(1, int(_FADES * steps))
+    fades = keep ** np.arange(chunk)
+    n, before = values.shape[-1], values.shape[:-1]
+    chunks = -(-n // chunk)
+    padded = np.zeros((*before, chunks * chunk))
+    padded[..., :n] = values
+    answer = np.cumsum(padded.reshape(*before, chunks, chunk) / fades, axis=-1) * (fades * (1 - keep))
+    state = np.zeros((*before, chunks))
+    for i in range(1, chunks):
+        state[..., i] = answer[..., i - 1, -1] + fades[-1] * keep * state[..., i - 1]
+    answer += state[..., None] * (keep * fades)
+    return np.asarray(answer.reshape(padded.shape)[..., :n], dtype=np.float64)
 
 
 def smooth_basis(values: Array, pieces: int) -> list[Array]:

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 _STEP_S, _MEAN, _LEAST_S = 0.25, 8, 180.0
 _LEAST_A2 = 1.0
 # The time constants that are tried, and the rounds that find the one between them.
-_TIMES_S = tuple(float(time) for time in np.geomspace(40, 3000, 16))
+_TIMES_S = tuple(float(time) for time in np.geomspace(40, 3000, 10))
 _ROUNDS = 5
 # The share of a body's cooling that goes into the other one.
 _SHARE = Prior(0.03, 0.03)
@@ -195,13 +195,13 @@ def _fit_body(load: _Load, degc: Array | None, other: Array | None) -> Body | st
     if other is None:
         # What the motor, whose temperature is not known, gives to the body.
         other = _late(heat, _MOTOR_S)
-        rough = fit(_columns([heat], float(np.median(_TIMES_S))), means)
+        rough = fit(_columns(heat[None], float(np.median(_TIMES_S))), means)
         size = 0.01 if rough is None else abs(float(rough.coefficients[2]))
         share = Prior(_MOTOR_SHARE.mean * size, _MOTOR_SHARE.deviation * size)
     else:
         other_degc = float(np.nanmean(other))
         other = bridged(other) - other_degc
-    inputs = [heat, other, wind, wind * (known - known.mean())]
+    inputs = np.stack([heat, other, wind, wind * (known - known.mean())])
     tried = ((time_s, fit(_columns(inputs, time_s), means, priors={3: share})) for time_s in _TIMES_S)
     fits = [(time_s, found) for time_s, found in tried if found is not None]
     if not fits:
@@ -217,16 +217,15 @@ def _fit_body(load: _Load, degc: Array | None, other: Array | None) -> Body | st
     return Body(load, found, fitted_s, known, other_degc)
 
 
-def _columns(inputs: list[Array], time_s: float) -> list[Array]:
-    """Rest and start, and how the body follows each input; all as means over a step."""
-    n = len(inputs[0])
-    ends = np.exp(-(np.arange(n) + 0.5) * _STEP_S / time_s)
-    late = [_late(one, time_s) for one in inputs]
+def _columns(inputs: Array, time_s: float) -> list[Array]:
+    """Rest and start, and how the body follows each input; all as means."""
+    ends = np.exp(-(np.arange(inputs.shape[1]) + 0.5) * _STEP_S / time_s)
     # A sensor is a little late, or early in its bin: the heat itself stands for that.
-    return [_means(column) for column in (np.ones(n), ends, *late, inputs[0])]
+    rows = np.vstack([np.ones_like(ends), ends, _late(inputs, time_s), inputs[0]])
+    return list(_means(rows))
 
 
-def _tangent(inputs: list[Array], time_s: float, coefficients: Array) -> Array:
+def _tangent(inputs: Array, time_s: float, coefficients: Array) -> Array:
     """How the model moves with the logarithm of the time constant."""
     one, two = (_columns(inputs, time_s * factor) for factor in (0.99, 1.01))
     moved: Any = sum(c * (b - a) / 0.02 for c, a, b in zip(coefficients, one, two, strict=False))
@@ -234,14 +233,17 @@ def _tangent(inputs: list[Array], time_s: float, coefficients: Array) -> Array:
 
 
 def _late(values: Array, time_s: float) -> Array:
-    """How a body of this time constant follows."""
+    """How a body of this time constant follows, in the middle of each step."""
     ends = lagged(values, time_s / _STEP_S)
-    return np.asarray((ends + np.append(0.0, ends[:-1])) / 2, dtype=np.float64)
+    made = ends.copy()
+    made[..., 1:] += ends[..., :-1]
+    return np.asarray(made / 2, dtype=np.float64)
 
 
 def _means(values: Array) -> Array:
     """The means over some steps: a temperature moves slowly."""
-    return np.asarray(values[: len(values) // _MEAN * _MEAN].reshape(-1, _MEAN).mean(axis=1))
+    whole = values[..., : values.shape[-1] // _MEAN * _MEAN]
+    return np.asarray(whole.reshape(*values.shape[:-1], -1, _MEAN).mean(axis=-1))
 
 
 def _binned(drive: Drive, name: str) -> Array | None:

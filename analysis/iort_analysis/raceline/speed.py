@@ -12,9 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.errors import AnalysisError
 from iort_analysis.raceline.reference import curvature
 
 _G = 9.81
+
+
+# A slower car stands.
+_SLOW_MPS = 0.01
+
+
+class LimitsError(AnalysisError):
+    """A car that does not get around the track; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +59,10 @@ class Profile:
 
 
 def profile(points: NDArray[np.float64], limits: Limits) -> Profile:
-    """The fastest profile of a lap after a lap: the speed at the end is that at the start."""
+    """The fastest profile of a lap after a lap: the speed at the end is that at the start.
+
+    Raises `LimitsError`.
+    """
     bend, _ = curvature(points)
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     grip = limits.grip * _G
@@ -63,6 +75,11 @@ def profile(points: NDArray[np.float64], limits: Limits) -> Profile:
     )
     forward = _forward(most_first, bend_first, steps_first, limits)
     speed = np.roll(_backward(forward, bend_first, steps_first, limits), first)
+    if speed.min() < _SLOW_MPS:
+        raise LimitsError(
+            f"the motor must pull more than rolling and the air take, got {limits.power_w:g} W and "
+            f"{limits.accel_mps2:g} m/s2 against {limits.rolling_n:g} N"
+        )
     times = 2 * steps / (speed + np.roll(speed, -1))
     return Profile(
         at_m=np.concatenate([[0.0], np.cumsum(steps)[:-1]]),
@@ -78,7 +95,11 @@ def _forward(most: list[float], bend: list[float], steps: list[float], limits: L
     speed = list(most)
     for i in range(len(speed) - 1):
         now = speed[i]
-        pull = min(_left(now, bend[i], limits), limits.accel_mps2, limits.power_w / (limits.mass_kg * now))
+        pull = min(
+            _left(now, bend[i], limits),
+            limits.accel_mps2,
+            limits.power_w / (limits.mass_kg * max(now, _SLOW_MPS)),
+        )
         reached = now**2 + 2 * (pull - _resisted(now, limits)) * steps[i]
         speed[i + 1] = min(speed[i + 1], math.sqrt(max(reached, 0.0)))
     return speed

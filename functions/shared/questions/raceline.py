@@ -23,13 +23,13 @@ def work(robot: str, body: Mapping[str, Any]) -> dict[str, Any]:
     """The line from a ``track`` and a ``car``. Raises `RefusedError` for what is neither."""
     try:
         track, car = _track(body.get("track")), _car(robot, body.get("car", {}))
-        limits = {name: found["value"] for name, found in car.items()}
-        track_reference = reference(track, limits.pop("width_m"))
+        values = {name: found["value"] for name, found in car.items()}
+        centre = reference(track, values.pop("width_m"))
+        offset, limits = least_curvature(centre), Limits(**values)
+        points = centre.line(offset)
+        found, before = profile(points, limits), profile(centre.points, limits)
     except (AnalysisError, ContractError) as error:
         raise RefusedError(INVALID, str(error)) from error
-    offset = least_curvature(track_reference)
-    points = track_reference.line(offset)
-    found, before = profile(points, Limits(**limits)), profile(track_reference.points, Limits(**limits))
     columns = {
         "s_m": found.at_m,
         "x_m": points[:, 0],

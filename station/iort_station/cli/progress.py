@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
-
 from iort_station.cli.console import errors
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
+
     from iort_station.data.batches import PageProgress
 
 # A bar that would be gone sooner is not shown.
@@ -34,6 +34,12 @@ def bar(title: str, total: float | None, *columns: ProgressColumn) -> Iterator[C
 @contextmanager
 def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[PageProgress]:
     """Show how much of a range has been read, if that takes longer than a second."""
+    if not errors.is_terminal:
+        yield lambda _more, _last_us: None
+        return
+    # It takes longer to load than a minute of samples to read.
+    from rich.progress import TextColumn  # noqa: PLC0415 - see above
+
     progress = _progress(TextColumn("{task.fields[items]:,} items"))
     range_us = (start_us, end_us - start_us) if start_us is not None and end_us is not None else None
     task = progress.add_task(title, total=1.0 if range_us else None, items=0)
@@ -44,7 +50,7 @@ def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[Pa
         items += more
         share = (last_us - range_us[0]) / max(1, range_us[1]) if range_us else 0.0
         progress.update(task, completed=min(1.0, max(0.0, share)), items=items)
-        if errors.is_terminal and time.monotonic() - began > _PATIENCE_S:
+        if time.monotonic() - began > _PATIENCE_S:
             progress.start()
 
     try:
@@ -54,6 +60,8 @@ def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[Pa
 
 
 def _progress(*columns: ProgressColumn) -> Progress:
+    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415 - as above
+
     shown = (TextColumn("{task.description}", markup=False), BarColumn(), *columns)
     return Progress(*shown, console=errors, transient=True)
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
-from iort_contract.messages.page import Archived
 from iort_station.texts import visible
 from iort_station.times import iso_s
+
+if TYPE_CHECKING:
+    from iort_contract.messages.page import Archived
 
 
 def say(text: str) -> None:

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Final, Generic, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypeAlias, TypeVar
 
 from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
 from iort_analysis.samples.blocks import Block, join
@@ -23,11 +23,13 @@ from iort_contract.archive import ArchivedHour, Hour, parse_hour
 from iort_contract.dynamodb import Keys, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
-from iort_contract.messages.page import Archived
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.archive import Archive, HourFile, is_expiring, key_of, within
 from iort_station.data.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
+
+if TYPE_CHECKING:
+    from iort_contract.messages.page import Archived
 
 # Where batches are read: where each is, in the table alone, or in the archive alone.
 Source: TypeAlias = Literal["auto", "table", "archive"]

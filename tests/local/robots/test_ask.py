@@ -159,3 +159,5 @@ def test_the_operator_asks_what_a_robot_may_ask(
     refused = iort("ask", bundle_of_asker.robot, "raceline", "--body", str(tmp_path / "track.json"))
     assert refused.exit_code == 1
     assert "invalid: track must be" in str(refused.exception)
+    # The robot's quota is none of its parameters.
+    assert "asked_" not in iort("robots", "show", bundle_of_asker.robot).stdout

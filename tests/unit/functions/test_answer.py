@@ -340,6 +340,7 @@ def test_the_raceline_uses_the_questions_limits_then_the_calibration_then_defaul
         ({"track": HALL, "car": {"wings": 2}}, "car must be an object of width_m"),
         ({"track": HALL, "car": {"grip": "wet"}}, "grip must be 0.05 to 5 1, got 'wet'"),
         ({"track": HALL, "car": {"width_m": 3}}, "the track must be wider than the car (3 m)"),
+        ({"track": HALL, "car": {"rolling_n": 500}}, "the motor must pull more than rolling and the air"),
     ],
 )
 def test_what_is_no_track_or_car_is_refused_with_the_reason(deployed, body, told):

@@ -16,6 +16,7 @@ from iort_contract.tables import (
     ADMITTED_MS,
     AGENT_VERSION,
     ALERT_PREFIX,
+    ASKED_PREFIX,
     CONNECTED_MS,
     DISCONNECT_REASON,
     DISCONNECTED_MS,
@@ -238,7 +239,7 @@ def _parameters(row: Mapping[str, Any]) -> str:
     return ", ".join(
         f"{key} {value}"
         for key, value in sorted(row.items())
-        if key not in known and not key.startswith(ALERT_PREFIX)
+        if key not in known and not key.startswith((ALERT_PREFIX, ASKED_PREFIX))
     )
 
 
