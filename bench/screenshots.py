@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +24,21 @@ from bench.errors import BenchError
 from bench.load.agent_process import AgentProcess
 from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.meters import chromium
+from bench.proof.analysing import analysed
+from bench.proof.cars import drive_of
+from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_analysis.evaluation.evaluate import evaluate
+from iort_analysis.process import analyse
+from iort_analysis.samples.blocks import Block
+from iort_contract.catalog.derived import F1TENTH
+from iort_contract.catalog.streams import POSE_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.analysis import AnalysedDrive
+from iort_contract.messages.findings import DriveKey
+from iort_station import data
+from iort_station.cloud import Cloud
+from iort_station.data import findings
+from iort_station.data.runs import runs
 from iort_station.fleet import robots
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
@@ -35,11 +51,16 @@ DRIVE_S = 100
 _REAL = "car1"
 _FLEET = 11
 _FAULTY, _STOPS, _SENSES = 4, 7, 1
+# What the analysis finds in the real car, and the drives of the healthy one before.
+_FAULT = {"kind": "worn_battery", "strength": "strong"}
+_EARLIER, _EARLIER_S = 8, 180.0
+_DAY_US = 86_400_000_000
 LAPTOP, PHONE = (1280, 800), (390, 844)
 VIEWS = {
     "fleet": "#/",
     "car": "#/car/car2",
     "history": f"#/history/{_REAL}",
+    "insights": f"#/insights/{_REAL}",
     "cloudwatch": "#/cloudwatch",
 }
 _FILL_S = 65.0
@@ -83,6 +104,8 @@ def _take(views: Sequence[str], out: Path) -> None:
         }
         # Wait until the charts are full and CloudWatch has a minute of metrics.
         threading.Event().wait(_FILL_S)
+        if "insights" in views:
+            _analyse(cloud.cloud)
         for view in views:
             on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
             looks: list[tuple[str, str, Theme]] = [
@@ -129,7 +152,7 @@ def _scrub(page: Any) -> None:
 @contextmanager
 def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
     """Run the real agent and the other cars until the block ends."""
-    source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3}
+    source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3, "faults": [_FAULT]}
     settings = {"sources": [source], "ping": {"rate_hz": 2}}
     bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
     pubnub = cloud.keys
@@ -156,6 +179,36 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
                 event.cancel()
             stop.set()
             driving.join()
+
+
+def _analyse(cloud: Cloud) -> None:
+    """Analyse what the real car has driven so far, after simulated drives of the same car."""
+    run = runs(cloud, _REAL, count=1)["runs"][0]
+    streams = {}
+    for name in (VESC_STREAM, POSE_STREAM):
+        read = data.query(cloud, _REAL, name, run["from_us"], run["to_us"])
+        streams[name] = Block(read.times_us, dict(read.columns))
+    result = analyse(DriveKey(_REAL, run["from_us"], run["run"]), streams, F1TENTH)
+    earlier = [
+        analysed(
+            replace(
+                drive_of(2, number, seconds=_EARLIER_S),
+                key=DriveKey(_REAL, run["from_us"] - (_EARLIER - number) * _DAY_US, f"{number:08x}"),
+                vehicle=VehicleConfig(charge=0.97 - number / 100),
+            )
+        ).result
+        for number in range(_EARLIER)
+    ]
+    table = findings.table(cloud)
+    for one in (*earlier, result):
+        mined = one.mined
+        table.put_drive(
+            AnalysedDrive(
+                one.drive, one.end_us, "screenshots", one.samples, mined.estimates, mined.missing, one.repairs
+            )
+        )
+    for finding in evaluate([result], [one.measured for one in earlier], []):
+        table.put_finding(finding)
 
 
 def _write(path: Path, png: bytes) -> None:

@@ -118,6 +118,7 @@ KINDS = {
             "samples of the motor controller are missing again and again",
             "check the cable and plugs between computer and controller, and the CAN bus' terminators",
             explains=("pattern_unusual",),
+            alternatives=("batches that were lost on their way to the cloud, which `iort audit` lists",),
         ),
         Kind(
             "fault_reported",

@@ -112,6 +112,15 @@ def test_the_delta_time_of_two_laps_is_the_true_one_at_every_place():
         compare(table, 3, 99)
 
 
+def test_the_speed_at_a_place_is_the_motors_and_else_that_of_the_positions():
+    drive = ride().drive
+    by_motor = laps.mine(drive).tables["lap_places"]["speed_mps"]
+    erpm = drive.samples.columns["vesc.speed"]
+    assert by_motor.max() == pytest.approx(erpm.max() / drive.vehicle.speed_to_erpm_gain, rel=0.02)
+    by_position = laps.mine(replace(drive, vehicle=None)).tables["lap_places"]["speed_mps"]
+    assert np.median(np.abs(by_position - by_motor)) < 0.15
+
+
 def wandering(seed: int) -> Driven:
     """A car that drives anywhere in a hall, at changing speeds."""
     chance, n = np.random.default_rng(seed), 6000

@@ -9,7 +9,7 @@ import numpy as np
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.intervals import mean_of
-from iort_analysis.mining.laps.laps import Laps, best, find_laps
+from iort_analysis.mining.laps.laps import Laps, best, find_laps, speed_mps
 from iort_analysis.mining.laps.path import Floats
 from iort_analysis.results import Mined, Table
 from iort_contract.catalog.findings import LAPS_TABLE, PARAMETERS, PLACES_TABLE
@@ -25,7 +25,7 @@ def mine(drive: Drive) -> Mined:
     found = find_laps(drive)
     if isinstance(found, str):
         return Mined(missing=dict.fromkeys(_NAMES, f"no laps: {found}"))
-    estimates = dict(_estimates(found))
+    estimates, speed = dict(_estimates(found)), speed_mps(drive, found)
     missing = {
         name: "needs the car's parameters"
         if name == "lap_distance_m"
@@ -34,7 +34,9 @@ def mine(drive: Drive) -> Mined:
         if name not in estimates
     }
     return Mined(
-        estimates, missing, tables={LAPS_TABLE: _laps_table(found), PLACES_TABLE: _places_table(found)}
+        estimates,
+        missing,
+        tables={LAPS_TABLE: _laps_table(found, speed), PLACES_TABLE: _places_table(found, speed)},
     )
 
 
@@ -59,7 +61,7 @@ def _per_km(laps: Laps) -> Floats:
     return laps.energy_wh / laps.distance_m * 1000
 
 
-def _laps_table(laps: Laps) -> Table:
+def _laps_table(laps: Laps, speed: Floats) -> Table:
     n = len(laps.time_s)
     return {
         "lap": np.arange(1, n + 1),
@@ -69,7 +71,7 @@ def _laps_table(laps: Laps) -> Table:
         "energy_wh": laps.energy_wh,
         "energy_wh_per_km": _per_km(laps),
         "mean_speed_mps": laps.distance_m / laps.time_s,
-        "top_speed_mps": laps.places.speed_mps.max(axis=1),
+        "top_speed_mps": speed.max(axis=1),
         "complete": laps.complete,
         "best": np.arange(n) == best(laps),
         "method": np.full(n, laps.method, dtype=object),
@@ -77,12 +79,12 @@ def _laps_table(laps: Laps) -> Table:
     }
 
 
-def _places_table(laps: Laps) -> Table:
+def _places_table(laps: Laps, speed: Floats) -> Table:
     """When each lap passed each place: the difference of two laps is their delta-time."""
     n, places = laps.places.since_s.shape
     return {
         "lap": np.repeat(np.arange(1, n + 1), places),
         "place_m": np.tile(laps.places.place_m, n),
         "since_s": np.round(laps.places.since_s.ravel(), 4),
-        "speed_mps": np.round(laps.places.speed_mps.ravel(), 3),
+        "speed_mps": np.round(speed.ravel(), 3),
     }

@@ -133,6 +133,18 @@ def _summed(seconds: Floats, bounds: Floats) -> Callable[[Floats], Floats]:
     return between
 
 
+def speed_mps(drive: Drive, laps: Laps) -> Floats:
+    """The speed at the places of each lap: by the motor, or without the car's parameters by the positions."""
+    erpm, vehicle = drive.of(drive.vesc, "speed"), drive.vehicle
+    if erpm is None or vehicle is None:
+        return laps.places.speed_mps
+    known = np.flatnonzero(np.isfinite(erpm))
+    speed = np.abs((erpm[known] - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain)
+    starts = (laps.start_us - drive.samples.times_us[0]) / 1e6
+    found: Floats = np.interp(starts[:, None] + laps.places.since_s, drive.seconds[known], speed)
+    return found
+
+
 def best(laps: Laps) -> int:
     """The index of the fastest complete lap."""
     return int(np.argmin(np.where(laps.complete, laps.time_s, math.inf)))
