@@ -85,12 +85,13 @@ def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
         f"{FLEET}/{mine}/*",
         f"{ASK}/{mine}/*",
     )
-    fleet = f"{FLEET}/{namespace}/*"
+    # What every robot hears.
+    heard_by_all = (f"{FLEET}/{namespace}/*",)
     subscribe = (
         f"{CMD}/{mine}/*",
         f"{_PING_OR_PONG}/{mine}/*",
         f"{ANSWER}/{mine}/*",
-        fleet,
+        *heard_by_all,
         f"{shadow}/*",
     )
     return {
@@ -103,7 +104,7 @@ def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
             _allow("iot:Publish", _arns(stack, "topic", *publish)),
             _allow(["iot:Publish", "iot:Receive"], _arns(stack, "topic", f"{shadow}/*")),
             _allow("iot:Subscribe", _arns(stack, "topicfilter", *subscribe)),
-            _allow("iot:Receive", _arns(stack, "topic", f"*/{mine}/*", fleet)),
+            _allow("iot:Receive", _arns(stack, "topic", f"*/{mine}/*", *heard_by_all)),
         ],
     }
 

@@ -155,9 +155,10 @@ def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
 
 def templates(copy: Copy) -> dict[str, dict[str, Any]]:
     """The resources of each stack of the copy, by logical id."""
-    layer = copy.root / "build" / "layer" / "lambda"
-    layer.mkdir(parents=True)
-    (layer / "nothing.py").touch()
+    for name in ("lambda", "analysis"):
+        layer = copy.root / "build" / "layer" / name
+        layer.mkdir(parents=True)
+        (layer / "nothing.py").touch()
     copy.run("app.py")
     return {
         path.name.removesuffix(".template.json"): json.loads(path.read_text())["Resources"]
