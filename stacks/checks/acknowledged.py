@@ -199,6 +199,14 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{iot}:topic/answer/{settings.namespace}/*/*"): f"{a_robot}, and its question",
             **to_a_queue,
         },
+        "archive/ArchiveRole/DefaultPolicy": {
+            wide(f"{files}/archive/*"): "the wildcard is the archive's own objects",
+            **to_a_queue,
+        },
+        "archive/Tasks": {
+            "Serverless-LambdaEventSourceMappingDestination": "as quarantine/Rejections: its dead-letter "
+            "queue is the quarantine's"
+        },
         "processing/QueryRole/DefaultPolicy": {
             wide(f"{files}/results/*"): (
                 "the wildcard is the result, which the function gives a random name"
