@@ -32,8 +32,8 @@ _LEAST_MPS = 0.3
 # The motor brakes with more than this; a brake that drags lets go in this time.
 _BRAKES_A, _RELEASE_S = 2.0, 4.0
 _LEAST_A = 1.0
-# The share of the friction that the tyres carry, about half of it: no field tells. Mean and variance.
-_BEYOND = (np.array([0.5]), np.array([[0.08**2]]))
+# The share of the friction that the tyres carry, a bit more than half: no field tells. Mean and variance.
+_BEYOND = (np.array([0.57]), np.array([[0.08**2]]))
 _GAIN = "speed_to_erpm_gain"
 _FORCES = (
     "motor_force_n_per_a",
