@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
-from functions.shared import clients
+from functions.shared import clients, recordings
 from functions.shared.environment import variables
 from functions.shared.kept import Kept
 from functions.shared.recordings import Recordings
@@ -55,21 +54,10 @@ def row(result: DriveResult, job: str) -> AnalysedDrive:
     )
 
 
-@cache
-def _recordings() -> Recordings:
-    given = variables(PlanEnvironment)
-    return Recordings(
-        clients.dynamodb(),
-        telemetry=given.telemetry_table,
-        robots=given.robots_table,
-        namespace=given.namespace,
-    )
-
-
 def handler(event: Mapping[str, Any], _context: object) -> None:
     """Entry point of the state Analyse."""
     given = variables(PlanEnvironment)
-    result = analysed(decode_planned(event["planned"]), _recordings())
+    result = analysed(decode_planned(event["planned"]), recordings.deployed())
     kept = Kept(clients.s3(), given.files_bucket)
     prefix = drive_prefix(result.drive)
     kept.put_json(f"{prefix}result.json", encode_result(result))

@@ -9,12 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from functions.shared import clients
+from functions.shared import clients, recordings
 from functions.shared.environment import variables
 from functions.shared.kept import Kept
 from functions.shared.recordings import Recordings
@@ -118,24 +118,13 @@ def unknown_to(table: FindingsTable, drives: list[PlannedDrive]) -> list[Planned
     return [one for one in drives if (one.drive, one.end_us) not in done]
 
 
-@cache
-def _recordings() -> Recordings:
-    given = variables(PlanEnvironment)
-    return Recordings(
-        clients.dynamodb(),
-        telemetry=given.telemetry_table,
-        robots=given.robots_table,
-        namespace=given.namespace,
-    )
-
-
 def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the states Robots, with an ``input``, and Plan, with a ``robot``."""
     now_us = time.time_ns() // 1000
     if "robot" not in event:
-        return selected(decode_request(event["input"], now_us), _recordings(), event["job"])
+        return selected(decode_request(event["input"], now_us), recordings.deployed(), event["job"])
     given, request = variables(PlanEnvironment), decode_request(event, now_us)
-    drives = planned(event["robot"], request, _recordings())
+    drives = planned(event["robot"], request, recordings.deployed())
     if not request.again:
         drives = unknown_to(FindingsTable(clients.dynamodb(), given.findings_table), drives)
     kept = Kept(clients.s3(), given.files_bucket)

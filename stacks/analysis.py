@@ -15,6 +15,7 @@ from aws_cdk import aws_scheduler as scheduler
 from aws_cdk import aws_sns as sns
 from aws_cdk import aws_stepfunctions as stepfunctions
 
+from iort_contract.archive import ARCHIVE_PREFIX
 from iort_contract.catalog.environments import EvaluateEnvironment, PlanEnvironment, PresentEnvironment
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
 from stacks.parts.base import PlatformStack
@@ -106,6 +107,7 @@ class Analysis(PlatformStack):
         return PlanEnvironment(
             namespace=self.settings.namespace,
             telemetry_table=self._storage.telemetry.table_name,
+            archive_table=self._storage.archive.table_name,
             robots_table=self._storage.robots.table_name,
             findings_table=self._storage.findings.table_name,
             files_bucket=self._storage.files.bucket_name,
@@ -113,6 +115,8 @@ class Analysis(PlatformStack):
 
     def _may_read(self, function_: lambda_.Function) -> None:
         self._storage.telemetry.grant(function_, "dynamodb:Query")
+        self._storage.archive.grant(function_, "dynamodb:Query")
+        allow(function_, ["s3:GetObject"], self._objects(ARCHIVE_PREFIX))
         self._storage.robots.grant(function_, "dynamodb:GetItem")
 
     def _objects(self, prefix: str) -> str:

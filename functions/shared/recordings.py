@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import islice
+from functools import cache
+from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from functions.shared import clients
+from functions.shared.environment import variables
+from functions.shared.expired import Expired
+from iort_contract.archive import ArchiveTable
 from iort_contract.catalog.derived import Vehicle
+from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import Item, TelemetryTable, plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import decode_batch
-from iort_contract.tables import ROBOT, STREAMS
+from iort_contract.tables import BATCH, ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 
 if TYPE_CHECKING:
@@ -39,8 +46,10 @@ class Registered(NamedTuple):
 class Recordings:
     """Reads the tables of telemetry and of robots."""
 
-    def __init__(self, client: DynamoDBClient, *, telemetry: str, robots: str, namespace: str) -> None:
-        self._client, self._robots, self._namespace = client, robots, namespace
+    def __init__(
+        self, client: DynamoDBClient, expired: Expired, *, telemetry: str, robots: str, namespace: str
+    ) -> None:
+        self._client, self._expired, self._robots, self._namespace = client, expired, robots, namespace
         self._telemetry = TelemetryTable(client, telemetry)
 
     def robots(self) -> list[str]:
@@ -60,11 +69,17 @@ class Recordings:
     def items(
         self, robot: str, stream: str, start_us: int, end_us: int, *, page_items: int | None = None
     ) -> Iterator[Item]:
-        """The stored batches with samples from ``start_us`` to ``end_us`` (exclusive), in order of time."""
+        """The stored batches with samples from ``start_us`` to ``end_us`` (exclusive), in order of time.
+
+        Where the table's items expire, the archive has them; those that both have come once.
+        """
         topic = build_topic(RECORD, robot, stream, self._namespace)
         keys = with_samples_between(start_us, end_us)
-        for page in self._telemetry.pages(topic, keys, page_items=page_items):
-            yield from page.items
+        pages = self._telemetry.pages(topic, keys, page_items=page_items)
+        stored = (item for page in pages for item in page.items)
+        archived = self._expired.items(topic, start_us, end_us)
+        for _, same in groupby(heapq.merge(archived, stored, key=_key), _key):
+            yield next(same)
 
     def fields(self, robot: str, stream: str, start_us: int, end_us: int) -> list[str] | None:
         """The fields of a stream at the beginning of a range; None if it has no samples there that could be
@@ -84,5 +99,23 @@ def robots_of(client: DynamoDBClient, table: str) -> list[str]:
     return sorted(str(item[ROBOT]["S"]) for page in pages for item in page["Items"])
 
 
+def _key(item: Item) -> str:
+    return str(item[BATCH]["S"])
+
+
 def _is_number(value: Any) -> bool:
     return not isinstance(value, (bool, str, set, list, dict, bytes)) and value is not None
+
+
+@cache
+def deployed() -> Recordings:
+    """The recordings of this function's deployment."""
+    given = variables(PlanEnvironment)
+    dynamodb = clients.dynamodb()
+    return Recordings(
+        dynamodb,
+        Expired(ArchiveTable(dynamodb, given.archive_table), clients.s3(), given.files_bucket),
+        telemetry=given.telemetry_table,
+        robots=given.robots_table,
+        namespace=given.namespace,
+    )

@@ -136,7 +136,28 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
         "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
     }
+    files = f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03"
+    a_run = {wide(f"{files}/analysis/plans/*"): "the wildcard is a run of the analysis, and its robots"}
+    read = {wide(f"{files}/archive/*"): "the wildcard is the robot, its stream and the time of a drive"}
     return {
+        "analysis/PlanRole/DefaultPolicy": {**a_run, **read},
+        "analysis/AnalyseRole/DefaultPolicy": {
+            wide(f"{files}/analysis/robot=*"): "the wildcard is the drive, which the event names",
+            **read,
+        },
+        "analysis/EvaluateRole/DefaultPolicy": {
+            wide(f"{files}/analysis/*"): "it compares all drives of a robot",
+            **a_run,
+        },
+        "analysis/PresentRole/DefaultPolicy": {**a_run},
+        "analysis/MachineRole/DefaultPolicy": {**a_run},
+        "analysis/Machine": {
+            "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role "
+            "that may change every log's delivery",
+            "AwsSolutions-SF2": "as Serverless-LambdaTracing of the functions",
+            "Serverless-StepFunctionStateMachineXray": "as AwsSolutions-SF2",
+            "W3005": "the CDK writes the dependency, and Step Functions tests the role's policy",
+        },
         "account/AuditRole/DefaultPolicy": {wide("*"): "an audit reads every certificate and policy"},
         "account/LogRole/DefaultPolicy": {
             wide(f"{logs}:log-group:AWSIotLogsV2:*"): "the wildcard is the log's streams"
@@ -176,6 +197,14 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{files}/results/ask/*"): "the wildcard is the robot that asked, and its question's id",
             wide(f"{iot}:topic/answer/{settings.namespace}/*/*"): f"{a_robot}, and its question",
             **to_a_queue,
+        },
+        "archive/ArchiveRole/DefaultPolicy": {
+            wide(f"{files}/archive/*"): "the wildcard is the archive's own objects",
+            **to_a_queue,
+        },
+        "archive/Tasks": {
+            "Serverless-LambdaEventSourceMappingDestination": "as quarantine/Rejections: its dead-letter "
+            "queue is the quarantine's"
         },
         "processing/QueryRole/DefaultPolicy": {
             wide(f"{files}/results/*"): (

@@ -21,6 +21,9 @@ RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON
 # The emulator runs functions on its host, so the architecture has no effect there.
 ARCHITECTURE = lambda_.Architecture.custom(target.ARCHITECTURE)
 
+# numpy's linear algebra; more threads than cores wait for each other, and the waiting is paid.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+
 
 def function(
     stack: PlatformStack,
@@ -32,11 +35,13 @@ def function(
     scratch_mb: int | None = None,
     layers: list[lambda_.ILayerVersion] | None = None,
     reserved_concurrency: int = 0,
+    arrays: bool = False,
 ) -> lambda_.Function:
     """The handler of ``functions/<name in lower case>.py``. Its role may only write its own log so far.
 
     The stack outputs its name as ``<name>Function``. ``scratch_mb`` is the size of /tmp, 512 without one. A
-    ``reserved_concurrency`` of 0 reserves nothing.
+    ``reserved_concurrency`` of 0 reserves nothing. One that computes with ``arrays`` does so in one thread,
+    since it has one core.
     """
     log = logs.LogGroup(
         stack,
@@ -61,7 +66,7 @@ def function(
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
         ephemeral_storage_size=Size.mebibytes(scratch_mb) if scratch_mb else None,
-        environment=environment.variables(),
+        environment={**environment.variables(), **(_ONE_THREAD if arrays else {})},
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,
     )

@@ -29,7 +29,7 @@ def schedules(
         iam.PolicyStatement(actions=["lambda:InvokeFunction"], resources=[called.function_arn])
     )
     for name, (expression, event) in when.items():
-        made = scheduler.CfnSchedule(
+        scheduler.CfnSchedule(
             stack,
             name,
             schedule_expression=expression,
@@ -39,4 +39,3 @@ def schedules(
                 arn=called.function_arn, role_arn=caller.role_arn, input=stack.to_json_string(event)
             ),
         )
-        made.node.add_dependency(caller)

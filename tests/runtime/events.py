@@ -10,6 +10,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
+from iort_contract.archive import DUE, TASK
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import PlannedDrive, encode_planned
 from iort_contract.messages.ask import Ask, encode_ask
@@ -47,6 +48,7 @@ def events() -> dict[str, dict[str, Any]]:
         "alert": {TOPIC: build_topic(RECORD, ROBOT, VESC_STREAM), RECEIVED_MS: now_ms, **sample},
         "analyse": {"job": "night", "planned": encode_planned(drive)},
         "answer": rule_event(encode_ask(ask), build_topic(ASK, ROBOT, "calibration"), now_ms),
+        "archive": {TASK: DUE},
         "echo": rule_event(encode_ping(1, now_us), build_topic(PING, ROBOT, LAMBDA), now_ms),
         "evaluate": {"job": "night", "robots": [ROBOT]},
         # A batch that expired while it waited.

@@ -82,7 +82,12 @@ SUMMARIZES = {
 }
 CONSUME = ("ReceiveMessage", "DeleteMessage", "ChangeMessageVisibility", "GetQueueAttributes", "GetQueueUrl")
 # Permissions of the functions that find and analyse drives.
-READS_DRIVES = {("dynamodb:Query", "Batches.Arn"), ("dynamodb:GetItem", "Robots.Arn")}
+READS_DRIVES = {
+    ("dynamodb:Query", "Batches.Arn"),
+    ("dynamodb:Query", "Archive.Arn"),
+    ("s3:GetObject", f"Files.Arn/{ARCHIVE_PREFIX}*"),
+    ("dynamodb:GetItem", "Robots.Arn"),
+}
 # For every role: each action on each resource, and who may assume it.
 ROLES = {
     "LiveRole": (

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
@@ -100,12 +101,14 @@ def test_the_tables_keys_are_the_contracts(synthesized):
     assert keys("Summary") == [(TOPIC, "HASH", "S"), (SECOND, "RANGE", "N")]
     assert keys("Robots") == [(ROBOT, "HASH", "S")]
     assert keys("Quarantine") == [(ROBOT, "HASH", "S"), (ENTRY, "RANGE", "S")]
+    assert keys("Archive") == [(TOPIC, "HASH", "S"), (HOUR, "RANGE", "S")]
     assert keys("Findings") == [(ROBOT, "HASH", "S"), (FINDING, "RANGE", "S")]
     expires = {"AttributeName": EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
         "Batches": expires,
         "Summary": expires,
         "Robots": None,
+        "Archive": None,
         "Quarantine": expires,
         "Findings": None,
     }
@@ -129,7 +132,7 @@ def test_lambda_1_has_reserved_concurrency_only_in_prod(synthesized, production)
     assert reserved(production) == {"functions.live.handler": 5}
 
 
-BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present"}
+BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present", "Archive"}
 
 
 def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized, functions, reader):
@@ -140,7 +143,7 @@ def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized,
         assert reader.text(function["LoggingConfig"]["LogGroup"]) == f"{noun}Log"
         assert reader.text(function["Role"]) == f"{noun}Role.Arn"
         assert (function["Runtime"], function["Architectures"]) == ("python3.13", ["arm64"])
-        # The analysis waits for nobody's answer.
+        # Nobody waits for the answers of the analysis and of the archive.
         assert function["Timeout"] <= {"Analyse": 90}.get(noun, 900 if noun in BACKGROUND else 60)
 
 
@@ -250,7 +253,10 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
     (ownership,) = bucket["OwnershipControls"]["Rules"]
     assert ownership["ObjectOwnership"] == "BucketOwnerEnforced"
     rules = {rule["Id"]: rule for rule in bucket["LifecycleConfiguration"]["Rules"]}
-    assert rules.keys() == {"abandoned", "results", "plans", "rare"}
+    assert rules.keys() == {"abandoned", "results", "plans", "archive", "rare"}
+    # What is archived is kept for good.
+    assert rules["archive"]["Prefix"] == ARCHIVE_PREFIX
+    assert "ExpirationInDays" not in rules["archive"]
     assert (rules["plans"]["Prefix"], rules["plans"]["ExpirationInDays"]) == (PLANS_PREFIX, 7)
     assert rules["abandoned"]["AbortIncompleteMultipartUpload"] == {"DaysAfterInitiation": 7}
     assert "Prefix" not in rules["abandoned"]

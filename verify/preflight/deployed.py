@@ -17,7 +17,7 @@ from verify.preflight.finding import Clients, Found, code, fine, item, listed, s
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = (
-    *("storage", "quarantine", "fleet", "processing", "ingest", "analysis", "monitoring", "site"),
+    *("storage", "quarantine", "fleet", "processing", "ingest", "archive", "analysis", "monitoring", "site"),
     "account",
 )
 # In these states neither CloudFormation nor the CDK can continue.

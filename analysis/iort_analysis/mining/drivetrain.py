@@ -23,6 +23,7 @@ from iort_analysis.mining.fitting import Fit, fit, propagated
 from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
 from iort_analysis.results import Mined
+from iort_contract.messages.findings import Estimate
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ _LEAST_MPS = 0.3
 # The motor brakes with more than this; a brake that drags lets go in this time.
 _BRAKES_A, _RELEASE_S = 2.0, 4.0
 _LEAST_A = 1.0
-# The share of the friction that the tyres carry, about half of it: no field tells. Mean and variance.
-_BEYOND = (np.array([0.5]), np.array([[0.08**2]]))
+# The share of the friction that the tyres carry, a bit more than half: no field tells. Mean and variance.
+_BEYOND = (np.array([0.57]), np.array([[0.08**2]]))
 _GAIN = "speed_to_erpm_gain"
 _FORCES = (
     "motor_force_n_per_a",
@@ -63,18 +64,30 @@ def mine(drive: Drive) -> Mined:
     if isinstance(motion, str):
         return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), motion)})
     found = (
-        Mined(missing=dict.fromkeys(_FORCES, motor))
+        Mined(_ratios(drive, motion, registered), dict.fromkeys(_FORCES, motor))
         if isinstance(motor, str)
         else _forces(drive, motion, motor, gain, registered)
     )
-    moved = (motion.coefficients, motion.covariance)
-    ratios = {
-        "acceleration_per_a_mps2": propagated(
-            lambda c: math.sqrt(max(c[0] * c[1], 0.0)) * (1 + _slipped(c)), moved, unit="m/s2/A"
-        ),
+    return Mined({**estimates, **found.estimates}, {**missing, **found.missing})
+
+
+def _ratios(drive: Drive, motion: Fit, gain: float) -> dict[str, Estimate]:
+    """What is left without the motor's flux linkage: forces for each kg."""
+    speed2, moved = _mean_square(drive, gain), (motion.coefficients, motion.covariance)
+
+    def per_amp(c: Array) -> Any:
+        return math.sqrt(max(c[0] * c[1], 0.0)) * (1 + _slipped(c) * (1 - c[3] * speed2 / c[2]))
+
+    return {
+        "acceleration_per_a_mps2": propagated(per_amp, moved, unit="m/s2/A"),
         "friction_per_mass_mps2": propagated(lambda c: c[2] * (1 + _slipped(c)), moved, unit="m/s2"),
     }
-    return Mined({**estimates, **ratios, **found.estimates}, {**missing, **found.missing})
+
+
+def _mean_square(drive: Drive, gain: float) -> float:
+    """The mean square of the speed in m2/s2."""
+    speed = drive.of(drive.vesc, "speed")
+    return 0.0 if speed is None else float(np.nanmean((speed / gain) ** 2))
 
 
 def _fit_motion(drive: Drive, gain: float) -> Fit | str:
@@ -132,8 +145,7 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
         return mass_kg(c) * c[index] * (1 + _slipped(c[2:]))
 
     parts = (flux, gains, moved, _BEYOND)
-    speed = drive.of(drive.vesc, "speed")
-    speed2 = 0.0 if speed is None else float(np.nanmean((speed / used_gain) ** 2))
+    speed2 = _mean_square(drive, used_gain)
     estimates = {
         "motor_force_n_per_a": propagated(
             # Rolling wheels carry the air's drag too.

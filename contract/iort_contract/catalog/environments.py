@@ -123,9 +123,10 @@ class QuarantineEnvironment(Environment):
 
 @dataclass(frozen=True)
 class PlanEnvironment(Environment):
-    """The functions that find drives and analyse them."""
+    """The functions that find drives and analyse them; hours that have expired are in the archive."""
 
     telemetry_table: str
+    archive_table: str
     robots_table: str
     findings_table: str
     files_bucket: str

@@ -8,8 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from tempfile import TemporaryFile
-from typing import IO, Literal
+from typing import Literal
 
 from botocore.exceptions import ClientError
 
@@ -43,7 +42,6 @@ from iort_station.fleet import registry
 _DUE_US = 2 * HOUR_US
 # A task takes at most ten minutes.
 _STALLED_S, _POLL_S = 660.0, 1.0
-_CHUNK = 1024 * 1024
 
 
 @dataclass
@@ -145,35 +143,25 @@ class _Objects:
         hashes: dict[str, str] = {}
         samples = 0
         if row.key:
-            file, sha256 = self._file(row.key)
-            if sha256 != row.sha256:
-                raise StationError(f"{row.key} is not the object that was written")
+            file = self._file(row.key, row.sha256)
             hashes = dict(file.hashes(hour))
             samples = sum(int(item[SAMPLES]["N"]) for item in file.headers(hour))
         counts = (len(hashes), samples)
         if row.refused:
-            key = refused_key(parse_topic(row.topic), hour)
-            items = [json.loads(line) for line in self._open(key)]
-            hashes.update({item[BATCH]["S"]: item_hash(item) for item in items})
+            lines = self._get(refused_key(parse_topic(row.topic), hour)).splitlines()
+            hashes.update({item[BATCH]["S"]: item_hash(item) for item in map(json.loads, lines)})
         if content_hash(sorted(hashes.items())) != row.content or counts != (row.batches, row.samples):
             raise StationError(f"{row.key or row.hour} does not hold what the manifest says")
         return hashes
 
-    def _read(self, key: str) -> tuple[ArchiveFile, str]:
-        file = self._open(key)
-        digest = hashlib.sha256()
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-        file.seek(0)
-        return ArchiveFile(file), digest.hexdigest()
+    def _read(self, key: str, sha256: str) -> ArchiveFile:
+        content = self._get(key)
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise StationError(f"{key} is not the object that was written")
+        return ArchiveFile(content)
 
-    def _open(self, key: str) -> IO[bytes]:
+    def _get(self, key: str) -> bytes:
         try:
-            body = self._client.get_object(Bucket=self._bucket, Key=key)["Body"]
+            return bytes(self._client.get_object(Bucket=self._bucket, Key=key)["Body"].read())
         except ClientError as error:
             raise StationError(f"{key} cannot be read: {error.response['Error']['Code']}") from error
-        file = TemporaryFile()  # noqa: SIM115 - closed with the last reference
-        for chunk in body.iter_chunks(_CHUNK):
-            file.write(chunk)
-        file.seek(0)
-        return file

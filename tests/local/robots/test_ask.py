@@ -160,4 +160,4 @@ def test_the_operator_asks_what_a_robot_may_ask(
     assert refused.exit_code == 1
     assert "invalid: track must be" in str(refused.exception)
     # The robot's quota is none of its parameters.
-    assert "asked_" not in iort("robots", "show", bundle_of_asker.robot).stdout
+    assert "asked_" not in iort("robots", "list").stdout

@@ -86,3 +86,14 @@ def test_a_position_that_comes_from_the_motors_speed_is_no_second_source() -> No
     mined = drivetrain.mine(replace(drive, streams={**drive.streams, "pose": odometry}))
 
     assert "calculated from the motor's speed" in mined.missing["speed_to_erpm_gain"]
+
+
+def test_without_the_motors_flux_forces_are_known_for_each_kilogram() -> None:
+    drive, truth = proven(0)
+    columns = {name: column for name, column in drive.samples.columns.items() if "current_input" not in name}
+    mined = drivetrain.mine(replace(drive, samples=drive.samples._replace(columns=columns)))
+
+    kg = truth["mass_kg"] + truth["rotating_mass_kg"]
+    found = mined.estimates["acceleration_per_a_mps2"].value
+    assert found == pytest.approx(truth["newtons_per_amp"] / kg, rel=0.003)
+    assert "control mode" in mined.missing["effective_mass_kg"]

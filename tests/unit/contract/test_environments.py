@@ -16,8 +16,8 @@ from iort_contract.catalog.environments import (
     "written",
     [
         LiveEnvironment("iort", "/iort/pubnub", {"vesc": ["speed"], "imu": []}, "queue"),
-        LaterEnvironment("iort", "telemetry", "summary", "robots", "queue", robot_metrics=True),
-        LaterEnvironment("iort", "telemetry", "summary", "robots", "queue", robot_metrics=False),
+        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", robot_metrics=True),
+        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", robot_metrics=False),
         AlertEnvironment("iort", "robots", "topic", 10.5),
         UploadEnvironment("iort", "files", "robots", "queue", 50 * 10**9),
     ],

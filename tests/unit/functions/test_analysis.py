@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 
@@ -12,8 +13,10 @@ import pytest
 from functions import analyse, evaluate, plan, present
 from functions.shared.kept import Kept
 from iort_analysis.archive.tables import read_table
+from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
+from iort_contract.archive import ArchivedHour, hour_of
 from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
 from iort_contract.cloud import drive_prefix, plan_key
 from iort_contract.dynamodb import TelemetryTable
@@ -30,9 +33,10 @@ from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
 S = 1_000_000
 CAR, BUCKET, RUN = "car", "files", "00c0ffee"
-TELEMETRY, ROBOTS, FINDINGS = "telemetry", "robots", "findings"
+TELEMETRY, ARCHIVE, ROBOTS, FINDINGS = "telemetry", "archive", "robots", "findings"
 VARIABLES = {
     "TELEMETRY_TABLE": TELEMETRY,
+    "ARCHIVE_TABLE": ARCHIVE,
     "ROBOTS_TABLE": ROBOTS,
     "FINDINGS_TABLE": FINDINGS,
     "FILES_BUCKET": BUCKET,
@@ -88,7 +92,13 @@ class Deployed:
 @pytest.fixture
 def cloud(aws: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
     dynamodb = boto3.client("dynamodb")
-    for table, keys in {TELEMETRY: (TOPIC, "batch"), ROBOTS: (ROBOT,), FINDINGS: (ROBOT, FINDING)}.items():
+    tables = {
+        TELEMETRY: (TOPIC, "batch"),
+        ARCHIVE: (TOPIC, "hour"),
+        ROBOTS: (ROBOT,),
+        FINDINGS: (ROBOT, FINDING),
+    }
+    for table, keys in tables.items():
         dynamodb.create_table(
             TableName=table,
             KeySchema=[
@@ -132,6 +142,46 @@ def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) 
     laps = read_table(file["Body"].read())
     assert laps["time_s"][laps["best"]] == pytest.approx([first.estimates["lap_best_s"].value])
     assert set(laps["method"]) == {"gate"}
+
+
+def test_hours_that_have_expired_are_read_from_the_archive(cloud: Deployed) -> None:
+    """One hour of a drive is in the archive alone, the next one in the table, and some batches in both."""
+    hour_us = 3_600_000_000
+    to_hour_s = (hour_us - START_US % hour_us) // S
+    cloud.register(CAR)
+    cloud.record(later({"vesc": streams(90)["vesc"]}, to_hour_s - 45))
+    cloud.run(end_us=START_US + 2 * hour_us)
+    (whole,) = cloud.table.drives(CAR)
+
+    topic = build_topic(RECORD, CAR, "vesc")
+    items = [one for page in TelemetryTable(cloud.dynamodb, TELEMETRY).pages(topic) for one in page.items]
+    hour = hour_of(START_US)
+    first = [one for one in items if int(one["batch"]["S"][:16]) < hour.end_us]
+    file = io.BytesIO()
+    written = write_hour(first, file, hour=hour, refused=io.BytesIO(), scratch=io.BytesIO())
+    row = ArchivedHour(
+        topic,
+        str(hour),
+        "archive/hour.parquet",
+        len(first),
+        written.samples,
+        0,
+        "",
+        "",
+        1,
+        1,
+        first_expires_s=1,
+    )
+    cloud.s3.put_object(Bucket=BUCKET, Key=row.key, Body=file.getvalue())
+    cloud.dynamodb.put_item(TableName=ARCHIVE, Item=row.item())
+    for one in first[:-5]:
+        key = {name: one[name] for name in (TOPIC, "batch")}
+        cloud.dynamodb.delete_item(TableName=TELEMETRY, Key=key)
+    cloud.run(end_us=START_US + 2 * hour_us, again=True)
+
+    (again,) = cloud.table.drives(CAR)
+    assert 40 < len(first) < 50 < len(items)
+    assert again == whole
 
 
 def test_only_new_drives_are_analysed_unless_again(cloud: Deployed) -> None:

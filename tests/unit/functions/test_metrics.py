@@ -33,7 +33,7 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         assert {metric["Name"] for metric in directive["Metrics"]} == set(names)
         for metric in directive["Metrics"]:
             endings = {"Ms": "Milliseconds", "Bytes": "Bytes", "Volts": "None", "DegC": "None"}
-            units = [unit for ending, unit in endings.items() if metric["Name"].endswith(ending)]
+            units = [unit for ending, unit in endings.items() if ending in metric["Name"]]
             assert metric["Unit"] == (units or ["Count"])[0]
             assert line[metric["Name"]] == 2.5
 

@@ -11,6 +11,7 @@ from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
 from tests.fakes import (
+    ARCHIVE,
     NAMES,
     ROBOTS,
     SUMMARY,
@@ -24,6 +25,7 @@ def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys
         monkeypatch.setenv(f"{name.upper()}_TABLE", table)
     for queue in ("REJECTED", "PUT_OFF"):
         monkeypatch.setenv(f"{queue}_QUEUE", f"https://sqs.example/{queue}")
+    monkeypatch.setenv("ARCHIVE_TABLE", ARCHIVE)
     monkeypatch.setenv("ROBOT_METRICS", "false")
     dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream = Stream(dynamodb)

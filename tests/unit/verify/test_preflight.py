@@ -286,7 +286,7 @@ CASES = [
         "robots",
     ),
     ("stacks", {}, {}, FINE, "none: a first one"),
-    ("stacks", {}, stack_answers(ALL), FINE, "8 of 8"),
+    ("stacks", {}, stack_answers(ALL), FINE, "10 of 10"),
     *(
         ("stacks", {}, stack_answers({**ALL, "fleet": state}), STOPS, f"iort-fleet is {state}")
         for state in (
@@ -299,7 +299,7 @@ CASES = [
             "UPDATE_IN_PROGRESS",
         )
     ),
-    ("stacks", {}, stack_answers({"storage": "UPDATE_ROLLBACK_COMPLETE"}), FINE, "1 of 8"),
+    ("stacks", {}, stack_answers({"storage": "UPDATE_ROLLBACK_COMPLETE"}), FINE, "1 of 10"),
     ("names", {}, {}, FINE, "free"),
     ("names", {}, {"GetPolicy": {"policyName": "a"}}, STOPS, "policy iort-robot, policy iort-claim"),
     ("names", {}, {"DescribeThingType": {"thingTypeName": "a"}}, STOPS, "thing type iort-robot"),
@@ -508,7 +508,7 @@ def test_the_cdks_arguments_are_read_as_app_py_reads_them(tmp_path):
             "never",
         ]
     )
-    read = preflight.context([*asked.context, f"layer={tmp_path}"])
+    read = preflight.context([*asked.context, f"layer={tmp_path}", f"analysis_layer={tmp_path}"])
     made = Settings.read(read.get)
     assert (made.stage, made.budget_usd, made.alarm_email) == ("prod", 50, "a@b.org")
     with pytest.raises(SettingsError, match="stage must be"):

@@ -77,7 +77,7 @@ export class InsightsView {
   /** Show the new findings; without drives, say why there are none. */
   private async analysed(drives: number): Promise<void> {
     await this.load(this.robot, {});
-    if (drives === 0) this.note.set("No drive of that time is over yet: a drive ends when the car has stood, or sent nothing, for a minute.");
+    if (drives === 0) this.note.set("No drives were found in that time: nothing was recorded, or the car stood.");
   }
 
   private async present(query: Query<"insights">): Promise<void> {

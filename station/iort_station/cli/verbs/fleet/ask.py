@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +11,8 @@ import typer
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_station.cli.console import errors, print_json
-from iort_station.cli.options import Robot
+from iort_station.cli.console import errors, tell
+from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
 from iort_station.fleet import questions
@@ -28,8 +29,9 @@ def ask(
         Path | None,
         typer.Option(help="A JSON file with the body of the question."),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Ask the cloud what a robot may ask, and print the answer as JSON.
+    """Ask the cloud what a robot may ask, and print the answer: indented, or as one line of JSON.
 
     It takes nothing from the robot's quota. Exit status 1 if the cloud refuses, with the reason.
     """
@@ -37,7 +39,7 @@ def ask(
     cloud = context.obj.cloud()
     with errors.status(f"waiting for {question} of {robot}"):
         answer = questions.ask(cloud, robot, question, asked)
-    print_json(answer)
+    tell(answer, json.dumps(answer, indent=2), as_json=as_json)
 
 
 def _read(file: Path) -> dict[str, Any]:
