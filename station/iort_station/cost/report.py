@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from iort_station.cost import line_items, model
+from iort_station.cost import archiving, line_items, model
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import PRODUCTS, Listed
 from iort_station.cost.prices import AS_OF, PRICES, REGION, Price
@@ -65,6 +65,15 @@ def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
     ]
     return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
+
+
+def robot_year(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+    """What a robot records in a year, in DynamoDB beside the archive."""
+    body: list[tuple[str, ...]] = [
+        (place.what, f"{place.size_bytes / 1e9:.2f}", _dollars(place.dollars))
+        for place in archiving.robot_year(usage, prices)
+    ]
+    return Rows((f"a robot-year, {usage.hours_per_day:g} h a day", "GB", "dollars"), body)
 
 
 def differences(listed: Listed) -> Rows:
