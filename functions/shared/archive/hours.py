@@ -125,10 +125,10 @@ def _with_archived(
     hour = parse_hour(row.hour)
     sources = [stored]
     if row.key:
-        file = files.enter_context(archive.objects.read(row.key)[0])
+        file = files.enter_context(archive.objects.read(row.key).file)
         sources.append(archived_items(ArchiveFile(file), row.topic, hour))
     if row.refused:
-        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour))[0])
+        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour)).file)
         sources.append(iter(sorted(map(json.loads, lines), key=_id)))
     # The stored one is the first of a kind.
     for _, same in groupby(merge(*sources, key=_id), key=_id):

@@ -6,6 +6,8 @@ import hashlib
 import json
 import subprocess
 import sys
+import time
+from contextlib import nullcontext
 
 import boto3
 import pytest
@@ -15,6 +17,7 @@ from functions import archive as function
 from functions.quarantine import entries
 from functions.shared.archive import hours
 from functions.shared.archive.archive import archive as archive_of_environment
+from functions.shared.archive.days import WRITING_MS, BeingWrittenError
 from functions.shared.archive.expiry import PUT_OFF_S, margin_s
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import in_order
@@ -253,8 +256,8 @@ LATER_MS = NOW_MS + 3 * DAY_S * 1000
 OBJECT_OF_DAY = day_key(CAR, HOUR_0)
 
 
-def join_day(cloud):
-    return function.perform({TASK: JOIN, TOPIC: TOPIC_OF_CAR, HOUR: HOUR_0.date}, LATER_MS)
+def join_day(cloud, now_ms=LATER_MS):
+    return function.perform({TASK: JOIN, TOPIC: TOPIC_OF_CAR, HOUR: HOUR_0.date}, now_ms)
 
 
 @pytest.fixture
@@ -301,7 +304,7 @@ def test_a_day_is_whole_whenever_its_join_is_killed(two_hours, monkeypatch, wher
         with pytest.raises(Killed):
             join_day(cloud)
     assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1])
-    join_day(cloud)
+    join_day(cloud, now_ms=int(time.time() * 1000) + WRITING_MS + 1)
     assert cloud.keys() == [OBJECT_OF_DAY]
     assert (cloud.speeds(HOUR_0), cloud.speeds(HOUR_1)) == ([0, 0, 0], [1, 1, 1])
 
@@ -321,6 +324,31 @@ def test_a_late_batch_during_the_join_is_not_lost(two_hours, monkeypatch):
     join_day(cloud)
     assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7]
     assert cloud.speeds(HOUR_0) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("joined_before", [False, True])
+def test_a_join_leaves_an_object_whose_row_is_still_to_come(two_hours, monkeypatch, joined_before):
+    """A late batch's run has written the hour's object, and the join is faster than its row."""
+    cloud = two_hours
+    if joined_before:
+        join_day(cloud)
+    cloud.store(5, [7, 7, 7], HOUR_1, seq=1)
+    cloud.marks.add(DAY, 0)
+    real = cloud.archive.client.put_item
+
+    def meanwhile(**request):
+        monkeypatch.setattr(cloud.archive.client, "put_item", real)
+        with nullcontext() if joined_before else pytest.raises(BeingWrittenError):
+            join_day(cloud)
+        return real(**request)
+
+    monkeypatch.setattr(cloud.archive.client, "put_item", meanwhile)
+    cloud.archived(HOUR_1, LATER_MS)
+    assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7]
+    assert DAY in cloud.pending()
+    join_day(cloud)
+    assert cloud.keys() == [OBJECT_OF_DAY]
+    assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7]
 
 
 # --- what is due ------------------------------------------------------------------------------------
