@@ -55,7 +55,7 @@ def plan_due(archive: Archive, now_ms: int) -> dict[str, int]:
         safe_s = int(row[SAFE_UNTIL_S]["N"]) if SAFE_UNTIL_S in row else 0
         if is_late and not pending.is_day and safe_s <= now_ms // 1000 + margin_s(archive.given.retention_s):
             tasks.append(_task(PUT_OFF, pending))
-        tasks.append(_task(JOIN if pending.is_day else ARCHIVE, pending))
+        tasks.append({**_task(JOIN if pending.is_day else ARCHIVE, pending), DUE_MS: due_ms})
     _send(archive, tasks)
     emit("archive", TasksOverdue=overdue)
     return {"tasks": len(tasks), "overdue": overdue}

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 
 import boto3
 import pytest
@@ -182,6 +183,10 @@ def test_an_hour_never_shrinks(cloud):
     cloud.forget(first)
     cloud.archived()
     assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+    # Late ones do not hide it by their number.
+    cloud.store(2, [3, 3, 3], seq=2)
+    cloud.archived()
+    assert cloud.speeds() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
 
 
 @pytest.mark.parametrize("where", ["put_object", "put_item"])
@@ -373,6 +378,29 @@ def test_a_live_stream_is_marked_once_an_hour_and_is_due_when_it_is_over(cloud, 
     cloud.marks.note(TOPIC_OF_CAR, [HOUR_0.start_us], NOW_MS + 1)
     assert cloud.marks.due_ms(PENDING) == NOW_MS + 1 + HOUR_REST_MS
     assert len(writes) == 1 + 2  # and the day's
+
+
+def test_a_task_that_an_earlier_one_has_done_reads_nothing(cloud, monkeypatch):
+    """Behind a long queue, each hour's plan queues the same hour again."""
+    cloud.store(0, [1, 1, 1])
+    for _ in range(2):
+        assert function.perform({TASK: DUE}, NOW_MS)["tasks"] == 1
+    first, second = cloud.tasks()
+    function.perform(first, NOW_MS)
+    assert cloud.row().batches == 1
+    monkeypatch.setattr(cloud.archive.client, "query", kill)
+    assert function.perform(second, NOW_MS) == {}
+
+
+def test_a_batch_sent_again_after_the_retention_became_shorter_is_read_from_the_archive_in_time(cloud):
+    item = cloud.store(0, [1, 1, 1])
+    cloud.archived()
+    expires_s = cloud.row().first_expires_s
+    again = {**item, EXPIRES_S: {"N": str(expires_s - 60 * DAY_S)}}
+    cloud.dynamodb.put_item(TableName=TELEMETRY, Item=again)
+    before = cloud.row()
+    cloud.archived()
+    assert cloud.row() == replace(before, first_expires_s=expires_s - 60 * DAY_S)
 
 
 def test_the_hours_of_a_clock_that_is_ahead_do_not_wait_for_their_time(cloud):
