@@ -161,6 +161,14 @@ def test_what_is_not_wanted_is_not_read():
     assert not list(file.pages(keys=starting_between(None, HOUR.start_us - 1)))
 
 
+def test_much_text_does_not_stay_in_memory_for_an_hour(monkeypatch):
+    monkeypatch.setattr(pieces, "_BYTES", 100_000)
+    items = [item_of(batch_at(HOUR, i, {"log": ["x" * 4000] * 3}, seq=i)) for i in range(300)]
+    file, told, _ = written(items)
+    assert told.batches == 300
+    assert len(file.groups()) == 3
+
+
 def test_other_tools_find_names_units_and_a_sample_a_row():
     items = [item_of(batch_at(HOUR, 0, {"speed": [1, 2.5, None], "time": [7, 8, 9]}))]
     into = io.BytesIO()
