@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import zlib
 
 import pyarrow.parquet as pq
 import pytest
@@ -49,7 +50,9 @@ def same_columns(one, other):
 def message_batches(draw):
     """A batch of ROS messages, that may become columns, or that are kept as published."""
     made = draw(definitions())
-    kind = RosType("/made", made.kind, made.md5sum, made.definition)
+    # A topic for each definition: genmsg's checksum leaves out whether a nested type is an array.
+    topic = f"/made_{zlib.crc32(made.definition.encode())}"
+    kind = RosType(topic, made.kind, made.md5sum, made.definition)
     raws = draw(st.lists(messages(made) | st.binary(max_size=8), min_size=1, max_size=4))
     first = draw(st.integers(0, 2**50))
     times = [first + i for i in range(len(raws))]
