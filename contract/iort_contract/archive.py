@@ -36,6 +36,8 @@ DUE, SWEEP, ARCHIVE, JOIN, PUT_OFF = "due", "sweep", "hour", "day", "put off"
 # With `SWEEP` of a topic: all its hours, not only those that expire soon.
 ALL = "all"
 HOUR_US = 3_600_000_000
+# What the key of a batch begins with.
+_START = re.compile(r"[0-9]{16}")
 _HOUR = re.compile(r"\d{4}-\d\d-\d\dT\d\d")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 # The part of a batch's envelope that its hash covers.
@@ -154,17 +156,19 @@ def hours_between(first: Hour | None, last: Hour | None) -> Keys:
     return Keys({"S": low}, {"S": high}, low > high)
 
 
-def stored_hours(table: TelemetryTable, topic: str, until_us: int) -> Iterator[Hour]:
-    """The hours of a topic that have stored items and are over by a time; a query each."""
-    from_us = 0
+def stored_hours(table: TelemetryTable, topic: str, until_us: int | None, from_us: int = 0) -> Iterator[Hour]:
+    """The hours of a topic that have stored items and are over by a time (None is open); a query each.
+
+    A robot decides about its keys, so one may begin with no time. It is in no hour, and passed over.
+    """
     while True:
-        keys = starting_between(from_us, until_us)
-        page = next(table.pages(topic, keys, attributes=(BATCH,), page_items=1), None)
-        if page is None or not page.items:
+        pages = table.pages(topic, starting_between(from_us, until_us), attributes=(BATCH,), page_items=1)
+        starts = (item[BATCH]["S"][:16] for page in pages for item in page.items)
+        start = next(filter(_START.fullmatch, starts), None)
+        if start is None:
             return
-        # An invalid key still begins with a time.
-        hour = hour_of(int(page.items[0][BATCH]["S"][:16]))
-        if hour.end_us > until_us:
+        hour = hour_of(int(start))
+        if until_us is not None and hour.end_us > until_us:
             return
         yield hour
         from_us = hour.end_us
