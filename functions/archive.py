@@ -14,7 +14,7 @@ from typing import Any
 from functions.shared.archive.archive import archive
 from functions.shared.archive.expiry import put_off
 from functions.shared.archive.planning import plan_due, plan_sweeps, sweep
-from iort_contract.archive import ALL, ARCHIVE, DUE, HOUR, JOIN, PUT_OFF, SWEEP, TASK, Pending
+from iort_contract.archive import ALL, ARCHIVE, DUE, DUE_MS, HOUR, JOIN, PUT_OFF, SWEEP, TASK, Pending
 from iort_contract.tables import TOPIC
 
 _log = logging.getLogger(__name__)
@@ -56,6 +56,9 @@ def _write(task: dict[str, Any], now_ms: int) -> dict[str, int]:
     from functions.shared.archive.hours import archive_hour  # noqa: PLC0415 - see above
 
     pending = Pending(task[TOPIC], task[HOUR])
+    if DUE_MS in task and archive().marks.due_ms(pending) is None:
+        # Behind a long queue every plan asks for the same again, and the first task has done it.
+        return {}
     if task[TASK] == ARCHIVE:
         row = archive_hour(archive(), pending, now_ms)
         return {"samples": row.samples, "bytes": row.size_bytes} if row else {}

@@ -13,7 +13,7 @@ import pyarrow as pa
 from iort_analysis.archive import columns as names
 from iort_analysis.archive.columns import OWN, kind_of, named, repeated, to_arrow
 from iort_analysis.samples.batches import decode_together
-from iort_analysis.samples.blocks import Block, column_of, join, objects
+from iort_analysis.samples.blocks import Block, Column, column_of, join, objects
 from iort_contract.archive import item_hash
 from iort_contract.checks import integer
 from iort_contract.codec.columns import EXACT, packed_samples, unpacked
@@ -60,12 +60,17 @@ def pieces(items: Iterable[Item], refuse: Refuse) -> Iterator[Piece]:
         rows += len(part[1].times_us)
         values += len(part[1].times_us) * len(part[1].columns)
         size += sum(len(raw) for one in part[0] if one.messages for raw in one.messages.raw)
+        size += sum(map(_text, part[1].columns.values()))
         parts.append(part)
         if rows >= _ROWS or values >= _VALUES or size >= _BYTES:
             yield _piece(parts)
             parts, rows, values, size = [], 0, 0, 0
     if any(entries for entries, _ in parts):
         yield _piece(parts)
+
+
+def _text(column: Column) -> int:
+    return sum(len(value) for value in column if type(value) is str) if column.dtype.kind == "O" else 0
 
 
 def _opened(items: Iterable[Item], refuse: Refuse) -> Iterator[list[_Entry]]:

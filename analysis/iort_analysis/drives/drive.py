@@ -34,7 +34,7 @@ class Repair(NamedTuple):
     samples: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drive:
     """One drive of a robot.
 

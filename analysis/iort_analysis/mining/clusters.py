@@ -61,8 +61,9 @@ def _k_means(points: Floats, k: int, chance: np.random.Generator) -> tuple[Float
             break
         labels = found
         filled = np.unique(labels)
-        centres = np.array([points[labels == each].mean(axis=0) for each in filled])
         labels = np.searchsorted(filled, labels)
+        members = labels == np.arange(len(filled))[:, None]
+        centres = members @ points / members.sum(axis=1, keepdims=True)
     return centres, float(_squares(points, centres).min(axis=1).sum())
 
 
@@ -76,8 +77,8 @@ def _silhouette(apart: Floats, labels: NDArray[np.intp]) -> float:
     filled, counts = np.unique(labels, return_counts=True)
     if len(filled) < 2:
         return -1.0
-    sums = np.stack([apart[:, labels == each].sum(axis=1) for each in filled], axis=1)
     own = np.searchsorted(filled, labels)
+    sums = apart @ (own[:, None] == np.arange(len(filled)))
     rows = np.arange(len(labels))
     alone = counts[own] == 1
     a = sums[rows, own] / np.maximum(counts[own] - 1, 1)

@@ -74,22 +74,22 @@ def fit(
     voltage was between 11.55 V and 11.65 V, and no more. Where a battery moves less than a few steps, the
     error of rounding follows the load, and least squares are wrong however many samples there are.
     """
-    design = np.column_stack(columns)
-    known = np.isfinite(design).all(axis=1) & np.isfinite(wanted)
-    rows, y = design[known], wanted[known]
-    if len(y) < 2 * blocks or len(y) < 4 * rows.shape[1]:
+    design = np.stack(columns)
+    known = np.isfinite(design).all(axis=0) & np.isfinite(wanted)
+    design, y = design[:, known], wanted[known]
+    if len(y) < 2 * blocks or len(y) < 4 * len(design):
         return None
-    scale = np.sqrt((rows**2).mean(axis=0))
+    scale = np.sqrt(np.einsum("ij,ij->i", design, design) / len(y))
     if not scale.all():
         return None
-    rows = rows / scale
-    problem = _Problem(rows, y, resolution, *_scaled(priors or {}, scale), _starts(len(y), blocks))
+    design /= scale[:, None]
+    problem = _Problem(design, y, resolution, *_scaled(priors or {}, scale), _starts(len(y), blocks))
     solved = problem.solve()
     if solved is None:
         return None
     coefficients, covariance, sigma = solved
     residuals = np.full(len(wanted), np.nan)
-    residuals[known] = y - rows @ coefficients
+    residuals[known] = y - coefficients @ design
     return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma)
 
 
@@ -119,9 +119,9 @@ def deviation_of(found: Estimate) -> float:
 
 
 class _Problem(NamedTuple):
-    """The rows of a regression whose columns all have the size 1, and the priors' precisions and means."""
+    """The columns of a regression, all of the size 1, and the priors' precisions and means."""
 
-    rows: Array
+    columns: Array
     y: Array
     resolution: float
     precision: Array
@@ -132,57 +132,56 @@ class _Problem(NamedTuple):
         """The coefficients, their covariance and sigma."""
         sigma = max(float(np.std(self.y)), 1e-12)
         weights = np.ones(len(self.y))
-        coefficients = np.zeros(self.rows.shape[1])
+        coefficients = np.zeros(len(self.columns))
         for _ in range(_ROUNDS):
-            gram = self._gram(weights / sigma**2)
-            total = gram.sum(axis=0) + self.precision
+            weighted = self.columns * (weights / sigma**2)
+            total = weighted @ self.columns.T + self.precision
             if np.linalg.cond(total) > _CONDITION:
                 return None
-            wanted = self.rows.T @ (weights * self.y) / sigma**2 + self.precision @ self.mean
-            coefficients = np.linalg.solve(total, wanted)
-            residuals = self.y - self.rows @ coefficients
+            coefficients = np.linalg.solve(total, weighted @ self.y + self.precision @ self.mean)
+            residuals = self.y - coefficients @ self.columns
             sigma = max(1.4826 * float(np.median(np.abs(residuals))), 1e-9, self.resolution / 5)
             weights = _biweight(residuals / sigma)
         score = weights * residuals / sigma**2
         # How fast the scores change with the coefficients: less than the weights, since those change too.
-        gram = self._gram(weights / sigma**2) * (_biweight_slope(residuals / sigma) / weights.mean())
+        curve = weights * (_biweight_slope(residuals / sigma) / weights.mean() / sigma**2)
         if self.resolution:
             refined = self._refined(coefficients, max(sigma / 2, self.resolution / 4))
             if refined is None:
                 return None
-            coefficients, sigma, score, gram = refined
-        return coefficients, self._covariance(gram, score), sigma
+            coefficients, sigma, score, curve = refined
+        return coefficients, self._covariance(curve, score), sigma
 
     def _refined(self, coefficients: Array, sigma: float) -> tuple[Array, float, Array, Array] | None:
         """The most likely coefficients, where each reading stands for an interval (by Newton's steps)."""
         for _ in range(_MOST_STEPS):
-            off = self.y - self.rows @ coefficients
+            off = self.y - coefficients @ self.columns
             low, high = (off - self.resolution / 2) / sigma, (off + self.resolution / 2) / sigma
             slope, curve, spread = between(low, high)
             near = (low < _FAR) & (high > -_FAR)
             score = np.where(near, slope / sigma, 0.0)
-            gram = self._gram(np.where(near, curve, 0.0) / sigma**2)
-            total = gram.sum(axis=0) + self.precision
+            curve = np.where(near, curve, 0.0) / sigma**2
+            total = (self.columns * curve) @ self.columns.T + self.precision
             if np.linalg.cond(total) > _CONDITION:
                 return None
-            step = np.linalg.solve(total, self.rows.T @ score - self.precision @ (coefficients - self.mean))
+            step = np.linalg.solve(total, self.columns @ score - self.precision @ (coefficients - self.mean))
             coefficients = coefficients + step
             wider = spread[near] / sigma
             change = float(wider.sum() / max(float((wider**2).sum()), 1e-12))
             sigma = max(float(np.clip(sigma + change, sigma / 2, sigma * 2)), self.resolution / 50)
             if float(step @ total @ step) < 1e-3 and abs(change) < 0.01 * sigma:
                 break
-        return coefficients, sigma, score, gram
+        return coefficients, sigma, score, curve
 
-    def _gram(self, weights: Array) -> Array:
-        """The normal equations of each block."""
+    def _covariance(self, curve: Array, score: Array) -> Array:
+        # The normal equations of each block.
         ends = [*self.starts[1:], len(self.y)]
-        weighted = self.rows * weights[:, None]
-        return np.stack([weighted[a:b].T @ self.rows[a:b] for a, b in zip(self.starts, ends, strict=True)])
-
-    def _covariance(self, gram: Array, score: Array) -> Array:
+        curved = self.columns * curve
+        gram = np.stack(
+            [curved[:, a:b] @ self.columns[:, a:b].T for a, b in zip(self.starts, ends, strict=True)]
+        )
         total = gram.sum(axis=0) + self.precision
-        scores = np.add.reduceat(self.rows * score[:, None], self.starts, axis=0)
+        scores = np.add.reduceat(self.columns * score, self.starts, axis=1).T
         # How far the coefficients move without each block.
         moved = np.linalg.solve(total - gram, scores[..., None])[..., 0]
         moved -= moved.mean(axis=0)

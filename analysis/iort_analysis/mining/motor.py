@@ -16,6 +16,7 @@ Torque for each ampere needs the number of pole pairs; the force at the tyres do
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -101,6 +102,8 @@ def mine(drive: Drive) -> Mined:
     return Mined(estimates, missing)
 
 
+# Three miners need it of the same drive.
+@lru_cache(maxsize=1)
 def fit_motor(drive: Drive) -> Motor | str:
     """Fit the motor's equations to a drive; or the reason why that cannot be done."""
     speed, vq, iq = (drive.of(drive.vesc, name) for name in ("speed", "avg_vq", "avg_iq"))

@@ -25,14 +25,14 @@ def binned(times_s: Array, values: Array, width_s: float) -> Array:
 
 def averaged(times_s: Array, columns: Sequence[Array], width_s: float) -> list[Array]:
     """The means of columns over ``width_s``, of the samples in which all are known."""
-    rows = np.column_stack(columns)
-    known = np.isfinite(rows).all(axis=1)
+    rows = np.stack(columns)
+    known = np.isfinite(rows).all(axis=0)
     if not known.any():
-        return list(rows[:0].T)
+        return list(rows[:, :0])
     at = (times_s[known] / width_s).astype(np.int64)
     starts = np.flatnonzero(np.append(True, at[1:] != at[:-1]))
     counts = np.diff(np.append(starts, len(at)))
-    return list((np.add.reduceat(rows[known], starts, axis=0) / counts[:, None]).T)
+    return list(np.add.reduceat(rows[:, known], starts, axis=1) / counts)
 
 
 def bridged(values: Array) -> Array:

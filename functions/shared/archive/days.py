@@ -7,6 +7,7 @@ the work.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from tempfile import TemporaryFile
 from typing import Any
@@ -21,6 +22,12 @@ from iort_contract.topics import parse_topic
 
 # Larger days stay as hours: a reader finds its hour, and nothing is won by reading and writing it again.
 MOST_BYTES = 256 * 1024 * 1024
+# A run has ended this long after it wrote an object; the function may take ten minutes.
+WRITING_MS = 900_000
+
+
+class BeingWrittenError(Exception):
+    """An hour's object has been written, and not its row: its run has not ended, or must be tried again."""
 
 
 def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
@@ -32,17 +39,18 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
     rows = [row for page in pages for item in page.items if (row := archived_hour(item)).key]
     key = day_key(topic, first)
     size = sum({row.key: row.size_bytes for row in rows}.values())
-    joined = all(row.key == key for row in rows)
+    joined, joins = all(row.key == key for row in rows), dict[str, str]()
     if not joined and len(rows) > 1 and size <= MOST_BYTES:
         etag = archive.objects.etag(key)
         with ExitStack() as files:
-            found = {
-                one: ArchiveFile(files.enter_context(archive.objects.read(one)[0]))
-                for one in sorted({row.key for row in rows})
-            }
+            found = {one: archive.objects.read(one) for one in sorted({row.key for row in rows})}
+            opened = {one: ArchiveFile(files.enter_context(read.file)) for one, read in found.items()}
+            for row in rows:
+                if row.key != key and found[row.key].sha256 != row.sha256:
+                    raise BeingWrittenError(f"{row.key} is newer than its row")
             into = files.enter_context(TemporaryFile())
             write_day(
-                {parse_hour(row.hour): found[row.key] for row in rows},
+                {parse_hour(row.hour): opened[row.key] for row in rows},
                 into,
                 describe=describe_of(topic.name),
             )
@@ -67,22 +75,34 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
             )
         archive.client.transact_write_items(TransactItems=changes)
         emit("archive", DaysJoined=1)
-        joined = True
+        joined, joins = True, {one: read.etag for one, read in found.items()}
+    clean = True
     if joined and rows:
-        _remove_hours(archive, pending.topic, [parse_hour(row.hour) for row in rows])
-    if due_ms is not None and due_ms <= now_ms:
+        clean = _remove_hours(archive, pending.topic, [parse_hour(row.hour) for row in rows], joins, now_ms)
+    if clean and due_ms is not None and due_ms <= now_ms:
         archive.marks.remove(pending, due_ms)
     return joined
 
 
-def _remove_hours(archive: Archive, topic: str, hours: list[Hour]) -> None:
-    """Remove the objects of hours whose rows point elsewhere."""
+def _remove_hours(
+    archive: Archive, topic: str, hours: list[Hour], joined: Mapping[str, str], now_ms: int
+) -> bool:
+    """Remove the objects of hours whose rows point elsewhere; returns whether all are gone.
+
+    Before a late batch's run moves the row back, it writes the object. So only a version that is ``joined``
+    goes, or one that nobody can be about to point to.
+    """
+    clean = True
     for hour in hours:
         key = hour_key(parse_topic(topic), hour)
-        # The version first: a late batch's run that writes the object after this moves the row back to it.
-        etag = archive.objects.etag(key)
-        if etag is None:
+        version = archive.objects.version(key)
+        if version is None:
             continue
         row = archive.row(topic, hour)
-        if row is not None and row.key != key:
-            archive.objects.remove(key, etag)
+        if row is None or row.key == key:
+            continue
+        if version.etag == joined.get(key) or version.written_ms < now_ms - WRITING_MS:
+            archive.objects.remove(key, version.etag)
+        else:
+            clean = False
+    return clean

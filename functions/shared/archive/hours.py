@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from heapq import merge
 from itertools import groupby
 from tempfile import TemporaryFile
@@ -71,6 +72,10 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
                 BytesArchived=size,
                 ItemsSetAside=made.refused,
             )
+        elif row is not None and made.first_expires_s != row.first_expires_s:
+            # A batch that was sent twice expires by its last receipt, and the retention may be shorter now.
+            before, row = row, replace(row, first_expires_s=made.first_expires_s)
+            _keep(archive, row, before)
     if due_ms is not None and due_ms <= now_ms:
         archive.marks.remove(pending, due_ms)
     return row
@@ -93,14 +98,14 @@ def _write(
 ) -> _Made:
     """Write an hour's files. What the table no longer has comes from the archive, which must not shrink."""
     topic, hour = pending.topic, parse_hour(pending.period)
-    may_have_expired = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
+    with_archived = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
     while True:
         into, refused, scratch = [files.enter_context(TemporaryFile()) for _ in range(3)]  # noqa: SIM115 - it is
         keys = starting_between(hour.start_us, hour.end_us - 1)
         pages = archive.telemetry.pages(topic, keys)
         items: Iterator[Item] = (item for page in pages for item in page.items)
         expiries = [row.first_expires_s] if row is not None and row.first_expires_s else []
-        if row is not None and may_have_expired:
+        if row is not None and with_archived:
             items = _with_archived(items, archive, row, files)
         written = write_hour(
             items,
@@ -110,12 +115,13 @@ def _write(
             scratch=scratch,
             describe=describe_of(parse_topic(topic).name),
         )
-        count = sum(written.refused.values())
-        if row is None or may_have_expired or written.batches + count >= row.batches + row.refused:
+        if row is None or with_archived or written.content == row.content:
+            count = sum(written.refused.values())
             expiries += [written.first_expires_s] if written.first_expires_s else []
             first_s = min(expiries, default=0)
             return _Made(into, refused, written.batches, written.samples, count, written.content, first_s)
-        may_have_expired = True
+        # Something is new. Whether something is missing as well tells only the archive.
+        with_archived = True
 
 
 def _with_archived(
@@ -125,10 +131,10 @@ def _with_archived(
     hour = parse_hour(row.hour)
     sources = [stored]
     if row.key:
-        file = files.enter_context(archive.objects.read(row.key)[0])
+        file = files.enter_context(archive.objects.read(row.key).file)
         sources.append(archived_items(ArchiveFile(file), row.topic, hour))
     if row.refused:
-        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour))[0])
+        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour)).file)
         sources.append(iter(sorted(map(json.loads, lines), key=_id)))
     # The stored one is the first of a kind.
     for _, same in groupby(merge(*sources, key=_id), key=_id):

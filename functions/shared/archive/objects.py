@@ -21,6 +21,21 @@ class Stored(NamedTuple):
     size: int
 
 
+class Version(NamedTuple):
+    """A version of an object, and when it was written."""
+
+    etag: str
+    written_ms: int
+
+
+class Read(NamedTuple):
+    """An object as a temporary file, its version, and its SHA-256."""
+
+    file: IO[bytes]
+    etag: str
+    sha256: str
+
+
 class Objects:
     """The objects of a bucket."""
 
@@ -29,21 +44,28 @@ class Objects:
 
     def etag(self, key: str) -> str | None:
         """The version that an object has now; None without an object."""
+        version = self.version(key)
+        return version.etag if version is not None else None
+
+    def version(self, key: str) -> Version | None:
+        """The version that an object has now; None without an object."""
         try:
-            return self._client.head_object(Bucket=self._bucket, Key=key)["ETag"]
+            head = self._client.head_object(Bucket=self._bucket, Key=key)
+            return Version(head["ETag"], round(head["LastModified"].timestamp() * 1000))
         except ClientError as error:
             if error.response["Error"]["Code"] in {"404", "NoSuchKey", "NotFound"}:
                 return None
             raise
 
-    def read(self, key: str) -> tuple[IO[bytes], str]:
-        """An object as a temporary file, and its version."""
+    def read(self, key: str) -> Read:
+        """Read an object."""
         answer = self._client.get_object(Bucket=self._bucket, Key=key)
-        file = TemporaryFile()  # noqa: SIM115 - the caller's
+        file, digest = TemporaryFile(), hashlib.sha256()  # noqa: SIM115 - the caller's
         for chunk in answer["Body"].iter_chunks(_CHUNK):
             file.write(chunk)
+            digest.update(chunk)
         file.seek(0)
-        return file, answer["ETag"]
+        return Read(file, answer["ETag"], digest.hexdigest())
 
     def write(self, key: str, file: IO[bytes], etag: str | None) -> Stored:
         """Write a file's content if the object still has this version; raises `ClientError` if it has not."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import zlib
 
 import pyarrow.parquet as pq
 import pytest
@@ -49,7 +50,9 @@ def same_columns(one, other):
 def message_batches(draw):
     """A batch of ROS messages, that may become columns, or that are kept as published."""
     made = draw(definitions())
-    kind = RosType("/made", made.kind, made.md5sum, made.definition)
+    # A topic for each definition: genmsg's checksum leaves out whether a nested type is an array.
+    topic = f"/made_{zlib.crc32(made.definition.encode())}"
+    kind = RosType(topic, made.kind, made.md5sum, made.definition)
     raws = draw(st.lists(messages(made) | st.binary(max_size=8), min_size=1, max_size=4))
     first = draw(st.integers(0, 2**50))
     times = [first + i for i in range(len(raws))]
@@ -159,6 +162,14 @@ def test_what_is_not_wanted_is_not_read():
     assert part.block.columns.keys() == {"mode"}
     assert not list(file.pages(keys=starting_between(HOUR.end_us, None)))
     assert not list(file.pages(keys=starting_between(None, HOUR.start_us - 1)))
+
+
+def test_much_text_does_not_stay_in_memory_for_an_hour(monkeypatch):
+    monkeypatch.setattr(pieces, "_BYTES", 100_000)
+    items = [item_of(batch_at(HOUR, i, {"log": ["x" * 4000] * 3}, seq=i)) for i in range(300)]
+    file, told, _ = written(items)
+    assert told.batches == 300
+    assert len(file.groups()) == 3
 
 
 def test_other_tools_find_names_units_and_a_sample_a_row():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from iort_analysis.drives.building import build
 from iort_analysis.mining import anomalies
 from iort_analysis.mining.anomalies.cusum import changed
-from iort_analysis.mining.anomalies.profile import mass, matrix_profile
+from iort_analysis.mining.anomalies.profile import matrix_profile
 from iort_analysis.samples.blocks import Block
 from tests.unit.analysis.simulated import KEY, START_US, streams
 
@@ -71,7 +71,6 @@ def test_the_profile_is_that_of_every_pair(seed: int, m: int) -> None:
     places = range(len(series) - m + 1)
     shapes = [normalised(series[i : i + m]) for i in places]
     far = np.array([[np.linalg.norm(a - b) for b in shapes] for a in shapes])
-    assert mass(np.array([series[i : i + m] for i in places]), series) == pytest.approx(far, abs=1e-4)
     far[np.abs(np.subtract.outer(places, places)) <= m // 2] = np.inf
     assert matrix_profile(series, m) == pytest.approx(far.min(axis=1), abs=1e-4)
 
