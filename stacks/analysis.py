@@ -30,8 +30,9 @@ _CORE_MB = 1769
 # A child of the map is an express workflow, which AWS ends after five minutes: three attempts must fit.
 _ANALYSE_S, _PLAN_S, _EVALUATE_S = 90, 900, 900
 # Robots that are planned at once, and drives that are analysed at once. The embedded cloud's functions share
-# this machine's cores, and a new account on AWS has ten environments for all functions.
-_ROBOTS, _DRIVES, _EMBEDDED = 8, 200, 2
+# this machine's cores; and a new account on AWS has ten environments for all functions, also for those that
+# take the robots' samples: drives that are refused there must find a place within the retries of a minute.
+_ROBOTS, _DRIVES, _EMBEDDED = 8, 40, 2
 # Every night both days are looked at: a drive that went on at night is analysed whole the next time.
 _NIGHTLY_S = 2 * 86_400
 
@@ -56,7 +57,13 @@ class Analysis(PlatformStack):
 
     def _plan(self) -> lambda_.Function:
         plan = function(
-            self, "Plan", self._reading(), memory_mb=_CORE_MB, timeout_s=_PLAN_S, layers=self._layers
+            self,
+            "Plan",
+            self._reading(),
+            memory_mb=_CORE_MB,
+            timeout_s=_PLAN_S,
+            layers=self._layers,
+            arrays=True,
         )
         self._may_read(plan)
         self._storage.robots.grant(plan, "dynamodb:Scan")
@@ -66,7 +73,13 @@ class Analysis(PlatformStack):
 
     def _analyse(self) -> lambda_.Function:
         analyse = function(
-            self, "Analyse", self._reading(), memory_mb=_CORE_MB, timeout_s=_ANALYSE_S, layers=self._layers
+            self,
+            "Analyse",
+            self._reading(),
+            memory_mb=_CORE_MB,
+            timeout_s=_ANALYSE_S,
+            layers=self._layers,
+            arrays=True,
         )
         self._may_read(analyse)
         self._storage.findings.grant(analyse, "dynamodb:PutItem")
@@ -81,11 +94,19 @@ class Analysis(PlatformStack):
             files_bucket=self._storage.files.bucket_name,
         )
         evaluate = function(
-            self, "Evaluate", environment, memory_mb=_CORE_MB, timeout_s=_EVALUATE_S, layers=self._layers
+            self,
+            "Evaluate",
+            environment,
+            memory_mb=_CORE_MB,
+            timeout_s=_EVALUATE_S,
+            layers=self._layers,
+            arrays=True,
         )
         self._storage.robots.grant(evaluate, "dynamodb:Scan")
         self._storage.findings.grant(evaluate, "dynamodb:Query")
         allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))
+        # Without it S3 refuses (403) instead of saying that a robot has no plan, because that failed.
+        allow(evaluate, ["s3:ListBucket"], self._storage.files.bucket_arn)
         allow(evaluate, ["s3:PutObject"], self._objects(PLANS_PREFIX))
         return evaluate
 

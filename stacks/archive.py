@@ -45,6 +45,7 @@ class Archive(PlatformStack):
             timeout_s=_TIMEOUT_S,
             scratch_mb=_SCRATCH_MB,
             layers=layers.arrays(self),
+            arrays=True,
             # On the embedded cloud all functions share this machine's cores.
             reserved_concurrency=1 if settings.embedded else 0,
         )

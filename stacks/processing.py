@@ -276,6 +276,7 @@ class Processing(PlatformStack):
             memory_mb=max(question.memory_mb for question in questions),
             timeout_s=max(question.timeout_s for question in questions),
             layers=arrays(self),
+            arrays=True,
         )
         # A robot that waits asks again.
         invoked_by_rule(answer, self._rejected)

@@ -34,7 +34,7 @@ class Function:
     """
 
     memory_mb: int = _MB_PER_CPU
-    at_once: int = 200
+    at_once: int = 40
     drive_s: float = 1.0
     written_units: int = 4
     workflow_mb: int = 64

@@ -231,6 +231,7 @@ ROLES = {
         | {
             ("dynamodb:Scan", "Robots.Arn"),
             ("dynamodb:Query", "Findings.Arn"),
+            ("s3:ListBucket", "Files.Arn"),
             ("s3:GetObject", f"Files.Arn/{ANALYSIS_PREFIX}*"),
             ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
         },

@@ -147,6 +147,16 @@ def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized,
         assert function["Timeout"] <= {"Analyse": 90}.get(noun, 900 if noun in BACKGROUND else 60)
 
 
+def test_functions_that_compute_with_arrays_do_so_in_one_thread(functions):
+    computing = {noun for noun, function in functions.items() if "Arrays" in str(function.get("Layers"))}
+    assert computing == {"Plan", "Analyse", "Evaluate", "Archive", "Answer"}
+    threads = {
+        noun: function["Environment"]["Variables"].get("OPENBLAS_NUM_THREADS")
+        for noun, function in functions.items()
+    }
+    assert {noun for noun, number in threads.items() if number == "1"} == computing
+
+
 def test_live_messages_and_pings_are_not_retried(synthesized, reader):
     configs = synthesized.resources("AWS::Lambda::EventInvokeConfig").values()
     assert {reader.text(c["FunctionName"]): c["MaximumRetryAttempts"] for c in configs} == {

@@ -1,6 +1,8 @@
-"""Finds the drives in a stream's batches: runs of the agent, cut where the car stood for long.
+"""Finds the drives in a stream's batches: runs of the agent, cut where the car stood for long, or went on for
+hours.
 
 It looks at one batch in many: a stand of a minute cannot hide between two looks that are closer together.
+Looks and cuts are at times of the clock, so that a drive has the same start wherever the reading began.
 """
 
 from __future__ import annotations
@@ -8,12 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
+from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.messages.batch import BatchId
 
 # A stand, or a pause in the recording, of this length ends a drive.
 STAND_US = 60_000_000
 # A drive keeps this much of the stands around it: there the battery rests, and sensors show their zero.
 _AROUND_US = 10_000_000
+# A robot that never stands, or of which nothing tells, has drives of this length; one that stands has at most
+# twice this. One function call analyses a drive, in its memory and time.
+LONGEST_US = 2 * 3_600_000_000
 # How far apart looks are while the car moves, and while it stands.
 _LOOK_MOVING_US, _LOOK_STANDING_US = 15_000_000, 3_000_000
 
@@ -82,7 +88,7 @@ class _Run:
         """Take the next batch; yields the drive that a stand has just ended."""
         self.newest_us = batch.id.t_us
         apart = _LOOK_MOVING_US if self._moving else _LOOK_STANDING_US
-        if self._looked_us is not None and batch.id.t_us - self._looked_us < apart:
+        if self._looked_us is not None and batch.id.t_us // apart == self._looked_us // apart:
             self._unseen.append(batch)
             return
         yield from self._look(batch)
@@ -107,6 +113,10 @@ class _Run:
             if self._start_us is None:
                 self._start_us = max(self._earliest_us, moved_us - _AROUND_US)
             self._moved_us = batch.id.t_us
+            cut_us = (-(-self._start_us // LONGEST_US) + 1) * LONGEST_US
+            if cut_us <= self._moved_us:
+                yield Found(self._start_us, cut_us - MAX_BATCH_SPAN_US, self._boot)
+                self._start_us = cut_us
         elif self._moving:
             last = next((one.id.t_us for one in reversed(unseen) if one.moves()), None)
             self._moved_us = self._moved_us if last is None else last

@@ -70,7 +70,8 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
     off = values - np.average(values, weights=weights)
     surplus = float((weights * off**2).sum()) - among
     scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
-    between = max(0.0, surplus / scaled) if among else 0.0
+    # 0 also where one drive is so much surer than the others that its weight is the whole.
+    between = max(0.0, surplus / scaled) if scaled > 0 else 0.0
     freedom = among + _PRIOR_DRIVES
     variance = (among * between + _PRIOR_DRIVES * expected_spread**2) / freedom
     weights = 1 / (errors**2 + variance)

@@ -26,7 +26,9 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     errors = np.maximum(errors, 1e-9 * max(float(np.abs(values).max()), 1e-12))
     weights, among = errors**-2.0, len(values) - 1
     surplus = float((weights * (values - np.average(values, weights=weights)) ** 2).sum()) - among
-    between = max(0.0, surplus / float(weights.sum() - (weights**2).sum() / weights.sum()))
+    scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
+    # 0 where one drive is so much surer than the others that its weight is the whole.
+    between = max(0.0, surplus / scaled) if scaled > 0 else 0.0
     weights = 1 / (errors**2 + between)
     mean = float(np.average(values, weights=weights))
     scatter = float((weights * (values - mean) ** 2).sum()) / among

@@ -135,7 +135,7 @@ KINDS = {
         Kind(
             ANALYSIS_FAILED,
             "a drive could not be analysed",
-            "the text has the reason; the samples are kept, so analyse it again",
+            "the text has the reason; the samples are kept, so `iort analyse` can try it again",
         ),
     )
 }

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_analysis.evaluation.baselines import baseline, fleet_baseline
+from iort_analysis.evaluation.combined import combined
 from iort_analysis.evaluation.discovery import false_discovery_rates
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.evaluation.student import quantile, tail
@@ -207,6 +208,13 @@ def test_a_baseline_follows_scale_and_shift(scale: float, shift: float) -> None:
 def test_one_bad_drive_moves_the_baseline_little() -> None:
     estimates = [ohms(value) for value in [*USUAL, 0.3]]
     assert baseline(estimates, 0.002).value == pytest.approx(0.03, rel=0.1)
+
+
+def test_one_drive_that_is_far_surer_than_the_others_is_no_division_by_zero() -> None:
+    sure, unsure = Estimate(0.03, 0.03, 0.03, "ohm"), Estimate(0.04, -1e6, 1e6, "ohm")
+
+    assert 0.03 <= baseline([sure, unsure, unsure], 0.001).value <= 0.04
+    assert combined([sure, unsure, unsure]).value == pytest.approx(0.03)
 
 
 def test_robots_that_differ_widen_the_fleets_baseline() -> None:

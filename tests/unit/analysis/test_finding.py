@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.drives.finding import Found, Heard, find
+from iort_analysis.drives.finding import LONGEST_US, Found, Heard, find
 from iort_contract.messages.batch import BatchId
 
 START_US, S = 1_700_000_000_000_000, 1_000_000
@@ -61,6 +61,28 @@ def test_two_runs_at_the_same_time_are_apart() -> None:
     both = sorted([*batches(parts(0, 100)), *batches(parts(0, 100), B, from_s=50)], key=lambda one: one.id)
 
     assert sorted(in_seconds(list(find(both)))) == [(0, 99, A), (50, 149, B)]
+
+
+def test_a_drive_is_the_same_wherever_the_reading_began() -> None:
+    """The car is nudged for a second, and drives half a minute later."""
+    moving = parts(1000, 1, 30, 100, 200)
+    found = {tuple(find(batches(moving[skipped:], from_s=skipped))) for skipped in range(30)}
+
+    assert len(found) == 1
+
+
+def test_a_robot_that_never_stands_has_a_drive_every_two_hours() -> None:
+    hour = 3600
+    whole = list(find(batches([True] * 9 * hour)))
+    later = list(find(batches([True] * 7 * hour, from_s=2 * hour)))
+
+    cuts = [one.start_us for one in whole[1:]]
+    assert len(cuts) == 3
+    assert not any(cut % LONGEST_US for cut in cuts)
+    # A drive's last batch has samples for a second.
+    assert [one.last_us + S for one in whole[:-1]] == cuts
+    assert in_seconds(whole)[-1][1] == 9 * hour - 1
+    assert later[1:] == whole[2:]
 
 
 def test_a_car_that_stands_has_no_drive() -> None:
