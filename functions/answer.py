@@ -104,7 +104,7 @@ def _answered(
     if late_s > 0:
         raise RefusedError(TOO_LATE, f"the deadline passed {late_s:.1f} s before the function began")
     if not isinstance(body, Content):
-        check_size(len(to_json(body)), min(question.max_question_bytes, MAX_INLINE_BYTES))
+        check_size(_size(body), min(question.max_question_bytes, MAX_INLINE_BYTES))
     if not desk.quota_of(question).take(topic.robot, 1, now_s):
         raise RefusedError(OVER_QUOTA, f"{question.per_hour} an hour, and only of registered robots")
     if isinstance(body, Content):
@@ -114,6 +114,14 @@ def _answered(
     if len(text) > most:
         raise RefusedError(TOO_LARGE, f"the answer must have at most {most} bytes, got {len(text)}")
     return found if len(text) <= MAX_INLINE_BYTES else desk.bodies.write(topic.robot, ask.id, text)
+
+
+def _size(body: Mapping[str, Any]) -> int:
+    try:
+        return len(to_json(body))
+    except ContractError as error:
+        # JSON has no infinity, but Python reads 1e999 as one.
+        raise RefusedError(INVALID, str(error)) from error
 
 
 def _refuse(topic: Topic, request_id: str | None, refusal: Refusal, desk: Desk) -> None:

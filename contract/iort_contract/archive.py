@@ -36,8 +36,8 @@ DUE, SWEEP, ARCHIVE, JOIN, PUT_OFF = "due", "sweep", "hour", "day", "put off"
 # With `SWEEP` of a topic: all its hours, not only those that expire soon.
 ALL = "all"
 HOUR_US = 3_600_000_000
-# What the key of a batch begins with.
-_START = re.compile(r"[0-9]{16}")
+# What the key of a batch begins with, and the time that none reaches.
+_START, _NEVER_US = re.compile(r"[0-9]{16}"), 10**16
 _HOUR = re.compile(r"\d{4}-\d\d-\d\dT\d\d")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 # The part of a batch's envelope that its hash covers.
@@ -161,7 +161,7 @@ def stored_hours(table: TelemetryTable, topic: str, until_us: int | None, from_u
 
     A robot decides about its keys, so one may begin with no time. It is in no hour, and passed over.
     """
-    while True:
+    while from_us < _NEVER_US:
         pages = table.pages(topic, starting_between(from_us, until_us), attributes=(BATCH,), page_items=1)
         starts = (item[BATCH]["S"][:16] for page in pages for item in page.items)
         start = next(filter(_START.fullmatch, starts), None)

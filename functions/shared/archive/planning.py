@@ -34,6 +34,8 @@ from iort_contract.topics import RECORD, build_topic
 
 # A mark that is due for longer than this waits for something to be mended.
 OVERDUE_MS = 3 * 3_600_000
+# What expires within two nights, a sweep must find.
+_SOON_S = 2 * 86_400
 # A night's sweep counts the hours of a day, and two more.
 _COUNTED_US = 26 * HOUR_US
 
@@ -90,7 +92,8 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
     retention_s = archive.given.retention_s
     until_us = (now_ms - HOUR_REST_MS) * 1000
     if not every:
-        until_us -= (retention_s - 2 * margin_s(retention_s)) * 1_000_000
+        soon_s = min(retention_s, max(2 * margin_s(retention_s), _SOON_S))
+        until_us -= (retention_s - soon_s) * 1_000_000
     # The hours of a clock that is ahead are over when their items have long expired.
     ahead_us = now_ms * 1000 + HOUR_US
     stored = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,9 +85,10 @@ def _calibrated(limit: CarLimit, known: Mapping[str, float]) -> float | None:
 
 
 def _checked(limit: CarLimit, value: Any) -> float:
-    number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
-    if not limit.low <= number <= limit.high:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    # Compared before it becomes a float, which holds no integer of 400 digits.
+    if not is_number or not limit.low <= value <= limit.high:
         raise ContractError(
             f"{limit.name} must be {limit.low:g} to {limit.high:g} {limit.unit}, got {shown(value)}"
         )
-    return number
+    return float(value)

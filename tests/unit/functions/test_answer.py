@@ -132,6 +132,11 @@ def test_the_robot_of_the_topic_is_answered_and_counted(serve, capsys):
     assert json.loads(capsys.readouterr().out)["QuestionsAnswered"] == 1
 
 
+def test_a_number_beyond_json_is_refused_and_no_failure_of_the_function(serve):
+    message = encode_ask(ask({"a": 1})).replace(b'{"a":1}', b'{"a":1e999}')
+    assert serve(message).reason == INVALID
+
+
 def test_an_unknown_question_is_refused(serve, capsys):
     refused = serve(ask(), name="nobody")
     assert (refused.reason, "calibration" in refused.text) == (UNKNOWN, True)
@@ -339,6 +344,7 @@ def test_the_raceline_uses_the_questions_limits_then_the_calibration_then_defaul
         ({"track": {"x_m": [1]}}, "a track must be the four lists"),
         ({"track": HALL, "car": {"wings": 2}}, "car must be an object of width_m"),
         ({"track": HALL, "car": {"grip": "wet"}}, "grip must be 0.05 to 5 1, got 'wet'"),
+        ({"track": HALL, "car": {"grip": int("9" * 400)}}, "grip must be 0.05 to 5 1, got 999"),
         ({"track": HALL, "car": {"width_m": 3}}, "the track must be wider than the car (3 m)"),
         ({"track": HALL, "car": {"rolling_n": 500}}, "the motor must pull more than rolling and the air"),
     ],
