@@ -18,24 +18,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from bench.command import made, parser, write
 from bench.proof.cars import drive_of
-from bench.proof.drives import simulated
 from bench.proof.speed import HOUR_S
-from iort_analysis.samples.blocks import values
+from bench.proof.stored import stored
 from iort_contract.dynamodb import Item, TelemetryTable
 from iort_contract.messages.analysis import AnalysisRequest
-from iort_contract.messages.batch import Batch
-from iort_contract.tables import ROBOT, STREAMS, TOPIC
+from iort_contract.tables import ROBOT, SAMPLES, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud
-from tests.fakes import item_of
 
 _S = 1_000_000
 _FUNCTIONS = ("Plan", "Analyse", "Evaluate", "Present")
@@ -73,7 +69,9 @@ def main() -> None:
 def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
     """Write the hours, and analyse them."""
     _without_lambda_2(cloud)
-    batches, samples, start_us = _hour()
+    spec = drive_of(0, 0, seconds=HOUR_S)
+    batches, start_us = stored(spec), spec.key.start_us
+    samples = sum(int(item[SAMPLES]["N"]) for items in batches.values() for item in items)
     with Progress(console=console) as progress:
         writing = progress.add_task("write", total=hours)
         for number in range(hours):
@@ -93,30 +91,6 @@ def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
         seconds=took_s,
         cpu_s={name: round(after[name] - before[name], 2) for name in _FUNCTIONS},
     )
-
-
-def _hour() -> tuple[dict[str, list[Item]], int, int]:
-    """The stored batches of an hour's drive by stream, the number of samples, and its start."""
-    spec = drive_of(0, 0, seconds=HOUR_S)
-    streams, _ = simulated(spec)
-    found: dict[str, list[Item]] = {}
-    for stream, block in streams.items():
-        seconds = (block.times_us - block.times_us[0]) // _S
-        edges = np.searchsorted(seconds, np.arange(int(seconds[-1]) + 2))
-        parts = (block.take(slice(*edges[i : i + 2])) for i in range(len(edges) - 1))
-        found[stream] = [
-            item_of(
-                Batch(
-                    spec.key.run,
-                    seq,
-                    part.times_us.tolist(),
-                    {name: values(column) for name, column in part.columns.items()},
-                )
-            )
-            for seq, part in enumerate(part for part in parts if len(part.times_us))
-        ]
-    first_us = min(int(block.times_us[0]) for block in streams.values())
-    return found, sum(len(block.times_us) for block in streams.values()), first_us
 
 
 def _record(cloud: Cloud, robot: str, batches: dict[str, list[Item]]) -> None:

@@ -73,9 +73,9 @@ def _measure(plan: Plan, console: Console) -> list[Section]:
         judging = progress.add_task("cars judged", total=plan.cars)
         judged = on_all_cores(judge, _cars(plan, drives), lambda: progress.advance(judging))
         hours = progress.add_task("hours timed", total=1)
-        cpu_s, samples = speed.hour_cpu_s(car=0)
+        hour = speed.hour_cpu_s(car=0)
         progress.advance(hours)
-    return _sections(plan, drives, judged, (cpu_s, samples))
+    return _sections(plan, drives, judged, hour)
 
 
 def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:
@@ -92,9 +92,8 @@ def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:
 
 
 def _sections(
-    plan: Plan, drives: dict[DriveSpec, Analysed], judged: Sequence[Judged], hour: tuple[float, int]
+    plan: Plan, drives: dict[DriveSpec, Analysed], judged: Sequence[Judged], hour: speed.Hour
 ) -> list[Section]:
-    cpu_s, samples = hour
     truths = [drives[spec] for spec in plan.covered_drives()]
     estimated = {name for drive in truths for name in drive.result.mined.estimates}
     real = recordings.section()
@@ -102,7 +101,7 @@ def _sections(
         report.detected(plan, detection(judged)),
         report.alarms(plan, judged),
         report.covered(plan.covered, coverage(truths), sorted(estimated - TRUTHS.keys())),
-        report.speed(cpu_s, samples, _ROBOT_HOURS, speed.bill(_ROBOT_HOURS, cpu_s, plan.seconds)),
+        report.speed(hour, _ROBOT_HOURS, speed.bill(_ROBOT_HOURS, hour.cpu_s, plan.seconds)),
         *([] if real is None else [real]),
     ]
 

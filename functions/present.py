@@ -29,20 +29,24 @@ _MOST_REASON = 500
 def present(
     drives: Iterable[tuple[DriveKey, Sequence[Finding]]], table: FindingsTable, notify: Notify, page_url: str
 ) -> dict[str, int]:
-    """Replace the findings of each drive; mail the serious ones that are new."""
-    kept = mailed = 0
+    """Replace the findings of each drive; mail the serious ones that are new.
+
+    A robot's findings of one kind are one mail, about the first: a run may be of a year's drives.
+    """
+    kept, mailed = 0, set[tuple[str, str]]()
     for drive, found in drives:
         before = {one.id: one for one in table.of_drive(drive)}
         for finding in found:
-            if finding.severity == SERIOUS and finding.id not in before:
+            about = (drive.robot, finding.kind)
+            if finding.severity == SERIOUS and finding.id not in before and about not in mailed:
                 notify(*mail(finding, page_url))
-                mailed += 1
+                mailed.add(about)
             # After the mail: a failure in between sends it twice, but never loses it.
             table.put_finding(finding)
             kept += 1
         for gone in before.keys() - {one.id for one in found}:
             table.remove(before[gone])
-    return {"findings": kept, "mails": mailed}
+    return {"findings": kept, "mails": len(mailed)}
 
 
 def mail(finding: Finding, page_url: str) -> tuple[str, str]:

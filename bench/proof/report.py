@@ -7,7 +7,7 @@ from statistics import median
 
 from bench.proof.judging import RIGHT, Case, Coverage, Detected, Judged
 from bench.proof.plan import Plan
-from bench.proof.speed import Bill
+from bench.proof.speed import Bill, Hour
 from bench.proof.truths import INDICATORS
 from bench.report import plots
 from bench.report.result import Section
@@ -121,7 +121,7 @@ def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) 
     return section
 
 
-def speed(cpu_s: float, samples: int, robot_hours: float, bill: Bill) -> Section:
+def speed(hour: Hour, robot_hours: float, bill: Bill) -> Section:
     """The time and the cost of the analysis."""
     section = Section("speed", "Time and cost of the analysis")
     dollars = sum(bill.dollars.values())
@@ -131,13 +131,21 @@ def speed(cpu_s: float, samples: int, robot_hours: float, bill: Bill) -> Section
         [*([what, f"{usd:.3f}"] for what, usd in bill.dollars.items()), ["in all", f"{dollars:.3f}"]],
     )
     section.ratio(
-        f"an hour's {samples:,} samples, processor", round(cpu_s, 2), 2.0, unit="s", by_machine=True
+        f"an hour's {hour.samples:,} samples, decoded and analysed, processor",
+        round(hour.cpu_s, 2),
+        2.0,
+        unit="s",
+        by_machine=True,
+    )
+    section.notes.append(
+        f"Of the hour's processor time {hour.decode_s:.2f} s decode the stored batches, "
+        f"{hour.analyse_s:.2f} s clean and mine."
     )
     section.ratio(f"{robot_hours:,.0f} robot-hours on AWS", round(dollars, 2), 1.0, unit="dollars")
     section.ratio(
         f"{robot_hours:,.0f} robot-hours on AWS, time", round(bill.seconds / 60, 1), 10.0, unit="minutes"
     )
-    section.raw = {"cpu_s": cpu_s, "samples": samples, "dollars": bill.dollars, "seconds": bill.seconds}
+    section.raw = {**hour._asdict(), "cpu_s": hour.cpu_s, "dollars": bill.dollars, "seconds": bill.seconds}
     return section
 
 

@@ -17,6 +17,8 @@ from iort_contract.tables import BATCH
 
 # A clock is corrected all the time by less than this.
 _SET_BACK_US = 1_000_000
+# So many batches are decoded together: their lists of numbers fit in a processor's cache.
+_PAGE_ITEMS = 200
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,9 @@ def recorded(drive: DriveKey, end_us: int, stream: str, items: Iterable[Item]) -
                 "quarantine or were lost"
             )
     kept.sort(key=lambda one: one[0])
-    block = join(list(blocks([[item for _, item in kept]] if kept else [], refused)))
+    ordered = [item for _, item in kept]
+    pages = (ordered[i : i + _PAGE_ITEMS] for i in range(0, len(ordered), _PAGE_ITEMS))
+    block = join(list(blocks(pages, refused)))
     if refused.count:
         notes[f"{stream} items"] = f"{refused.count} cannot be decoded: {refused.reason}"
     times = block.times_us

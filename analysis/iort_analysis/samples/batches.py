@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import chain, groupby
+from itertools import chain, groupby, repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,7 +102,7 @@ def start_us(item: Item) -> int:
 def _opened(items: Iterable[Item], refused: RefusedItems, *, messages: bool) -> Iterator[Opened]:
     for item in items:
         try:
-            batch = open_batch(plain(item))
+            batch = open_batch(plain({name: item[name] for name in ATTRIBUTES if name in item}))
         except ContractError as error:
             refused.add(error)
             continue
@@ -158,7 +158,7 @@ def decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
 
 def _column(name: str, written: Sequence[Any], counts: Sequence[int]) -> Column:
     """A field's values from its column in each batch of ``counts`` samples."""
-    decimals = [decimals_of(name, column, n) for column, n in zip(written, counts, strict=True)]
+    decimals = list(map(decimals_of, repeat(name), written, counts))
     if None not in decimals:
         return _from_steps(name, written)
     parts: list[Column] = []
