@@ -7,7 +7,7 @@ from aws_cdk import aws_lambda as lambda_
 
 from iort_contract.archive import ARCHIVE_PREFIX, DUE, SWEEP, TASK
 from iort_contract.catalog.environments import ArchiveEnvironment
-from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
+from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, TOPIC
 from stacks.parts import layers
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import allow, function
@@ -50,7 +50,7 @@ class Archive(PlatformStack):
             reserved_concurrency=1 if settings.embedded else 0,
         )
         storage.telemetry.grant(archive, "dynamodb:Query")
-        storage.may_change(storage.telemetry, archive, TOPIC, BATCH, EXPIRES_S)
+        storage.may_change(storage.telemetry, archive, TOPIC, BATCH, EXPIRES_S, PUT_OFF_TO_S)
         storage.archive.grant(
             archive,
             *(f"dynamodb:{verb}Item" for verb in ("Get", "Put", "Update", "Delete")),

@@ -13,7 +13,7 @@ from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
 
-from iort_contract.archive import DUE_MS, HOUR
+from iort_contract.archive import DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.catalog.environments import (
     AlertEnvironment,
     AnswerEnvironment,
@@ -181,7 +181,7 @@ class Processing(PlatformStack):
         self._storage.robots.grant(made, "dynamodb:GetItem")
         self._storage.may_keep(made, STREAMS)
         if self.settings.archive:
-            self._storage.may_change(self._storage.archive, made, TOPIC, HOUR, DUE_MS)
+            self._storage.may_change(self._storage.archive, made, TOPIC, HOUR, DUE_MS, FIRST_DUE_MS)
         return made
 
     def _query(self) -> None:

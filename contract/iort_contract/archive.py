@@ -25,6 +25,8 @@ HOUR = "hour"
 # The sort key is the hour or the date, `#` and the topic. It stands for all batches that Lambda 2 saw before
 # ``due_ms``.
 PENDING, DUE_MS = "pending", "due_ms"
+# In a pending row: when it was due at first. Late batches move ``due_ms``, and this stays.
+FIRST_DUE_MS = "first_due_ms"
 # In a pending row: until then no item of the hour expires, since its expiry was put off.
 SAFE_UNTIL_S = "safe_until_s"
 # An hour is over for this long before it is archived, and a day before its hours are joined, so that late

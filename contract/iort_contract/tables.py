@@ -7,6 +7,8 @@ TOPIC, BATCH, SECOND = "topic", "batch", "second"
 # A time in a message, microseconds since the epoch.
 T_US = "t"
 RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
+# In an item whose expiry the archive has put off: until when. A batch that is sent again has none.
+PUT_OFF_TO_S = "put_off_to_s"
 # The lifetime of telemetry and summaries, unless a deployment sets its own.
 DEFAULT_RETENTION_DAYS = 90
 ROBOT = "robot"

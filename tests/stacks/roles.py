@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from iort_contract.archive import ARCHIVE_PREFIX, DUE_MS, HOUR
+from iort_contract.archive import ARCHIVE_PREFIX, DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
-from iort_contract.tables import BATCH, EXPIRES_S, PRESENCE, STREAMS, TOPIC
+from iort_contract.tables import BATCH, EXPIRES_S, PRESENCE, PUT_OFF_TO_S, STREAMS, TOPIC
 from iort_contract.topics import SHADOW
 from stacks.checks.invariants import EVERY_RESOURCE
 
@@ -280,7 +280,7 @@ KEEPS = {
 }
 # The attributes of other items that a function may change, by its role and the table.
 CHANGES = {
-    ("ArchiveRole", "Batches.Arn"): (BATCH, EXPIRES_S, TOPIC),
-    ("LaterRole", "Archive.Arn"): (DUE_MS, HOUR, TOPIC),
-    ("SummarizeRole", "Archive.Arn"): (DUE_MS, HOUR, TOPIC),
+    ("ArchiveRole", "Batches.Arn"): (BATCH, EXPIRES_S, PUT_OFF_TO_S, TOPIC),
+    ("LaterRole", "Archive.Arn"): (DUE_MS, FIRST_DUE_MS, HOUR, TOPIC),
+    ("SummarizeRole", "Archive.Arn"): (DUE_MS, FIRST_DUE_MS, HOUR, TOPIC),
 }

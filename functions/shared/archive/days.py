@@ -79,8 +79,8 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
     clean = True
     if joined and rows:
         clean = _remove_hours(archive, pending.topic, [parse_hour(row.hour) for row in rows], joins, now_ms)
-    if clean and due_ms is not None and due_ms <= now_ms:
-        archive.marks.remove(pending, due_ms)
+    if clean:
+        archive.marks.done(pending, due_ms, now_ms)
     return joined
 
 

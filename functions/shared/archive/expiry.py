@@ -8,7 +8,7 @@ from functions.shared.archive.archive import Archive
 from functions.shared.metrics import emit
 from iort_contract.archive import SAFE_UNTIL_S, Pending, parse_hour
 from iort_contract.dynamodb import starting_between
-from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
+from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, TOPIC
 
 _DAY_S = 86_400
 PUT_OFF_S = 30 * _DAY_S
@@ -38,9 +38,9 @@ def put_off(archive: Archive, pending: Pending, now_ms: int) -> int:
                 archive.client.update_item(
                     TableName=archive.telemetry.name,
                     Key={name: item[name] for name in (TOPIC, BATCH)},
-                    UpdateExpression="SET #expires = :expires",
+                    UpdateExpression="SET #expires = :expires, #put_off = :expires",
                     ConditionExpression="#expires = :before",
-                    ExpressionAttributeNames={"#expires": EXPIRES_S},
+                    ExpressionAttributeNames={"#expires": EXPIRES_S, "#put_off": PUT_OFF_TO_S},
                     ExpressionAttributeValues={
                         ":expires": {"N": str(now_s + PUT_OFF_S)},
                         ":before": item[EXPIRES_S],

@@ -76,8 +76,7 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
             # A batch that was sent twice expires by its last receipt, and the retention may be shorter now.
             before, row = row, replace(row, first_expires_s=made.first_expires_s)
             _keep(archive, row, before)
-    if due_ms is not None and due_ms <= now_ms:
-        archive.marks.remove(pending, due_ms)
+    archive.marks.done(pending, due_ms, now_ms)
     return row
 
 

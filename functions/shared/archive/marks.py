@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.archive import DUE_MS, PENDING, ArchiveTable, Pending, hour_of, parse_pending
+from iort_contract.archive import (
+    DUE_MS,
+    FIRST_DUE_MS,
+    PENDING,
+    ArchiveTable,
+    Pending,
+    hour_of,
+    parse_pending,
+)
 from iort_contract.dynamodb import Item
 
 if TYPE_CHECKING:
@@ -54,9 +62,9 @@ class Marks:
             self._client.update_item(
                 TableName=self._table,
                 Key=pending.key,
-                UpdateExpression="SET #due = :due",
+                UpdateExpression="SET #due = :due, #first = if_not_exists(#first, :due)",
                 ConditionExpression="attribute_not_exists(#due) OR #due < :due",
-                ExpressionAttributeNames={"#due": DUE_MS},
+                ExpressionAttributeNames={"#due": DUE_MS, "#first": FIRST_DUE_MS},
                 ExpressionAttributeValues={":due": {"N": str(due_ms)}},
             )
         return due_ms
@@ -66,8 +74,8 @@ class Marks:
         answer = self._client.get_item(TableName=self._table, Key=pending.key, ConsistentRead=True)
         return int(answer["Item"][DUE_MS]["N"]) if "Item" in answer else None
 
-    def remove(self, pending: Pending, due_ms: int) -> None:
-        """Remove a mark that is done, unless it has moved since."""
+    def remove(self, pending: Pending, due_ms: int) -> bool:
+        """Remove a mark that is done, unless it has moved since; returns whether it is gone."""
         with suppress(self._client.exceptions.ConditionalCheckFailedException):
             self._client.delete_item(
                 TableName=self._table,
@@ -75,6 +83,21 @@ class Marks:
                 ConditionExpression="#due = :due",
                 ExpressionAttributeNames={"#due": DUE_MS},
                 ExpressionAttributeValues={":due": {"N": str(due_ms)}},
+            )
+            return True
+        return False
+
+    def done(self, pending: Pending, due_ms: int | None, now_ms: int) -> None:
+        """Remove a mark whose work is done. One that was not due, or has moved, stays and begins anew."""
+        if due_ms is None or (due_ms <= now_ms and self.remove(pending, due_ms)):
+            return
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._client.update_item(
+                TableName=self._table,
+                Key=pending.key,
+                UpdateExpression="SET #first = #due",
+                ConditionExpression="#first < #due",
+                ExpressionAttributeNames={"#due": DUE_MS, "#first": FIRST_DUE_MS},
             )
 
     def every(self) -> Iterator[tuple[Pending, Item]]:

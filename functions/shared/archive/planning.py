@@ -13,6 +13,7 @@ from functions.shared.queues import send_all
 from iort_contract.archive import (
     ARCHIVE,
     DUE_MS,
+    FIRST_DUE_MS,
     HOUR,
     HOUR_REST_MS,
     HOUR_US,
@@ -34,6 +35,8 @@ from iort_contract.topics import RECORD, build_topic
 
 # A mark that is due for longer than this waits for something to be mended.
 OVERDUE_MS = 3 * 3_600_000
+# Batches that keep coming delay their hour by no more than this.
+_DELAYED_MS = 3_600_000
 # What expires within two nights, a sweep must find.
 _SOON_S = 2 * 86_400
 # A night's sweep counts the hours of a day, and two more.
@@ -50,9 +53,10 @@ def plan_due(archive: Archive, now_ms: int) -> dict[str, int]:
     overdue = 0
     for pending, row in archive.marks.every():
         due_ms = int(row[DUE_MS]["N"])
-        if due_ms > now_ms:
+        first_ms = int(row.get(FIRST_DUE_MS, row[DUE_MS])["N"])
+        if due_ms > now_ms and first_ms > now_ms - _DELAYED_MS:
             continue
-        is_late = due_ms < now_ms - OVERDUE_MS
+        is_late = first_ms < now_ms - OVERDUE_MS
         overdue += is_late
         safe_s = int(row[SAFE_UNTIL_S]["N"]) if SAFE_UNTIL_S in row else 0
         if is_late and not pending.is_day and safe_s <= now_ms // 1000 + margin_s(archive.given.retention_s):

@@ -16,7 +16,7 @@ from functions.shared.summary.share import REQUESTS_S, Change, Share, robot_of_c
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, decode_item
-from iort_contract.tables import RECEIVED_MS
+from iort_contract.tables import PUT_OFF_TO_S, RECEIVED_MS
 
 _log = logging.getLogger(__name__)
 
@@ -55,13 +55,14 @@ class Decoded:
 
 def decode_records(records: Iterable[Mapping[str, Any]], share: Share | None = None) -> Decoded:
     """Decode stream records and charge each to its robot. Records over the robot's share are not decoded.
-    Removals (expiry) carry no image and are skipped."""
+    Removals (expiry) carry no image and are skipped, and so are expiries that the archive has put off."""
     share = share or Share.unlimited()
     decoded = Decoded()
     for record in records:
         change = record["dynamodb"]
         image = change.get("NewImage")
-        if image is None:
+        # The rule stores a batch that is sent again as a whole, without this attribute.
+        if image is None or (record["eventName"] == "MODIFY" and PUT_OFF_TO_S in image):
             continue
         at_s = float(change.get("ApproximateCreationDateTime", time.time()))
         decoded.at_s = max(decoded.at_s, at_s)

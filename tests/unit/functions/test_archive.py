@@ -19,7 +19,8 @@ from functions.quarantine import entries
 from functions.shared.archive import hours
 from functions.shared.archive.archive import archive as archive_of_environment
 from functions.shared.archive.days import WRITING_MS, BeingWrittenError
-from functions.shared.archive.expiry import PUT_OFF_S, margin_s
+from functions.shared.archive.expiry import PUT_OFF_S, margin_s, put_off
+from functions.shared.summary.decoded import decode_records
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import join, values
@@ -46,7 +47,7 @@ from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
 from iort_contract.topics import parse_topic
-from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message
+from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message, record_of
 from tests.unit.contract.contract_values import BOOT
 
 DAY_S = 86_400
@@ -517,6 +518,50 @@ def test_what_cannot_be_archived_does_not_expire(cloud, monkeypatch, capsys):
     cloud.archived(now_ms=again_s * 1000)
     assert cloud.speeds() == [1, 1, 1]
     assert PENDING not in cloud.pending()
+
+
+def test_late_batches_that_keep_coming_delay_neither_their_hour_nor_its_put_off(cloud):
+    """A batch every ten minutes moves the mark before it is due, and no run succeeds for hours."""
+    cloud.store(0, [1, 1, 1])
+    expires_s = cloud.expiries()[0]
+    near_ms = (expires_s - margin_s(RETENTION_S)) * 1000
+    cloud.marks.remove(PENDING, cloud.marks.due_ms(PENDING))
+
+    def plan(now_ms):
+        cloud.marks.note(TOPIC_OF_CAR, [HOUR_0.start_us], now_ms)
+        assert cloud.marks.due_ms(PENDING) > now_ms
+        told = function.perform({TASK: DUE}, now_ms)
+        return told["overdue"], [task for task in cloud.tasks() if task[HOUR] == str(HOUR_0)]
+
+    def kinds(hours):
+        overdue, tasks = plan(near_ms + hours * 3_600_000)
+        return overdue, [task[TASK] for task in tasks]
+
+    assert kinds(0) == (0, [])
+    assert kinds(2) == (0, [ARCHIVE])
+    overdue, tasks = plan(near_ms + 4 * 3_600_000)
+    assert (overdue, [task[TASK] for task in tasks]) == (1, [PUT_OFF, ARCHIVE])
+    for task in tasks:
+        function.perform(task, near_ms + 4 * 3_600_000)
+    assert cloud.expiries() == [near_ms // 1000 + 4 * 3600 + PUT_OFF_S]
+    # That run has archived it, so the mark that stays begins anew.
+    assert cloud.speeds() == [1, 1, 1]
+    assert PENDING in cloud.pending()
+    assert kinds(5) == (0, [])
+    assert kinds(6) == (0, [ARCHIVE])
+
+
+def test_lambda_2_ignores_an_expiry_put_off_but_not_a_batch_sent_again(cloud):
+    item = cloud.store(0, [1, 1, 1])
+    put_off(cloud.archive, PENDING, int(item[EXPIRES_S]["N"]) * 1000)
+    changed = cloud.dynamodb.get_item(TableName=TELEMETRY, Key={name: item[name] for name in (TOPIC, BATCH)})[
+        "Item"
+    ]
+    assert changed[EXPIRES_S] != item[EXPIRES_S]
+    assert not decode_records([record_of(changed, kind="MODIFY")]).batches
+    assert decode_records([record_of(item, kind="MODIFY")]).batches[TOPIC_OF_CAR]
+    # What waited, or is replayed, comes as it is stored.
+    assert decode_records([record_of(changed)]).batches[TOPIC_OF_CAR]
 
 
 def test_expiries_are_put_off_even_where_pyarrow_fails_to_load():
