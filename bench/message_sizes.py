@@ -11,10 +11,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
+from io import BytesIO
 from typing import Any
+
+from boto3.dynamodb.types import TypeSerializer
 
 from bench.load.simulated import simulated_drive
 from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_analysis.archive.writing import write_hour
+from iort_contract.archive import hour_of
 from iort_contract.catalog.derived import Vehicle as Gain
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -22,7 +27,7 @@ from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping, live_update
 from iort_contract.statistics import summarize_second
-from iort_contract.tables import EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
+from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cost.sizes import Measured
 
@@ -42,6 +47,7 @@ def main() -> None:
     for samples in SAMPLES:
         print(f"    Measured{tuple(batch_sizes(samples, 1.0))},")
     print(f"OWN_ITEM_BYTES = {own_item_bytes()}")
+    print(f"ARCHIVED_SHARE = {archived_share():.2f}")
     for name, size in message_sizes().items():
         print(f"    {name}: int = {size}")
 
@@ -78,6 +84,22 @@ def own_item_bytes() -> int:
     """The telemetry item of the agent's own figures, one sample."""
     columns: dict[str, list[Value]] = {name: [12.345] for name in AGENT_FIELDS}
     return stored_bytes(encode_batch(Batch(_BOOT, 100_000, [_T_US], columns)))
+
+
+def archived_share(seconds: int = 3600) -> float:
+    """The bytes in the archive for each byte of a drive's items in the table, over a whole hour."""
+    samples = simulated_drive(seconds * 50, after_s=_WARM_S)
+    items, stored, into, serialize = [], 0, BytesIO(), TypeSerializer().serialize
+    start_us = hour_of(_T_US).start_us
+    for second in range(seconds):
+        batch = batch_of(samples[second * 50 : (second + 1) * 50], 50)
+        times_us = [t_us - _T_US + start_us + second * 1_000_000 for t_us in batch.times_us]
+        made = replace(batch, seq=100_000 + second, times_us=times_us)
+        item = {**json.loads(encode_batch(made)), **_rule(), BATCH: str(made.id)}
+        stored += item_bytes(item)
+        items.append({name: serialize(value) for name, value in item.items()})
+    write_hour(items, into, hour=hour_of(start_us), refused=BytesIO(), scratch=BytesIO())
+    return len(into.getvalue()) / stored
 
 
 def stored_bytes(message: bytes) -> int:

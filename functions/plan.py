@@ -113,8 +113,10 @@ def unknown_to(table: FindingsTable, drives: list[PlannedDrive]) -> list[Planned
     """The drives that have not been analysed up to their end."""
     if not drives:
         return []
-    first, last = drives[0].drive, drives[-1].drive
-    done = {(one.drive, one.end_us) for one in table.drives(first.robot, first.start_us, last.start_us + 1)}
+    # Runs at the same time are in the order of their ends.
+    starts_us = [one.drive.start_us for one in drives]
+    rows = table.drives(drives[0].drive.robot, min(starts_us), max(starts_us) + 1)
+    done = {(one.drive, one.end_us) for one in rows}
     return [one for one in drives if (one.drive, one.end_us) not in done]
 
 

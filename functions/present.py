@@ -17,32 +17,34 @@ from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.catalog.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
 from iort_contract.cloud import findings_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.findings import DriveKey, Finding, decode_finding
+from iort_contract.messages.findings import NO_RUN, DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]
-# A run that could not be planned has no drive; its finding has this run of the agent.
-_NO_RUN = "00000000"
 _MOST_REASON = 500
 
 
 def present(
     drives: Iterable[tuple[DriveKey, Sequence[Finding]]], table: FindingsTable, notify: Notify, page_url: str
 ) -> dict[str, int]:
-    """Replace the findings of each drive; mail the serious ones that are new."""
-    kept = mailed = 0
+    """Replace the findings of each drive; mail the serious ones that are new.
+
+    A robot's findings of one kind are one mail, about the first: a run may be of a year's drives.
+    """
+    kept, mailed = 0, set[tuple[str, str]]()
     for drive, found in drives:
         before = {one.id: one for one in table.of_drive(drive)}
         for finding in found:
-            if finding.severity == SERIOUS and finding.id not in before:
+            about = (drive.robot, finding.kind)
+            if finding.severity == SERIOUS and finding.id not in before and about not in mailed:
                 notify(*mail(finding, page_url))
-                mailed += 1
+                mailed.add(about)
             # After the mail: a failure in between sends it twice, but never loses it.
             table.put_finding(finding)
             kept += 1
         for gone in before.keys() - {one.id for one in found}:
             table.remove(before[gone])
-    return {"findings": kept, "mails": mailed}
+    return {"findings": kept, "mails": len(mailed)}
 
 
 def mail(finding: Finding, page_url: str) -> tuple[str, str]:
@@ -67,7 +69,7 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
 def failure(event: Mapping[str, Any]) -> Finding:
     """The finding about a drive that could not be analysed, or a robot whose drives could not be found."""
     about = event["failed"]
-    drive = DriveKey(about["robot"], about["start_us"], about.get("run", _NO_RUN))
+    drive = DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN))
     what = "the drive could not be analysed" if "run" in about else "the drives could not be found"
     return Finding(
         drive=drive,

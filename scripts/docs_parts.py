@@ -232,13 +232,13 @@ def alarms() -> None:
 
 
 def cost(name: str) -> None:
-    """A table of the cost model: a robot's hour, what changes if, or fleets of several sizes."""
+    """A table of the cost model: a robot's hour or year, what changes if, or fleets of several sizes."""
     usage = Usage()
     if name == "scale":
         rows = fleets(usage)
     else:
         print(f"List prices of {AS_OF}, {REGION}, in US dollars; one robot, {usage.rate_hz:g} Hz.\n")
-        rows = {"hour": report.robot_hour, "whatif": report.what_if}[name](usage)
+        rows = {"hour": report.robot_hour, "whatif": report.what_if, "year": report.robot_year}[name](usage)
     _table(rows.head, rows.body)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
-from iort_analysis.results import DriveResult, Mined
+from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.messages.findings import DriveKey, Estimate
@@ -79,7 +79,7 @@ def _mined(name: str, miner: Miner, drive: Drive) -> Mined:
 
 
 def _finite(mined: Mined) -> Mined:
-    """The same with plain numbers; an estimate that is not finite is missing."""
+    """The same with plain numbers; an estimate that is not finite is missing, as is an event's effect."""
     estimates, missing = {}, dict(mined.missing)
     for name, one in mined.estimates.items():
         value, low, high = float(one.value), float(one.low), float(one.high)
@@ -87,7 +87,16 @@ def _finite(mined: Mined) -> Mined:
             estimates[name] = Estimate(value, low, high, one.unit)
         else:
             missing[name] = "the estimate is not finite"
-    return replace(mined, estimates=estimates, missing=missing)
+    return replace(
+        mined, estimates=estimates, missing=missing, events=[_finite_event(event) for event in mined.events]
+    )
+
+
+def _finite_event(event: Event) -> Event:
+    known = event.effect is not None and np.isfinite(event.effect[:3]).all()
+    # A chance that is not known is no evidence.
+    p = event.p if event.p is None or np.isfinite(event.p) else 1.0
+    return event._replace(effect=event.effect if known else None, p=p)
 
 
 def _unusable(drive: Drive) -> dict[str, str]:

@@ -13,31 +13,11 @@ from bench.proof.stored import stored
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
 from iort_contract.catalog.derived import F1TENTH
-from iort_station.cost.line_items import READ
-from iort_station.cost.prices import PRICES
-from iort_station.cost.sizes import sizes_of
+from iort_station.cost.analysing import Function, drive_items
+from iort_station.cost.usage import Usage
 
 HOUR_S = 3600.0
 _REPEATS = 3
-# A second of poses: docs/how-to/simulated-car.md.
-_POSE_ITEM_BYTES = 325
-# A function has a whole processor from this memory on ("Configure Lambda function memory").
-_MB_PER_CPU = 1769
-
-
-@dataclass(frozen=True)
-class Function:
-    """The function that analyses a drive, as stacks/analysis.py deploys it: its memory, how many run at once,
-    and the seconds and items that a drive takes besides the analysis, for reading and writing.
-
-    Each is an express workflow of the distributed map.
-    """
-
-    memory_mb: int = _MB_PER_CPU
-    at_once: int = 40
-    drive_s: float = 1.0
-    written_units: int = 4
-    workflow_mb: int = 64
 
 
 class Hour(NamedTuple):
@@ -79,26 +59,11 @@ def hour_cpu_s(car: int) -> Hour:
 def bill(robot_hours: float, cpu_s: float, drive_s: float, function: Function | None = None) -> Bill:
     """What the analysis of so many robot-hours takes and costs, in drives of ``drive_s`` seconds.
 
-    A function's share of a processor is its share of the memory that has a whole one. The samples are read
-    from the telemetry table.
+    The samples, of a VESC and as many of poses, are read from the telemetry table.
     """
     f = function or Function()
     drives = ceil(robot_hours * HOUR_S / drive_s)
-    billed_s = cpu_s * drive_s / HOUR_S * max(1.0, _MB_PER_CPU / f.memory_mb) + f.drive_s
-    units = {
-        "Lambda computing": ("compute_arm", drives * billed_s * f.memory_mb / 1024),
-        "Lambda invoked": ("invocation", drives),
-        "Step Functions, a state for each drive": ("transition", drives),
-        "Step Functions, express workflows": ("express_request", drives),
-        "Step Functions, their duration": ("express_duration", drives * billed_s * f.workflow_mb / 1024),
-        "DynamoDB, samples read": ("read", robot_hours * _read_units_per_hour()),
-        "DynamoDB, results written": ("write", drives * f.written_units),
-    }
-    dollars = {what: count * PRICES[price].each for what, (price, count) in units.items()}
+    billed_s = f.billed_s(cpu_s * drive_s / HOUR_S)
+    items = drive_items(Usage(rate_hz=RATE_HZ, streams=2), drives / robot_hours, billed_s, f)
+    dollars = {f"{item.service}, {item.what}": robot_hours * item.dollars for item in items}
     return Bill(ceil(drives / f.at_once) * billed_s, dollars)
-
-
-def _read_units_per_hour() -> float:
-    """A query's read units of an hour's batches of the VESC and of poses, half a unit for each 4 KB."""
-    vesc = sizes_of(RATE_HZ, 1.0).telemetry_item
-    return HOUR_S * (vesc + _POSE_ITEM_BYTES) / READ / 2

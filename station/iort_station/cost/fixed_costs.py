@@ -16,9 +16,9 @@ from iort_station.cost.prices import MONTH_HOURS, PRICES, Price
 from iort_station.cost.usage import Usage
 
 # Lambda polls a queue around the clock with five long polls of at most 20 s. It needs only two for a mapping
-# without a limit on its concurrency, but both of ours have one: the quarantine's, and that of batches put off
-# ("Configuring scaling behavior for SQS event source mappings").
-_QUEUES, _POLLERS, _POLL_S = 2, 5, 20
+# without a limit on its concurrency, but all of ours have one: the quarantine's, that of batches put off, and
+# the archive's ("Configuring scaling behavior for SQS event source mappings").
+_QUEUES, _POLLERS, _POLL_S = 3, 5, 20
 # SQS requests the queue's key every five minutes (KmsDataKeyReusePeriodSeconds).
 _KEYS_AN_HOUR = 12
 # "Amazon CloudWatch pricing", free tier: three dashboards of up to fifty metrics each, ten custom metrics,

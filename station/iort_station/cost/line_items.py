@@ -11,7 +11,7 @@ from iort_station.cost.usage import Usage
 
 METER, WRITE, READ, PUBNUB_UNIT = 5 * 1024, 1024, 4 * 1024, 2048
 # "For most use cases, storage is the sum of item sizes, plus 100 bytes an item of indexing overhead."
-_ITEM_OVERHEAD = 100
+ITEM_OVERHEAD = 100
 # Lambda's own log lines for an invocation.
 _REQUEST = "8f507cfc-xmpl-4697-b07a-ac58fc914c95"
 PLATFORM_LINES = (
@@ -79,7 +79,7 @@ def rules(lane: str, messages: float, size: int) -> list[LineItem]:
 
 def storage(lane: str, what: str, count: float, size: int, usage: Usage) -> LineItem:
     """The storage of ``count`` items an hour."""
-    gigabyte_months = count * (size + _ITEM_OVERHEAD) / 1e9 * usage.retention_days / MONTH_DAYS
+    gigabyte_months = count * (size + ITEM_OVERHEAD) / 1e9 * usage.retention_days / MONTH_DAYS
     return LineItem("DynamoDB", lane, what, "storage", gigabyte_months)
 
 

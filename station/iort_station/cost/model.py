@@ -11,6 +11,7 @@ from math import ceil
 from typing import Any
 
 from iort_contract.catalog.questions import QUESTIONS
+from iort_station.cost import analysing, archiving
 from iort_station.cost.line_items import (
     METER,
     PUBNUB_UNIT,
@@ -134,7 +135,7 @@ def _bill(usage: Usage) -> list[LineItem]:
         logged=_live_lines_per_s(usage) * hour / usage.robots * _LIVE_LINE + live * _LIVE_VALUES,
         all_lines=all_lines,
     )
-    return items
+    return [*items, *archiving.items(usage), *analysing.items(usage)]
 
 
 def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[LineItem]:

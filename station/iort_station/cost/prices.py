@@ -38,6 +38,8 @@ _DEFENDER = "https://aws.amazon.com/iot-device-defender/pricing/"
 _DYNAMODB = "https://aws.amazon.com/dynamodb/pricing/on-demand/"
 _LAMBDA = "https://aws.amazon.com/lambda/pricing/"
 _STATES = "https://aws.amazon.com/step-functions/pricing/"
+_S3 = "https://aws.amazon.com/s3/pricing/"
+_EVENTS = "https://aws.amazon.com/eventbridge/pricing/"
 _CLOUDWATCH = "https://aws.amazon.com/cloudwatch/pricing/"
 _SQS = "https://aws.amazon.com/sqs/pricing/"
 _KMS = "https://aws.amazon.com/kms/pricing/"
@@ -66,6 +68,13 @@ PRICES = {
     "transition": Price(0.025, 1000, "state transition", _STATES, "the page's table, Europe (Ireland)"),
     "express_request": Price(1.00, 1e6, "request of an express workflow", _STATES),
     "express_duration": Price(0.00001667, 1, "GB-second of an express workflow", _STATES),
+    "s3_standard": Price(0.023, 1, "GB-month in S3 Standard", _S3),
+    "s3_instant": Price(0.005, 1, "GB-month in S3 Glacier Instant Retrieval", _S3),
+    "s3_instant_read": Price(0.03, 1, "GB read from S3 Glacier Instant Retrieval", _S3),
+    "s3_put": Price(0.005, 1000, "PUT, COPY, POST or LIST", _S3),
+    "s3_get": Price(0.0004, 1000, "GET or HEAD", _S3),
+    "s3_move": Price(0.02, 1000, "object moved to S3 Glacier Instant Retrieval", _S3),
+    "schedule": Price(1.00, 1e6, "scheduled call", _EVENTS),
     "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
     "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH, "signoz.io, 2026-02-15"),
     "metric_request": Price(0.01, 1000, "metric requested by GetMetricData", _CLOUDWATCH),

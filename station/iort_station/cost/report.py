@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from iort_station.cost import line_items, model
+from iort_station.cost import analysing, archiving, line_items, model
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import PRODUCTS, Listed
 from iort_station.cost.prices import AS_OF, PRICES, REGION, Price
@@ -14,6 +14,7 @@ from iort_station.cost.usage import Usage, variations
 
 # The table of a robot-hour has no rows below this; the totals include them.
 _LEAST_DOLLARS = 0.00005
+_NOT_IN_THE_THESIS = frozenset({archiving.LANE, analysing.LANE})
 
 
 class Rows(NamedTuple):
@@ -43,6 +44,8 @@ def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
     unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
     body.append(("total AWS without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
+    alike = line_items.total(thesis), sum(i.dollars for i in ours if i.lane not in _NOT_IN_THE_THESIS)
+    body.append(("total AWS without archive and analysis", *map(_dollars, alike), _ratio(alike)))
     both = line_items.total(pubnub[1]), line_items.total(pubnub[0])
     body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
     return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
@@ -65,6 +68,15 @@ def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
     ]
     return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
+
+
+def robot_year(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+    """What a robot records in a year, in DynamoDB beside the archive."""
+    body: list[tuple[str, ...]] = [
+        (place.what, f"{place.size_bytes / 1e9:.2f}", _dollars(place.dollars))
+        for place in archiving.robot_year(usage, prices)
+    ]
+    return Rows((f"a robot-year, {usage.hours_per_day:g} h a day", "GB", "dollars"), body)
 
 
 def differences(listed: Listed) -> Rows:

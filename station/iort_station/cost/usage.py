@@ -25,10 +25,11 @@ class Usage:
     The agent sends its metrics ``agent_every_s``.
 
     Of a deployment: items are kept ``retention_days``, and are ``recoverable`` to a point in time in stage
-    prod. Each of ``alarms`` watches a metric; the alarms by Metrics Insights analyse ``insights_metrics``
-    together. ``dashboards`` has the number of metrics on each; ``robot_metrics`` adds to the last. They are
-    open on the live page for ``dashboard_hours`` a month. ``function_logs`` "all" adds Lambda's own log
-    lines.
+    prod. The archive's are counted for ``archive_days``, 0 for none. Every night drives of ``drive_minutes``
+    are analysed, 0 for none. Each of ``alarms`` watches a metric; the alarms by Metrics Insights analyse
+    ``insights_metrics`` together. ``dashboards`` has the number of metrics on each; ``robot_metrics`` adds to
+    the last. They are open on the live page for ``dashboard_hours`` a month. ``function_logs`` "all" adds
+    Lambda's own log lines.
 
     Only AWS knows the billed milliseconds; ``live_ms``, ``summarize_ms`` and ``summarize_batch_ms`` (for each
     batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet all the time.
@@ -47,6 +48,8 @@ class Usage:
     hours_per_day: float = 2.0
     viewers: int = 1
     retention_days: int = DEFAULT_RETENTION_DAYS
+    archive_days: int = 365
+    drive_minutes: float = 10.0
     live_memory_mb: int = 256
     live_ms: float = 20.0
     live_concurrency: int = 0
@@ -102,6 +105,11 @@ class Usage:
         return figures + 1 / ACCOUNT_EVERY_S + min(1.0, 3 * self.ping_hz)
 
     @property
+    def own_streams(self) -> int:
+        """The agent's own streams."""
+        return bool(self.agent_every_s) + 1 + bool(self.ping_hz)
+
+    @property
     def live_at_broker_per_s(self) -> float:
         """A robot's live messages a second that pass the broker while its fault code does not change."""
         return min(self.live_hz, self.streams / LIVE_BROKER_EVERY_S)
@@ -133,5 +141,8 @@ def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
     yield "reconnecting every minute", replace(usage, connects_per_hour=60.0)
     yield "with Lambda's own log lines", replace(usage, function_logs="all")
     yield "kept for 30 days", replace(usage, retention_days=30)
+    yield "without an archive", replace(usage, archive_days=0)
+    yield "kept for ten years in the archive", replace(usage, archive_days=3653)
+    yield "without the nightly analysis", replace(usage, drive_minutes=0.0)
     yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)
     yield "a thousand robots", replace(usage, robots=1000)

@@ -8,7 +8,7 @@ import numpy as np
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.process import analyse
-from iort_analysis.results import Event, Mined
+from iort_analysis.results import Event, Mined, encode_result
 from iort_analysis.samples.blocks import EMPTY, Block, objects
 from iort_contract.messages.findings import Estimate
 from tests.unit.analysis.simulated import KEY, START_US, VEHICLE, changed, streams
@@ -37,6 +37,16 @@ def test_a_miner_that_fails_does_not_stop_the_others() -> None:
         "drag": "too slow",
     }
     assert (result.samples, result.end_us) == (9000, START_US + 119_980_000)
+
+
+def test_an_event_without_a_finite_effect_is_kept_without_it() -> None:
+    def finds(drive: Drive) -> Mined:
+        at_us, nothing = drive.key.start_us, MASS._replace(high=np.inf)
+        return Mined(events=[Event("odd", at_us, at_us, "vesc", (), "text", nothing, p=np.nan)])
+
+    (event,) = encode_result(analyse(KEY, streams(), VEHICLE, miners={"a": finds}))["events"]
+
+    assert (event["effect"], event["p"]) == (None, 1.0)
 
 
 def test_a_drive_in_any_state_has_a_result() -> None:

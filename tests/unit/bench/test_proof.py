@@ -111,5 +111,5 @@ def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
     once, twice, slow = (speed.bill(*these, 600.0) for these in ((100, 2.0), (200, 2.0), (100, 20.0)))
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
-    assert slow.dollars["Lambda computing"] > once.dollars["Lambda computing"]
+    assert slow.dollars["Lambda, computing"] > once.dollars["Lambda, computing"]
     assert slow.dollars["DynamoDB, samples read"] == once.dollars["DynamoDB, samples read"]

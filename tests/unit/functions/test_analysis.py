@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 
 import boto3
 import numpy as np
@@ -197,6 +198,16 @@ def test_only_new_drives_are_analysed_unless_again(cloud: Deployed) -> None:
     assert [one.samples for one in cloud.table.drives(CAR)] == [60 * HZ]
 
 
+def test_drives_of_two_runs_at_the_same_time_are_known(cloud: Deployed) -> None:
+    """The run that began second ends first."""
+    cloud.register(CAR)
+    cloud.record({"vesc": streams(200)["vesc"]})
+    cloud.record(later({"vesc": streams(30)["vesc"]}, 20), run="00c0ffef")
+
+    assert [one["start_us"] - START_US for one in cloud.run()] == [20 * S, 0]
+    assert cloud.run() == []
+
+
 def test_a_drive_that_began_before_the_range_is_whole(cloud: Deployed) -> None:
     cloud.register(CAR)
     cloud.record(streams(120))
@@ -259,6 +270,9 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
 
     for day in range(-8, 0):
         cloud.table.put_drive(resistance(day, 0.03 + 0.0005 * (day % 3), "before"))
+    # Analysed again after a year, a drive is still compared with those before it.
+    for day in range(1, 350):
+        cloud.table.put_drive(resistance(day, 0.06, "since"))
     worn = resistance(0, 0.06, JOB)
     cloud.table.put_drive(worn)
     result = DriveResult(worn.drive, worn.end_us, 3000, {}, Mined(estimates=worn.estimates))
@@ -267,7 +281,7 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
-    evaluate.handler({"job": JOB, "robots": [CAR]}, None)
+    evaluate.handler({"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1}, None)
     present.handler({"job": JOB}, None)
 
     (found,) = cloud.table.findings(CAR)
@@ -312,6 +326,17 @@ def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Dep
     assert link in text
 
 
+def test_a_year_of_drives_with_one_fault_is_one_mail(cloud: Deployed) -> None:
+    mails: list[str] = []
+    found = [replace(finding(), drive=DriveKey(CAR, START_US + day * S, RUN)) for day in range(3)]
+
+    counts = present.present(
+        [(one.drive, [one]) for one in found], cloud.table, lambda subject, _: mails.append(subject), PAGE_URL
+    )
+
+    assert (counts, len(mails)) == ({"findings": 3, "mails": 1}, 1)
+
+
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
@@ -337,6 +362,18 @@ def test_a_failed_drive_is_a_finding_until_it_succeeds(
     assert (found.kind, found.drive.start_us) == (ANALYSIS_FAILED, START_US)
     assert found.text == f"the drive could not be analysed in three attempts: {reason}"
     assert ANALYSIS_FAILED not in {one.kind for one in cloud.table.findings(CAR)}
+
+
+def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) -> None:
+    cloud.register(CAR)
+    failed = {"robot": CAR, "start_us": START_US, "end_us": START_US + 60 * S}
+    present.handler({"failed": failed, "error": {"Cause": "no answer"}}, None)
+    (found,) = cloud.table.findings(CAR)
+    assert found.text == "the drives could not be found in three attempts: no answer"
+
+    for end_us, left in ((START_US + 30 * S, [found]), (START_US + 60 * S, [])):
+        cloud.run(end_us=end_us)
+        assert list(cloud.table.findings(CAR)) == left
 
 
 @pytest.mark.parametrize(

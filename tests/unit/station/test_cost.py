@@ -77,8 +77,8 @@ def test_the_ratio_is_also_given_without_log_lines():
 
 def test_an_idle_deployment_pays_for_polling_monitoring_and_storage():
     rest = deployment_dollars_per_month(_ONE)
-    # Five long polls of 20 s at all times, for each of two queues.
-    assert rest["polling the queues"] == pytest.approx(2 * 657_000 * 0.40e-6)
+    # Five long polls of 20 s at all times, for each of three queues.
+    assert rest["polling the queues"] == pytest.approx(3 * 657_000 * 0.40e-6)
     assert rest["alarms"] == pytest.approx((_ONE.alarms - 10) * 0.10), "ten are free"
     insights = rest["alarms by Metrics Insights, at most"]
     assert insights == pytest.approx(_ONE.insights_metrics * 0.10), "and none of those"

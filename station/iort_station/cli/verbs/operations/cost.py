@@ -15,7 +15,7 @@ from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples
-from iort_station.cost import line_items, model, report, scale
+from iort_station.cost import archiving, line_items, model, report, scale
 from iort_station.cost.car import as_configured
 from iort_station.cost.deployed import as_deployed
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
@@ -54,6 +54,12 @@ def cost_(
     ] = _DEFAULT.hours_per_day,
     viewers: Annotated[int, typer.Option(help="People who watch the fleet.")] = _DEFAULT.viewers,
     retention_days: Annotated[int, typer.Option(help="Days that items are kept.")] = _DEFAULT.retention_days,
+    archive_days: Annotated[
+        int, typer.Option(help="Days that the archive keeps them, for this estimate; 0 for no archive.")
+    ] = _DEFAULT.archive_days,
+    drive_minutes: Annotated[
+        float, typer.Option(help="Minutes of a drive, which is analysed at night; 0 for no analysis.")
+    ] = _DEFAULT.drive_minutes,
     live_ms: Annotated[float, typer.Option(help="Billed milliseconds of Lambda 1.")] = _DEFAULT.live_ms,
     summarize_ms: Annotated[
         float, typer.Option(help="Billed milliseconds of Lambda 2.")
@@ -107,6 +113,8 @@ def cost_(
         hours_per_day=hours_per_day,
         viewers=viewers,
         retention_days=retention_days,
+        archive_days=archive_days,
+        drive_minutes=drive_minutes,
         live_ms=live_ms,
         summarize_ms=summarize_ms,
         connects_per_hour=connects_per_hour,
@@ -131,6 +139,7 @@ def cost_(
     for title, rows in (
         ("A robot-hour", report.robot_hour(usage, prices)),
         ("A month", report.month(usage, prices)),
+        ("A robot-year in DynamoDB beside one in the archive", report.robot_year(usage, prices)),
         ("What if", report.what_if(usage, prices)),
         ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
     ):
@@ -178,6 +187,7 @@ def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
         "dollars_per_robot_hour": line_items.total(ours),
         "thesis_dollars_per_robot_hour": line_items.total(thesis),
         "deployment_dollars_per_month": deployment_dollars_per_month(usage, prices),
+        "robot_year": [place._asdict() for place in archiving.robot_year(usage, prices)],
         "fleet_dollars_per_month": paper.aws_dollars_per_month,
         "pubnub_mau_dollars_per_month": model.pubnub_mau_dollars_per_month(usage),
         "quotas": [
