@@ -20,7 +20,7 @@ from iort_contract.catalog.environments import EvaluateEnvironment
 from iort_contract.cloud import drive_prefix, findings_key, plan_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis import AnalysedDrive, decode_planned
-from iort_contract.messages.findings import Finding, encode_finding
+from iort_contract.messages.findings import NO_RUN, DriveKey, Finding, encode_finding
 
 # The newest drives of a robot before those of the run, and of each other robot up to its end, with which a
 # drive is compared.
@@ -46,6 +46,13 @@ class Drives:
         made = [one.drive for one in rows if one.job == job]
         found = [self._kept.json(f"{drive_prefix(drive)}result.json") for drive in made]
         return [decode_result(content) for content in found if content is not None]
+
+    def made_good(self, job: str, robot: str, start_us: int) -> list[DriveKey]:
+        """What stands for the robot's failed plans whose range this run has planned."""
+        if self._kept.json(plan_key(job, robot)) is None:
+            return []
+        found = self._table.findings(robot, start_us, self._end_us)
+        return [one.drive for one in found if one.drive.run == NO_RUN and one.to_us <= self._end_us]
 
     def history(self, robot: str, results: Sequence[DriveResult]) -> list[Measured]:
         """The drives of a robot among ``results``, and the newest ones before."""
@@ -89,5 +96,10 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
         {"drive": vars(result.drive), "findings": [encode_finding(one) for one in found]}
         for result, found in findings(drives, event["job"], event["robots"])
     ]
-    kept.put_json(findings_key(event["job"]), made)
+    good = [
+        {"drive": vars(drive), "findings": []}
+        for robot in event["robots"]
+        for drive in drives.made_good(event["job"], robot, event["start_us"])
+    ]
+    kept.put_json(findings_key(event["job"]), made + good)
     return {"drives": len(made), "findings": sum(len(one["findings"]) for one in made)}

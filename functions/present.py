@@ -17,12 +17,10 @@ from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.catalog.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
 from iort_contract.cloud import findings_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.findings import DriveKey, Finding, decode_finding
+from iort_contract.messages.findings import NO_RUN, DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]
-# A run that could not be planned has no drive; its finding has this run of the agent.
-_NO_RUN = "00000000"
 _MOST_REASON = 500
 
 
@@ -71,7 +69,7 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
 def failure(event: Mapping[str, Any]) -> Finding:
     """The finding about a drive that could not be analysed, or a robot whose drives could not be found."""
     about = event["failed"]
-    drive = DriveKey(about["robot"], about["start_us"], about.get("run", _NO_RUN))
+    drive = DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN))
     what = "the drive could not be analysed" if "run" in about else "the drives could not be found"
     return Finding(
         drive=drive,

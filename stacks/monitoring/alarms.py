@@ -35,6 +35,8 @@ class Alarms(Construct):
             self._add(f"{name}Throttled", throttled)
         for name, reader in watched.readers.items():
             self._add(f"{name}Behind", metrics.function("IteratorAge", reader))
+        for name, machine in watched.machines.items():
+            self._add(f"{name}Failed", metrics.machine("ExecutionsFailed", machine))
         for metric in METRICS.values():
             if metric.alarm:
                 self._add(metric.name, metrics.ours(metric, settings.namespace))

@@ -11,6 +11,7 @@ from aws_cdk import aws_cloudwatch as cloudwatch
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
+from aws_cdk import aws_stepfunctions as stepfunctions
 
 from iort_contract.catalog.metrics import (
     METRIC_DEPLOYMENT,
@@ -77,6 +78,11 @@ def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
         using_metrics={},
         period=PERIOD,
     )
+
+
+def machine(name: str, of: stepfunctions.IStateMachine) -> cloudwatch.Metric:
+    """A metric of a state machine."""
+    return _metric("AWS/States", name, {"StateMachineArn": of.state_machine_arn})
 
 
 def waiting(of: sqs.IQueue, *, label: str | None = None) -> cloudwatch.Metric:

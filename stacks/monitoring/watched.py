@@ -9,6 +9,7 @@ from aws_cdk import Stack
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
+from aws_cdk import aws_stepfunctions as stepfunctions
 
 from stacks.storage import OLD_TELEMETRY
 
@@ -16,12 +17,13 @@ from stacks.storage import OLD_TELEMETRY
 @dataclass(frozen=True)
 class Watched:
     """Functions, tables and queues by their construct's name; ``readers`` are the functions that read a
-    stream."""
+    stream. ``machines`` are state machines by their stack's name."""
 
     functions: Mapping[str, lambda_.Function]
     tables: Mapping[str, dynamodb.Table]
     queues: Mapping[str, sqs.Queue]
     readers: Mapping[str, lambda_.Function]
+    machines: Mapping[str, stepfunctions.StateMachine]
 
     @classmethod
     def of(cls, stacks: Iterable[Stack]) -> Watched:
@@ -30,6 +32,7 @@ class Watched:
         tables: dict[str, dynamodb.Table] = {}
         queues: dict[str, sqs.Queue] = {}
         readers: dict[str, lambda_.Function] = {}
+        machines: dict[str, stepfunctions.StateMachine] = {}
         for stack in stacks:
             for construct in stack.node.find_all():
                 if isinstance(construct, lambda_.Function):
@@ -40,8 +43,10 @@ class Watched:
                         tables[construct.node.id] = construct
                 elif isinstance(construct, sqs.Queue):
                     queues[construct.node.id] = construct
+                elif isinstance(construct, stepfunctions.StateMachine):
+                    machines[type(stack).__name__] = construct
                 elif isinstance(construct, lambda_.EventSourceMapping):
                     reader = construct.node.scope
                     if isinstance(reader, lambda_.Function):
                         readers[reader.node.id] = reader
-        return cls(functions, tables, queues, readers)
+        return cls(functions, tables, queues, readers, machines)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 # Dimensions of each metric. AWS IoT Developer Guide, "AWS IoT metrics and dimensions"; Lambda Developer
 # Guide, "Types of metrics for Lambda functions"; DynamoDB Developer Guide, "DynamoDB metrics and
-# dimensions"; SQS Developer Guide, "Available CloudWatch metrics for Amazon SQS".
+# dimensions"; SQS Developer Guide, "Available CloudWatch metrics for Amazon SQS";
+# Step Functions Developer Guide, "Execution metrics".
 AWS_METRICS = {
     ("AWS/IoT", "Protocol"): {
         f"{what}.{how}"
@@ -30,4 +31,5 @@ AWS_METRICS = {
         "WriteThrottleEvents",
     },
     ("AWS/SQS", "QueueName"): {"ApproximateNumberOfMessagesVisible"},
+    ("AWS/States", "StateMachineArn"): {"ExecutionsFailed"},
 }

@@ -62,7 +62,7 @@ def test_every_alarm_notifies_the_topic_and_is_documented(alarms, reader):
         assert re.fullmatch(r"\w.*\. What to do: .*", description)
         assert "](" not in description
         assert len(description) <= 1024
-        generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind)$", r"\1", alarm)
+        generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind|Failed)$", r"\1", alarm)
         assert f"`{generic}`" in text or f"`...{generic}`" in text, (
             f"docs/how-to/alarms.md says nothing of {alarm}"
         )

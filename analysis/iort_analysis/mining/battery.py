@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
+from iort_analysis.mining.charge import DRAWN, LEFT, RANGE, Spent, charge
 from iort_analysis.mining.fitting import Fit, Prior, fit
 from iort_analysis.mining.signals import averaged, binned, bridged, lagged, resolution, smooth_basis
 from iort_analysis.results import Mined, Table
@@ -43,6 +44,9 @@ _NAMES = (
     "battery_slow_resistance_ohm",
     "battery_open_voltage_v",
     "battery_voltage_per_ah",
+    DRAWN,
+    LEFT,
+    RANGE,
 )
 
 
@@ -67,7 +71,7 @@ class Battery(NamedTuple):
 
 
 def mine(drive: Drive) -> Mined:
-    """The battery's resistances, and its open voltage against the charge drawn."""
+    """The battery's resistances, its open voltage against the charge drawn, and what is left in it."""
     battery = fit_battery(drive)
     if isinstance(battery, str):
         return Mined(missing=dict.fromkeys(_NAMES, battery))
@@ -80,7 +84,15 @@ def mine(drive: Drive) -> Mined:
         "battery_open_voltage_v": battery.open_at(-1),
         "battery_voltage_per_ah": battery.slope(),
     }
-    return Mined(estimates, tables={"battery": _curve(battery)})
+    way_m = drive.of(drive.vesc, "distance_m")
+    spent = Spent(
+        float(battery.charge_ah[-1] - battery.charge_ah[0]),
+        None if way_m is None else float(np.nanmax(way_m) - np.nanmin(way_m)),
+        battery.open_at(0),
+        battery.open_at(-1),
+    )
+    left, missing = charge(spent, drive.known)
+    return Mined({**estimates, **left}, missing, tables={"battery": _curve(battery)})
 
 
 def fit_battery(drive: Drive) -> Battery | str:

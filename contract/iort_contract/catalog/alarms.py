@@ -33,7 +33,8 @@ class Alarm:
         return re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", self.action)
 
 
-# One for each queue, function, table and stream reader: the resource's name stands before the alarm's.
+# One for each queue, function, table, stream reader and state machine: the resource's name stands before the
+# alarm's.
 WAITING = Alarm(
     "messages are in quarantine",
     "they wait for a minute in a burst, or for good because the quarantine's function fails (`Last` after "
@@ -71,8 +72,19 @@ BEHIND = Alarm(
     factor=1000,
     periods=3,
 )
+FAILED = Alarm(
+    "the state machine failed, and its work is not done",
+    "the execution's history in Step Functions names the state and its error; afterwards run "
+    "`iort analyse --fleet --new`. A drive that fails is a finding instead, and fails no execution",
+)
 # By the ends of their names.
-OF_RESOURCES = {"Waiting": WAITING, "Errors": ERRORS, "Throttled": THROTTLED, "Behind": BEHIND}
+OF_RESOURCES = {
+    "Waiting": WAITING,
+    "Errors": ERRORS,
+    "Throttled": THROTTLED,
+    "Behind": BEHIND,
+    "Failed": FAILED,
+}
 # By their names.
 OF_ONE_RESOURCE = {"PutOffWaiting": PUT_OFF_WAITING, "ArchiveTasksWaiting": ARCHIVE_TASKS_WAITING}
 # Messages that can be lost without being in quarantine, by AWS' namespace and metric. Account-wide, since AWS

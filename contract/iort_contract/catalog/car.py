@@ -1,8 +1,30 @@
-"""The parameters of a car's parts: battery, motor, what the motor moves, and heat."""
+"""The parameters of a car's parts: battery, motor, what the motor moves, and heat; and what the operator may
+tell of a car."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from iort_contract.catalog.parameter import Parameter
+
+
+class Known(NamedTuple):
+    """A number of a car that no sensor tells, and its limits."""
+
+    unit: str
+    meaning: str
+    least: float
+    most: float
+    whole: bool = False
+
+
+# By `iort robots set`, into the robot's row; the analysis has them as the drive's ``known``.
+KNOWN = {
+    "mass_kg": Known("kg", "mass of the car", 0.1, 10_000),
+    "pole_pairs": Known("1", "pole pairs of the motor", 1, 50, whole=True),
+    "cells": Known("1", "cells of the battery in series", 1, 100, whole=True),
+    "capacity_ah": Known("Ah", "rated capacity of the battery", 0.01, 1000),
+}
 
 _BATTERY = ("voltage_input", "current_input")
 BATTERY = (
@@ -33,6 +55,27 @@ BATTERY = (
         "V/Ah",
         "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
         fields=_BATTERY,
+        state=True,
+    ),
+    Parameter(
+        "battery_drawn_share",
+        "1",
+        "charge that the drive drew, as a share of the battery's rated capacity",
+        fields=_BATTERY,
+        state=True,
+    ),
+    Parameter(
+        "battery_charge_left",
+        "1",
+        "charge in the battery at the drive's end, as a share; by the voltage of its cells at rest",
+        fields=_BATTERY,
+        state=True,
+    ),
+    Parameter(
+        "battery_range_left_km",
+        "km",
+        "how far that charge takes the car, driven as in this drive",
+        fields=(*_BATTERY, "speed"),
         state=True,
     ),
 )

@@ -10,6 +10,8 @@ from iort_contract.limits import ContractError
 
 # The share of repetitions in which an estimate's interval holds the truth.
 INTERVAL = 0.9
+# The run of a finding that is about no drive: a robot's drives could not be found.
+NO_RUN = "00000000"
 
 
 class Estimate(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from iort_station.cost.line_items import PLATFORM_LINES, READ, LineItem
 from iort_station.cost.sizes import sizes_of
@@ -46,6 +46,7 @@ class Function:
 
 def drive_items(usage: Usage, drives: float, billed_s: float, function: Function) -> list[LineItem]:
     """The line items of ``drives`` in a robot-hour, each of ``billed_s`` seconds."""
+    one_stream = replace(usage, streams=1)
     return [
         _item("Lambda", "computing", "compute_arm", drives * billed_s * function.memory_mb / 1024),
         _item("Lambda", "invoked", "invocation", drives),
@@ -58,6 +59,8 @@ def drive_items(usage: Usage, drives: float, billed_s: float, function: Function
             drives * billed_s * function.workflow_mb / 1024,
         ),
         _item("DynamoDB", "samples read", "read", read_units(usage)),
+        # The stream that tells of motion.
+        _item("DynamoDB", "samples read to find the drives", "read", _PLANNED * read_units(one_stream)),
         _item("DynamoDB", "results written", "write", drives * function.written_units),
         _item("S3", "results written, PUT", "s3_put", drives * function.objects),
         _item("S3", "results read, GET", "s3_get", drives),
@@ -86,7 +89,6 @@ def items(usage: Usage) -> list[LineItem]:
         _item(
             "Step Functions", "states of the run, and of each robot", "transition", nights + _STATES * runs
         ),
-        _item("DynamoDB", "samples read to find the drives", "read", _PLANNED * read_units(usage)),
         _item("DynamoDB", "earlier drives read", "read", nights * _COMPARED),
         _item(
             "S3",

@@ -57,7 +57,7 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 37
+    alarms: int = 38
     insights_metrics: int = 63
     dashboards: tuple[int, ...] = (49, 20, 20)
     dashboard_hours: float = 20.0

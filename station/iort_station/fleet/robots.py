@@ -11,6 +11,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from iort_contract.catalog import derived
+from iort_contract.catalog.car import KNOWN
 from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
@@ -32,13 +33,25 @@ _MOST, _LEAST = 1e9, 1e-9
 def checked_vehicle(vehicle: Mapping[str, float]) -> dict[str, float]:
     """Return valid vehicle parameters; raises `UsageError`."""
     for name, value in vehicle.items():
+        if name in KNOWN:
+            _check_known(name, value)
+            continue
         if name not in F1TENTH:
-            raise UsageError(f"vehicle parameter must be one of {', '.join(F1TENTH)}, got {name}")
+            allowed = ", ".join([*F1TENTH, *KNOWN])
+            raise UsageError(f"vehicle parameter must be one of {allowed}, got {name}")
         # NaN fails every comparison.
         if not abs(value) <= _MOST or (name == GAIN and abs(value) < _LEAST):
             no_zero = " and not 0" if name == GAIN else ""
             raise UsageError(f"{name} must be a number from {-_MOST:g} to {_MOST:g}{no_zero}, got {value:g}")
     return dict(vehicle)
+
+
+def _check_known(name: str, value: float) -> None:
+    unit, _, least, most, whole = KNOWN[name]
+    if not least <= value <= most or (whole and value != int(value)):
+        kind = "whole number" if whole else "number"
+        of = "" if unit == "1" else f" ({unit})"
+        raise UsageError(f"{name} must be a {kind} from {least:g} to {most:g}{of}, got {value:g}")
 
 
 def add(

@@ -4,6 +4,7 @@ cloud.
 
 from __future__ import annotations
 
+import json
 import time
 
 import pytest
@@ -81,3 +82,12 @@ def test_an_invalid_parameter_changes_nothing(embedded, bundle, iort, parameter,
     assert said in str(done.exception)
     assert registry.get(embedded.cloud, car.robot) == before
     assert "not registered" in str(iort("robots", "set", "nobody", "speed_to_erpm_gain=1").exception)
+
+
+def test_what_only_the_analysis_needs_is_set_at_once_and_shown(embedded, bundle, iort):
+    car = bundle()
+    done = iort("robots", "set", car.robot, "capacity_ah=5", "cells=3")
+    assert done.exit_code == 0, done.output
+    assert "recomputed" not in done.output
+    shown = json.loads(iort("robots", "show", car.robot, "--json").stdout)
+    assert (shown["capacity_ah"], shown["cells"]) == (5.0, 3.0)

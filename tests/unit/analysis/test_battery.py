@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from iort_agent.sources.sim.parameters import open_voltage
+from iort_analysis.drives.transform import with_derived
 from iort_analysis.mining.battery import mine
+from iort_analysis.mining.charge import Spent, charge
+from iort_contract.catalog.derived import F1TENTH
+from iort_contract.messages.findings import Estimate
 from tests.unit.analysis.proven import proven
 
 
@@ -63,3 +68,41 @@ def test_a_steady_current_says_nothing_of_the_resistance() -> None:
 
     assert not mined.estimates
     assert "hardly changes" in mined.missing["battery_resistance_ohm"]
+
+
+@pytest.mark.parametrize("car", range(4))
+def test_the_charge_and_the_range_that_are_left_hold_the_truth(car: int) -> None:
+    drive, truth = proven(car)
+    known = {"capacity_ah": truth["capacity_ah"], "cells": truth["cells"]}
+    samples = with_derived(drive.samples, "vesc", F1TENTH)
+    found = mine(replace(drive, known=known, samples=samples)).estimates
+
+    left = found["battery_charge_left"]
+    assert left.low < truth["charge_left"] < left.high
+    assert left.high - left.low < 0.5
+    share = truth["charge"] - truth["charge_left"]
+    assert found["battery_drawn_share"].value == pytest.approx(share, rel=0.02)
+    km = samples.columns["vesc.distance_m"][-1] / 1000
+    ranged = found["battery_range_left_km"]
+    assert ranged.low < km / share * truth["charge_left"] < ranged.high
+
+
+@pytest.mark.parametrize("left", np.linspace(0.02, 0.99, 20))
+def test_the_charge_holds_that_of_a_cell_with_another_curve(left: float) -> None:
+    first, last = (
+        Estimate(3 * open_voltage(at), 3 * open_voltage(at), 3 * open_voltage(at), "V")
+        for at in (left + 0.01, left)
+    )
+    found, _ = charge(Spent(0.05, None, first, last), {"cells": 3, "capacity_ah": 5})
+    assert found["battery_charge_left"].low <= left <= found["battery_charge_left"].high
+
+
+def test_without_capacity_or_cells_nothing_is_said_of_what_is_left() -> None:
+    drive = proven(0).drive
+    missing = mine(replace(drive, known={"cells": 3.0})).missing
+    assert missing["battery_charge_left"] == "needs capacity_ah of the battery: iort robots set"
+    assert missing.keys() == {"battery_drawn_share", "battery_charge_left", "battery_range_left_km"}
+    still = mine(replace(drive, known={"cells": 3.0, "capacity_ah": 5.0}))
+    assert "speed in m/s" in still.missing["battery_range_left_km"]
+    wrong = mine(replace(drive, known={"cells": 6.0, "capacity_ah": 5.0}))
+    assert "for each of 6 cells" in wrong.missing["battery_charge_left"]

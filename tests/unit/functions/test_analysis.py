@@ -281,7 +281,7 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
-    evaluate.handler({"job": JOB, "robots": [CAR], "end_us": worn.drive.start_us + 1}, None)
+    evaluate.handler({"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1}, None)
     present.handler({"job": JOB}, None)
 
     (found,) = cloud.table.findings(CAR)
@@ -362,6 +362,18 @@ def test_a_failed_drive_is_a_finding_until_it_succeeds(
     assert (found.kind, found.drive.start_us) == (ANALYSIS_FAILED, START_US)
     assert found.text == f"the drive could not be analysed in three attempts: {reason}"
     assert ANALYSIS_FAILED not in {one.kind for one in cloud.table.findings(CAR)}
+
+
+def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) -> None:
+    cloud.register(CAR)
+    failed = {"robot": CAR, "start_us": START_US, "end_us": START_US + 60 * S}
+    present.handler({"failed": failed, "error": {"Cause": "no answer"}}, None)
+    (found,) = cloud.table.findings(CAR)
+    assert found.text == "the drives could not be found in three attempts: no answer"
+
+    for end_us, left in ((START_US + 30 * S, [found]), (START_US + 60 * S, [])):
+        cloud.run(end_us=end_us)
+        assert list(cloud.table.findings(CAR)) == left
 
 
 @pytest.mark.parametrize(

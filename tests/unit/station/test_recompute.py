@@ -128,10 +128,12 @@ def test_an_outdated_lambda_is_an_error():
         ({"speed_to_erpm_gain": 0.0}, "and not 0, got 0"),
         ({"speed_to_erpm_gain": float("nan")}, "got nan"),
         ({"speed_to_erpm_gain": float("-inf")}, "must be a number from -1e.09 to 1e.09"),
+        ({"cells": 2.5}, "cells must be a whole number from 1 to 100, got 2.5"),
+        ({"capacity_ah": 0.0}, r"capacity_ah must be a number from 0.01 to 1000 \(Ah\), got 0"),
         ({"speed_to_erpm_offset": 1e10}, "speed_to_erpm_offset must be"),
         (
             {"serial": 1.0},
-            "vehicle parameter must be one of speed_to_erpm_gain, speed_to_erpm_offset, got serial",
+            "vehicle parameter must be one of speed_to_erpm_gain, .*, capacity_ah, got serial",
         ),
     ],
 )

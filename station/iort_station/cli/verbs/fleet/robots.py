@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_contract.catalog.car import KNOWN
 from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
@@ -46,12 +47,18 @@ commands.add_typer(tags.commands)
 _PIPE_WIDTH = 10_000
 
 
-@commands.command("set", epilog=examples("robots set car7 speed_to_erpm_gain=4614 --last 7d"))
+@commands.command(
+    "set",
+    epilog=examples(
+        "robots set car7 speed_to_erpm_gain=4614 --last 7d",
+        "robots set car7 capacity_ah=5 cells=3 mass_kg=3.7 pole_pairs=2",
+    ),
+)
 def set_(
     context: typer.Context,
     name: Robot,
     parameters: Annotated[
-        list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{' or '.join(robots.F1TENTH)}.")
+        list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{', '.join([*robots.F1TENTH, *KNOWN])}.")
     ],
     start: From = None,
     last: Last = None,
@@ -70,6 +77,9 @@ def set_(
 
     Queries of samples use the new parameters at once, for all times. Summaries before --from stay as
     they are. A second run changes nothing; after an interruption it does the rest.
+
+    Mass, pole pairs, cells and capacity are for the analysis: of drives that are analysed from now on, it
+    also tells torque, inertia, the battery's charge and the range that is left. No summary depends on them.
     """
     vehicle = robots.checked_vehicle(dict(_parameter(text) for text in parameters))
     from_us = When(start, last=last).range().start_us
@@ -79,6 +89,8 @@ def set_(
         was = f"{before[key]:.12g}" if key in before else "not set"
         facts = {"robot": name, "parameter": key, "value": value, "was": before.get(key)}
         tell(facts, f"{name}: {key} {value:.12g}, was {was}", as_json=as_json)
+    if vehicle.keys() <= KNOWN.keys():
+        return
     # numpy takes longer to load than most commands to run.
     from iort_station.operations import recompute  # noqa: PLC0415 - see above
 
@@ -211,7 +223,7 @@ def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
     """A robot's row with every attribute that a row may have; null is not known."""
     known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, FILES_DAY, FILES_BYTES))
     told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
-    told |= {name: float(row[name]) for name in robots.F1TENTH if name in row}
+    told |= {name: float(row[name]) for name in (*robots.F1TENTH, *KNOWN) if name in row}
     for name in (CONNECTED_MS, DISCONNECTED_MS, LAST_SEEN_MS, ADMITTED_MS):
         at_ms = told.pop(name)
         told |= stamped(name.removesuffix("_ms"), None if at_ms is None else int(at_ms) * 1000)
