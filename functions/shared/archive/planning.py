@@ -53,7 +53,7 @@ def plan_due(archive: Archive, now_ms: int) -> dict[str, int]:
     overdue = 0
     for pending, row in archive.marks.every():
         due_ms = int(row[DUE_MS]["N"])
-        first_ms = int(row.get(FIRST_DUE_MS, row[DUE_MS])["N"])
+        first_ms = int(row[FIRST_DUE_MS if FIRST_DUE_MS in row else DUE_MS]["N"])
         if due_ms > now_ms and first_ms > now_ms - _DELAYED_MS:
             continue
         is_late = first_ms < now_ms - OVERDUE_MS
