@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 from functions.shared.archive.archive import Archive
 from functions.shared.archive.expiry import margin_s
@@ -24,7 +24,9 @@ from iort_contract.archive import (
     TASK,
     Hour,
     Pending,
+    hour_of,
     hours_between,
+    parse_hour,
     stored_hours,
 )
 from iort_contract.catalog.streams import OWN_STREAMS
@@ -39,8 +41,8 @@ OVERDUE_MS = 3 * 3_600_000
 _DELAYED_MS = 3_600_000
 # What expires within two nights, a sweep must find.
 _SOON_S = 2 * 86_400
-# A night's sweep counts the hours of a day, and two more.
-_COUNTED_US = 26 * HOUR_US
+# A night's sweep counts the hours that begin to expire soon within a day, and two hours more.
+_COUNTED_S = 26 * 3600
 
 
 class QueueError(Exception):
@@ -91,12 +93,13 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
     """Queue the hours of a stream that are over and not archived: those that expire soon, which have lost
     their mark, or ``every`` one, also with batches that came late.
 
-    An hour that begins to expire soon is counted once more: a late batch may have lost its mark.
+    An archived hour that begins to expire soon, also one of a clock that was wrong, is counted once more: a
+    late batch may have lost its mark.
     """
     retention_s = archive.given.retention_s
+    soon_s = min(retention_s, max(2 * margin_s(retention_s), _SOON_S))
     until_us = (now_ms - HOUR_REST_MS) * 1000
     if not every:
-        soon_s = min(retention_s, max(2 * margin_s(retention_s), _SOON_S))
         until_us -= (retention_s - soon_s) * 1_000_000
     # The hours of a clock that is ahead are over when their items have long expired.
     ahead_us = now_ms * 1000 + HOUR_US
@@ -104,17 +107,18 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
         *stored_hours(archive.telemetry, topic, until_us),
         *stored_hours(archive.telemetry, topic, None, from_us=ahead_us),
     ]
-    archived = _counts(archive, topic, stored)
+    archived = _archived(archive, topic, min([*stored, hour_of(until_us)]))
     marks = archive.marks.every() if every else ()
     marked = {pending.period for pending, _ in marks if pending.topic == topic}
-    counted_us = until_us if every else until_us - _COUNTED_US
-    found = [
-        Pending(topic, str(hour))
-        for hour in stored
-        if str(hour) in marked
-        or str(hour) not in archived
-        or (counted_us < hour.end_us <= until_us and _count(archive, topic, hour) > archived[str(hour)])
-    ]
+    found = [Pending(topic, str(hour)) for hour in stored if str(hour) in marked or str(hour) not in archived]
+    if not every:
+        soon_s += now_ms // 1000
+        found += [
+            Pending(topic, hour)
+            for hour, row in archived.items()
+            if soon_s - _COUNTED_S < row.first_expires_s <= soon_s
+            and _count(archive, topic, parse_hour(hour)) > row.items
+        ]
     for pending in found:
         if not every:
             archive.marks.add(pending, 0)
@@ -123,15 +127,22 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
     return {"tasks": len(tasks)}
 
 
-def _counts(archive: Archive, topic: str, hours: Sequence[Hour]) -> dict[str, int]:
-    """The number of items in the archive by hour, of these hours."""
-    if not hours:
-        return {}
-    pages = archive.manifest.pages(
-        topic, hours_between(hours[0], hours[-1]), attributes=(HOUR, "batches", "refused")
-    )
+class _Archived(NamedTuple):
+    """What a row of the manifest says: the number of items, and when the first of them expires."""
+
+    items: int
+    first_expires_s: int
+
+
+def _archived(archive: Archive, topic: str, first: Hour) -> dict[str, _Archived]:
+    """The archived hours since the first one."""
+    attributes = (HOUR, "batches", "refused", "first_expires_s")
+    pages = archive.manifest.pages(topic, hours_between(first, None), attributes=attributes)
     rows = (plain(item) for page in pages for item in page.items)
-    return {row[HOUR]: int(row["batches"] + row["refused"]) for row in rows}
+    return {
+        row[HOUR]: _Archived(int(row["batches"] + row["refused"]), int(row["first_expires_s"]))
+        for row in rows
+    }
 
 
 def _count(archive: Archive, topic: str, hour: Hour) -> int:

@@ -442,7 +442,7 @@ def swept(cloud, now_ms=LATER_MS, **more):
 def test_a_sweep_finds_a_late_batch_without_a_mark_before_the_hour_expires(cloud):
     cloud.store(0, [1, 1, 1])
     cloud.archived()
-    begins_ms = NOW_MS + (RETENTION_S - 2 * margin_s(RETENTION_S)) * 1000
+    begins_ms = (HOUR_0.start_us // 1_000_000 + RETENTION_S - 2 * margin_s(RETENTION_S)) * 1000
     night_ms = begins_ms + 20 * 3_600_000
     assert not swept(cloud, night_ms)
     cloud.store(1, [2, 2, 2], seq=1)
@@ -451,6 +451,27 @@ def test_a_sweep_finds_a_late_batch_without_a_mark_before_the_hour_expires(cloud
     assert swept(cloud, night_ms) == [str(HOUR_0)]
     cloud.archived(now_ms=night_ms)
     assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("ahead_days", [-300, 30, 365])
+def test_a_sweep_counts_hours_of_a_wrong_clock_before_they_expire(cloud, ahead_days):
+    """They expire by their receipt, and not by their hour."""
+    hour = Hour(HOUR_0.number + 24 * ahead_days)
+
+    def store(second):
+        item = cloud.store(second, [1, 1, 1], hour, seq=second)
+        item[EXPIRES_S] = {"N": str(HOUR_0.start_us // 1_000_000 + RETENTION_S)}
+        cloud.dynamodb.put_item(TableName=TELEMETRY, Item=item)
+
+    store(0)
+    cloud.archived(hour, now_ms=max(NOW_MS, hour.end_us // 1000 + HOUR_REST_MS))
+    begins_ms = (HOUR_0.start_us // 1_000_000 + RETENTION_S - 2 * margin_s(RETENTION_S)) * 1000
+    assert not swept(cloud, begins_ms)
+    store(1)
+    if cloud.marks.due_ms(Pending(TOPIC_OF_CAR, str(hour))) is not None:
+        lose_mark(cloud, hour)
+    assert not swept(cloud, begins_ms - 1000)
+    assert swept(cloud, begins_ms + 20 * 3_600_000) == [str(hour)]
 
 
 def test_a_sweep_finds_hours_of_a_clock_that_is_ahead(cloud):
