@@ -1,10 +1,10 @@
 """What is left in a battery: its charge, and how far that takes the car.
 
-Nobody says what cells a pack has, so the interval spans two published curves of the voltage at rest, and a
-spread between cells beside them: a hobby charger's chart of lithium-polymer cells (blog.ampow.com,
-"LiPo voltage chart"), which falls late, and a typical curve of lithium-ion cells with nickel, manganese and
-cobalt (Plett, Battery Management Systems I, chapter 2), which falls early. Where a drive began and what it
-drew narrow the interval: near full both agree.
+Nobody says what cells a pack has, so the interval spans two curves of the voltage at rest, and a spread
+between cells beside them: a hobby charger's chart of lithium-polymer cells (blog.ampow.com, "LiPo voltage
+chart"), which falls late, and typical values of lithium-ion cells with nickel, manganese and cobalt, which
+fall early. These values are of no single cell: the spread stands for what they miss. Where a drive began and
+what it drew narrow the interval: near full both agree.
 """
 
 from __future__ import annotations
