@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shlex
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from iort_agent.sources.sim.circuit import HALL
 from iort_contract.messages.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
@@ -20,7 +22,8 @@ from tests.local.robots.test_shadow import driving
 from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
-NOT_RUN = {"adopt", "dashboard", "files empty", "pubnub", "robots revoke-claims", "site"}
+# Laps need minutes of driving.
+NOT_RUN = {"adopt", "dashboard", "files empty", "laps", "pubnub", "robots revoke-claims", "site"}
 # Runs until Ctrl-C.
 ENDLESS = "iort watch"
 # These need a car that drives; audit counts what is still in a car.
@@ -46,6 +49,7 @@ def car7(embedded, tmp_path_factory):
 
 def test_every_example_does_what_it_says(embedded, iort, car7, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "track.json").write_text(json.dumps({"track": HALL.csv()}))
     # It would wait a minute for Lambda 2's cache of parameters.
     monkeypatch.setattr(recompute, "wait_until_settled", lambda: None)
 

@@ -12,7 +12,7 @@ def test_the_embedded_cloud_passes_the_preflight(embedded):
     assert not preflight.stopped(list(findings.values())), findings
     said = {item: one.found for item, one in findings.items() if one.verdict is Verdict.FINE}
     assert "account 000000000000" in said["credentials"]
-    assert said["stacks"] == "6 of 8 are there, each can be updated"
+    assert said["stacks"] == "8 of 10 are there, each can be updated"
     assert said["names"] == "free, or used by this deployment"
     assert said["kept data"] == "no leftovers"
     assert said["changed settings"] == "none that must not be"

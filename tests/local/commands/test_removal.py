@@ -80,7 +80,7 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
     assert (again.exit_code, again.output) == (0, "lasting claims revoked: 0\n")
 
     assert iort("files", "empty", "--yes").exit_code == 0
-    for noun in ("fleet", "processing", "quarantine", "storage"):
+    for noun in ("fleet", "analysis", "archive", "processing", "quarantine", "storage"):
         assert destroyed(cloud, noun) == (True, ""), noun
 
     assert registry.get(embedded.cloud, kept.robot)

@@ -23,7 +23,9 @@ def fire(embedded, name):
     """Let EventBridge Scheduler call what a schedule calls, once, now."""
     client = embedded.cloud.client("scheduler")
     (found,) = [
-        one["Name"] for one in client.list_schedules()["Schedules"] if f"-archive-{name}-" in one["Name"]
+        one["Name"]
+        for one in client.list_schedules()["Schedules"]
+        if one["Name"].startswith(f"{embedded.namespace}-archive-{name}-")
     ]
     schedule = client.get_schedule(Name=found)
     assert schedule["State"] == "ENABLED"

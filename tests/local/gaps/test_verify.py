@@ -87,7 +87,7 @@ def test_a_run_deploys_queries_reports_and_destroys(embedded, tmp_path):
     assert recorder.told == [{}, "destroyed"]
     written = json.loads((tmp_path / "report.json").read_text())
     assert {one["verdict"] for one in written["answers"]} == {"as assumed"}
-    assert "fine: stacks: 6 of 8 are there, each can be updated" in written["preflight"]
+    assert "fine: stacks: 8 of 10 are there, each can be updated" in written["preflight"]
     assert "000000000000" not in json.dumps(written["preflight"])
     assert report.load(tmp_path / "report.json").seen.keys() == {one.name for one in RULES}
 
