@@ -73,7 +73,7 @@ def _constants() -> Iterator[str]:
         kinds: ("ANALYSIS_FAILED",),
         findings: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
-        served: ("KEY_HEADER",),
+        served: ("KEY_HEADER", "INVITATION"),
     }.items():
         for name in names:
             value = getattr(module, name)
