@@ -70,8 +70,8 @@ def analyse(
         for finding in findings.findings(cloud, robot, request.start_us, request.end_us)
     )
     facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
-    text = f"{done.drives or 0} drives analysed, {done.findings} findings"
-    tell(facts, f"{text}, {failed} drives failed" if failed else text, as_json=as_json)
+    text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
+    tell(facts, f"{text}, drives failed: {failed}" if failed else text, as_json=as_json)
     raise typer.Exit(1 if failed else 0)
 
 
