@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import (
+from iort_contract.messages.analysis.run import (
     MAX_RANGE_US,
     AnalysisRequest,
     decode_request,
@@ -20,7 +20,7 @@ from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
