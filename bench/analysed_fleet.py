@@ -112,9 +112,13 @@ def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
             progress.advance(writing)
         before, began = _cpu_s(), time.monotonic()
         run = analysis.start(cloud, AnalysisRequest((), start_us, start_us + round(HOUR_S) * _S, again=True))
-        analysing = progress.add_task("drives analysed", total=None)
+        finding = progress.add_task("robots searched for drives", total=None)
+        analysing = progress.add_task("drives analysed", total=None, start=False)
         for last in analysis.watch(cloud, run):
-            progress.update(analysing, total=last.drives, completed=last.done)
+            if last.drives is not None:
+                progress.update(finding, total=hours, completed=hours)
+                progress.start_task(analysing)
+                progress.update(analysing, total=last.drives, completed=last.done)
         took_s, after = time.monotonic() - began, _cpu_s()
     without = [robot for robot in robots if not findings.drives(cloud, robot)]
     if without:
