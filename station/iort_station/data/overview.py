@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.insights import Extent
+from iort_contract.messages.analysis.insights import Extent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import has_fraction

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import (
+from iort_contract.messages.analysis.run import (
     MAX_RANGE_US,
     AnalysisRequest,
     decode_request,
@@ -21,7 +21,7 @@ from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
@@ -71,8 +71,8 @@ def analyse(
         for finding in findings.findings(cloud, robot, request.start_us, request.end_us)
     )
     facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
-    text = f"{done.drives or 0} drives analysed, {done.findings} findings"
-    tell(facts, f"{text}, {failed} drives failed" if failed else text, as_json=as_json)
+    text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
+    tell(facts, f"{text}, drives failed: {failed}" if failed else text, as_json=as_json)
     raise typer.Exit(1 if failed else 0)
 
 
