@@ -17,7 +17,7 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, insights, page
+from iort_contract.messages import commands, insights, notes, page
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -73,6 +73,7 @@ def _constants() -> Iterator[str]:
         kinds: ("ANALYSIS_FAILED",),
         findings: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
+        notes: ("MAX_NOTE_CHARACTERS",),
         served: ("KEY_HEADER",),
     }.items():
         for name in names:

@@ -15,6 +15,7 @@ from iort_contract.messages.insights import (
     Extent,
     InsightsAnswer,
     LapsAnswer,
+    NotesAnswer,
 )
 
 
@@ -297,6 +298,7 @@ Answer = Union[
     InsightsAnswer,
     LapsAnswer,
     DeltaAnswer,
+    NotesAnswer,
     RobotsAnswer,
     TagsAnswer,
     VehiclesAnswer,
