@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from iort_contract.messages.insights import NotesAnswer
+from iort_contract.messages.analysis.insights import NotesAnswer
 from iort_contract.messages.page import Answer
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.data import notes as stored
+from iort_station.data.analysis import notes as stored
 from iort_station.operations.alarms import user
 from iort_station.page.parameters import text, whole
 

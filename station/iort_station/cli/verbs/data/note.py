@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from iort_contract.messages.notes import MAX_NOTE_CHARACTERS, Note
+from iort_contract.messages.analysis.notes import MAX_NOTE_CHARACTERS, Note
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
-from iort_station.data import notes as stored
+from iort_station.data.analysis import notes as stored
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations.alarms import user

@@ -6,9 +6,9 @@ import secrets
 import time
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.notes import Note, check_note_id
+from iort_contract.messages.analysis.notes import Note, check_note_id
 from iort_station.cloud import Cloud
-from iort_station.data.findings import named, table
+from iort_station.data.analysis.findings import named, table
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 
