@@ -18,7 +18,7 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, page
+from iort_contract.messages import commands, page, viewing
 from iort_contract.messages.analysis import insights, notes
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
@@ -68,15 +68,16 @@ def page_contract() -> None:
 
 def _constants() -> Iterator[str]:
     for module, names in {
-        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
-        topics: ("NAME",),
+        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "MAX_NEXT_MS", "STALE_S", "GONE_S"),
+        topics: ("NAME", "LIVE", "VIEW"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
         kinds: ("ANALYSIS_FAILED",),
         parameters: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
         notes: ("MAX_NOTE_CHARACTERS",),
-        served: ("KEY_HEADER",),
+        viewing: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
+        served: ("KEY_HEADER", "INVITATION"),
     }.items():
         for name in names:
             value = getattr(module, name)

@@ -131,8 +131,8 @@ class Lab:
             tls=False,
             vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
             answers=self.answers(),
+            open_actions={"acknowledge": self.acknowledge},
             actions={
-                "acknowledge": self.acknowledge,
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
                 "analyse": lambda _: {"run": "iort-1"},
                 "note": self.write,

@@ -5,6 +5,7 @@ import { el } from "../base/dom";
 import { dayTime, zone } from "../base/format";
 import { writeTime, type Range } from "../base/range";
 import { route } from "../base/route";
+import { may } from "../server/admission";
 import { act, ask, AnswerError } from "../server/answers";
 
 /** The history around a note, in seconds before and after it. */
@@ -44,7 +45,7 @@ export class NotesPanel {
   async show(robot: string | undefined, range?: Range): Promise<void> {
     if (robot !== this.robot) this.fill([]);
     [this.robot, this.range] = [robot, range];
-    this.form.hidden = robot === undefined || !this.config.actions.includes("note");
+    this.form.hidden = robot === undefined || !may(this.config, "note");
     if (this.config.answers) await this.load();
   }
 
@@ -89,7 +90,7 @@ export class NotesPanel {
     const notes = [...newest].reverse();
     this.list.replaceChildren(...notes.map((note, i) => this.item(note, i + 1)).reverse());
     // Without the form, an empty panel says nothing.
-    this.node.hidden = notes.length === 0 && (this.robot === undefined || !this.config.actions.includes("note"));
+    this.node.hidden = notes.length === 0 && (this.robot === undefined || !may(this.config, "note"));
     this.options.shown?.(notes);
   }
 
@@ -99,7 +100,7 @@ export class NotesPanel {
     const query = { from: writeTime(at - AROUND_S), to: writeTime(at + AROUND_S), at: writeTime(at) };
     const when = el("a", { href: route({ view: "history", robot, query }) }, `${dayTime(at)} ${zone(at)}`);
     const item = el("li", { "data-note": note.id }, ...(this.options.shown ? [el("b", { class: "mark" }, String(number))] : []), el("span", { class: "note-text" }, text), el("span", { class: "note" }, when, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`));
-    if (!this.config.actions.includes("delete_note")) return item;
+    if (!may(this.config, "delete_note")) return item;
     const remove = el("button", { type: "button", class: "tool", "aria-label": `Delete the note: ${text.slice(0, 60)}` }, "Delete");
     remove.addEventListener("click", () => {
       if (remove.dataset["sure"] === "true") void this.remove(note);
