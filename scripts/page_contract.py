@@ -19,7 +19,7 @@ from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import commands, page, viewing
-from iort_contract.messages.analysis import insights
+from iort_contract.messages.analysis import insights, notes
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -83,6 +83,7 @@ def _constants() -> Iterator[str]:
         kinds: ("ANALYSIS_FAILED",),
         parameters: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
+        notes: ("MAX_NOTE_CHARACTERS",),
         viewing: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
         served: ("KEY_HEADER", "INVITATION"),
     }.items():

@@ -15,6 +15,7 @@ from iort_contract.messages.analysis.insights import (
     Extent,
     InsightsAnswer,
     LapsAnswer,
+    NotesAnswer,
 )
 
 
@@ -311,6 +312,7 @@ Answer = Union[
     InsightsAnswer,
     LapsAnswer,
     DeltaAnswer,
+    NotesAnswer,
     RobotsAnswer,
     TagsAnswer,
     VehiclesAnswer,

@@ -16,6 +16,7 @@ export const TACHOMETER_COUNTS = 6;
 export const ANALYSIS_FAILED = "analysis_failed";
 export const STYLE_GROUP = "Driving style";
 export const MAX_LEASE_MS = 10000;
+export const MAX_NOTE_CHARACTERS = 500;
 export const LEASE = "lease";
 export const VIEW_LEASE_MS = 15000;
 export const VIEW_RENEW_S = 5.0;
@@ -382,6 +383,20 @@ export interface InsightsAnswer {
   readonly findings: readonly FindingEntry[];
   readonly drives: readonly DriveEntry[];
   readonly groups: Readonly<Record<string, Readonly<Record<string, ParameterEntry>>>>;
+}
+
+/** What ``by`` wrote about a robot at a time. */
+export interface NoteEntry {
+  readonly id: string;
+  readonly robot: string;
+  readonly t_us: number;
+  readonly text: string;
+  readonly by: string;
+}
+
+/** Answers ``notes``, ``note`` and ``delete_note``: notes about a robot or the fleet, the newest first. */
+export interface NotesAnswer {
+  readonly notes: readonly NoteEntry[];
 }
 
 /** Answers ``analyse``: the run of the analysis. */
