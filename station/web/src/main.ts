@@ -10,7 +10,7 @@ import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
 import { observer } from "./live/observer";
-import { GLANCE_HZ, NONE, Viewing, type Looks } from "./live/viewing";
+import { GLANCE_HZ, NONE, Viewing, type Looks } from "./link/viewing";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";

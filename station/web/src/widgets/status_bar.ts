@@ -3,7 +3,7 @@
 import type { Config, FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
 import type { Alarms } from "../live/alarms";
-import type { Viewing } from "../live/viewing";
+import type { Viewing } from "../link/viewing";
 import type { Fleet } from "../live/fleet";
 import { age, number } from "../base/format";
 import { now } from "../base/clock";
