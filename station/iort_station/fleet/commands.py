@@ -46,8 +46,8 @@ def send(
 ) -> Sent:
     """Send a command and wait for the robot's answer, at most ``seconds``.
 
-    Every call is an operator's session of its own, which takes over from the one that drives. ``lease_ms`` is how
-    long the robot may move. Raises `UsageError` for an unknown robot and for an invalid command.
+    Every call is an operator's session of its own, which takes over from the one that drives. ``lease_ms`` is
+    how long the robot may move. Raises `UsageError` for an unknown robot and for an invalid command.
     """
     shadow = Shadow(cloud, robot)
     now_us = time.time_ns() // 1000
