@@ -18,8 +18,8 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, driving, page
-from iort_contract.messages.analysis import insights
+from iort_contract.messages import commands, driving, page, viewing
+from iort_contract.messages.analysis import insights, notes
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -68,15 +68,17 @@ def page_contract() -> None:
 
 def _constants() -> Iterator[str]:
     for module, names in {
-        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
-        topics: ("NAME",),
+        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "MAX_NEXT_MS", "STALE_S", "GONE_S"),
+        topics: ("NAME", "LIVE", "VIEW"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
         kinds: ("ANALYSIS_FAILED",),
         parameters: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
         driving: ("DRIVE_RATE_HZ", "DRIVE_LEASE_MS", "DRIVE_MAX_RTT_MS", "DRIVE_MAX_AGE_MS"),
-        served: ("KEY_HEADER",),
+        notes: ("MAX_NOTE_CHARACTERS",),
+        viewing: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
+        served: ("KEY_HEADER", "INVITATION"),
     }.items():
         for name in names:
             value = getattr(module, name)
