@@ -15,6 +15,7 @@ from iort_contract.topics import check_stream
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 FIELDS = "fields"
+MOTION_STOPPED = "motion.stopped"
 FIELD_LIST = "a list of field names; an empty one means all fields"
 
 
@@ -74,6 +75,8 @@ SETTINGS: Mapping[str, Flag | Number | Choice] = {
     "live.rate_hz": Number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, "Hz"),
     "ping.rate_hz": Number(0, 20, "Hz"),
     "log_level": Choice(LOG_LEVELS),
+    # The emergency stop.
+    MOTION_STOPPED: Flag(),
 }
 CHANGEABLE = (*SETTINGS, f"{FIELDS}.<stream>")
 

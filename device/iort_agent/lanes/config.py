@@ -52,6 +52,7 @@ class RuntimeSettings:
     live_rate_hz: float
     ping_rate_hz: float
     log_level: str
+    motion_stopped: bool = False
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def by_name(self) -> dict[str, Any]:
