@@ -9,7 +9,7 @@ import { CloudClock } from "./cloud_clock";
 import { commandOf, type Command, type Session } from "./command";
 import type { Driven, LiveMessage } from "./live_message";
 import { CENTRE, meant, type Motion, type Stick } from "./stick";
-import { inWords, TOO_LATE } from "./words";
+import { inWords, TOO_LATE } from "./outcomes";
 
 export type Phase = "free" | "starting" | "driving" | "over";
 
@@ -147,7 +147,7 @@ export class Driver {
   private unanswered(now_ms: number): string {
     if (this.phase === "starting") return now_ms - this.began_ms > ANSWER_MS ? "The car does not answer" : "";
     const oldest = this.waiting[0]?.left_ms ?? now_ms;
-    return now_ms - oldest > DRIVE_MAX_RTT_MS + this.next_ms ? slow(now_ms - oldest) : "";
+    return now_ms - oldest > DRIVE_MAX_RTT_MS + this.next_ms ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
   }
 
   private answer(driven: Driven, message: LiveMessage, now_ms: number): void {
