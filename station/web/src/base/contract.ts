@@ -4,7 +4,6 @@ export const SCHEMA_VERSION = 1;
 export const MAX_FIELDS = 512;
 export const MAX_FIELD_CHARACTERS = 1024;
 export const MAX_NEXT_MS = 100000;
-export const LIVE_MAX_RATE_HZ = 10.0;
 export const STALE_S = 1.5;
 export const GONE_S = 4.5;
 export const LIVE_MAX_RATE_HZ = 10.0;
