@@ -86,6 +86,7 @@ def main() -> None:
         f"{figures.drives} drives, {figures.findings} findings\n"
         f"{cpu_s / hours:.2f} s of processor a robot-hour: {by_function}",
         highlight=False,
+        soft_wrap=True,
     )
     write(given.json, {**made(), **asdict(figures)})
 
