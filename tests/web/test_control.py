@@ -10,8 +10,9 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
-from tests.browser import show, until
+from tests.browser import drawn, show, until
 from tests.web.cars import SUBSCRIBE_KEY, Car
+from tests.web.lab import Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -61,18 +62,18 @@ def robot() -> Robot:
 
 
 @pytest.fixture
-def served(pubnub: PubNubStandIn, robot: Robot) -> Iterator[str]:
+def invite(pubnub: PubNubStandIn, robot: Robot) -> Iterator[Callable[[str], str]]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
     with PageServer(
         namespace="iort", actions={"send": robot.send, "settings": robot.settings, "set": robot.set}, **told
     ) as server:
-        yield server.url
+        yield server.invitation
 
 
 def test_a_command_is_sent_and_its_answer_shown(
-    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
 ) -> None:
-    page = open_page(f"{served}#/car/car-1")
+    page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Commands").click()
     said = page.locator(".control .said")
@@ -104,9 +105,9 @@ def test_a_command_is_sent_and_its_answer_shown(
 
 
 def test_a_setting_is_checked_changed_and_reset(
-    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
 ) -> None:
-    page = open_page(f"{served}#/car/car-1")
+    page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Settings").click()
     rate, row = page.locator("[name='live.rate_hz']"), page.locator(".setting").first
@@ -132,7 +133,65 @@ def test_a_setting_is_checked_changed_and_reset(
     until(lambda: "pending; in force is 10" in row.inner_text(), "the pending value")
 
 
+def test_a_note_is_written_marked_in_the_history_and_deleted(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    with lab.server(pubnub) as server:
+        page = open_page(server.invitation())
+        page.goto(
+            f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
+            "&to=2026-05-04T10:01:00.000Z&at=2026-05-04T10:00:30.000Z"
+        )
+        chart = page.locator(".history .charts .plot canvas").first
+        chart.wait_for()
+        page.locator(".scrub-at").filter(has_text="10:00:30").wait_for()
+        drawn(page)
+        before = chart.screenshot()
+        page.fill("[name=note]", "<b>hit</b> the wall")
+        page.get_by_role("button", name="Add note").click()
+        # About the cursor's time, and as text.
+        page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
+        assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
+        drawn(page)
+        assert chart.screenshot() != before
+        # A note links to its time.
+        page.goto(f"{server.url}#/insights/car-1")
+        page.locator(".insights-view .notes-list a").last.click()
+        page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
+        page.locator(".history .notes-list li").wait_for()
+        for name in ("Delete the note", "Really delete"):
+            page.locator(".history .notes-list").get_by_role("button").filter(
+                has_text=name.split()[0]
+            ).click()
+        until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
+        assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
+
+
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
     show(page, car.send())
     assert page.get_by_role("heading", name="Commands").count() == 0
     assert page.get_by_role("heading", name="Settings").count() == 0
+
+
+def test_only_a_browser_that_was_invited_may_act(
+    open_page: Callable[..., Page], invite: Callable[[str], str], car: Car
+) -> None:
+    address = invite("#/car/car-1")
+    page = open_page(address.partition("?")[0])
+    show(page, car.send())
+    commands = page.get_by_role("heading", name="Commands")
+    assert "open the address in the server's terminal" in page.inner_text(".aside")
+    assert not commands.is_visible()
+    # In the same tab, only what follows the # is another.
+    with page.expect_event("load"):
+        page.goto(address)
+    until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
+    show(page, car.send())
+    assert commands.is_visible()
+    assert page.url == address.partition("?")[0]
+    again = page.context.new_page()
+    again.goto(page.url)
+    until(lambda: again.evaluate("window.iort?.link") == "live", "another tab to connect")
+    show(again, car.send())
+    assert again.get_by_role("heading", name="Commands").is_visible()

@@ -15,6 +15,7 @@ from iort_contract.messages.analysis.insights import (
     Extent,
     InsightsAnswer,
     LapsAnswer,
+    NotesAnswer,
 )
 
 
@@ -30,9 +31,9 @@ class TrackMap(TypedDict):
 class Config(TypedDict):
     """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
     whether the server answers questions about the past; a static site does not. ``actions`` names what the
-    server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a
-    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is
-    known."""
+    server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see
+    `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars
+    drive on, if it is known."""
 
     namespace: str
     subscribe_key: str
@@ -41,9 +42,15 @@ class Config(TypedDict):
     token: str
     answers: bool
     actions: list[str]
-    key: str
+    keyed: list[str]
     vehicles: dict[str, dict[str, float]]
     track: TrackMap | None
+
+
+class Admitted(TypedDict):
+    """Answers ``key``, once for each token; or again for the key itself."""
+
+    key: str
 
 
 class RobotPresence(TypedDict):
@@ -292,11 +299,13 @@ class Logs(TypedDict):
 
 
 Answer = Union[
+    Admitted,
     AnalysisAnswer,
     AnalysisStarted,
     InsightsAnswer,
     LapsAnswer,
     DeltaAnswer,
+    NotesAnswer,
     RobotsAnswer,
     TagsAnswer,
     VehiclesAnswer,

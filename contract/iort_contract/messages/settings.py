@@ -17,6 +17,7 @@ LOG_LEVELS = ("debug", "info", "warning", "error")
 # When the live lane sends at its full rate.
 WATCHED, ALWAYS = "watched", "always"
 FIELDS = "fields"
+MOTION_STOPPED = "motion.stopped"
 FIELD_LIST = "a list of field names; an empty one means all fields"
 
 
@@ -77,6 +78,8 @@ SETTINGS: Mapping[str, Flag | Number | Choice] = {
     "live.when": Choice((WATCHED, ALWAYS)),
     "ping.rate_hz": Number(0, 20, "Hz"),
     "log_level": Choice(LOG_LEVELS),
+    # The emergency stop.
+    MOTION_STOPPED: Flag(),
 }
 CHANGEABLE = (*SETTINGS, f"{FIELDS}.<stream>")
 

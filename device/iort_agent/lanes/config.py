@@ -60,6 +60,7 @@ class RuntimeSettings:
     ping_rate_hz: float
     log_level: str
     live_when: str = ALWAYS
+    motion_stopped: bool = False
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def by_name(self) -> dict[str, Any]:

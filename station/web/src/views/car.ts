@@ -15,14 +15,18 @@ import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
+import { NotesPanel } from "../widgets/notes_panel";
 import { Commands } from "../car/commands";
 import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
+import { barred, may } from "../server/admission";
 import { StreamSection } from "../car/field_tiles";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
+
+const ONLY_LOOK = "This browser may only look. To send commands, open the address in the server's terminal.";
 
 export class CarView {
   readonly node: HTMLElement;
@@ -37,6 +41,7 @@ export class CarView {
   private readonly commands = new Commands();
   private readonly settings = new Settings();
   private readonly log: AgentLog;
+  private readonly notes: NotesPanel;
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
@@ -57,6 +62,7 @@ export class CarView {
   ) {
     this.past = new Past(config);
     this.log = new AgentLog(config);
+    this.notes = new NotesPanel(config);
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     this.board = new Board(table, config.track, () => this.tools.arranged());
@@ -71,7 +77,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(config.actions.includes("send") ? [this.commands.node, this.settings.node] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note" }, ONLY_LOOK)] : []))),
       this.streams,
     );
   }
@@ -93,6 +99,7 @@ export class CarView {
     this.commands.of(name);
     this.settings.of(name);
     this.log.of(name);
+    void this.notes.show(name);
     this.tools.read(query);
     this.drawn = -1;
   }
