@@ -68,7 +68,15 @@ def page_contract() -> None:
 
 def _constants() -> Iterator[str]:
     for module, names in {
-        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "MAX_NEXT_MS", "STALE_S", "GONE_S"),
+        limits: (
+            "SCHEMA_VERSION",
+            "MAX_FIELDS",
+            "MAX_FIELD_CHARACTERS",
+            "MAX_NEXT_MS",
+            "STALE_S",
+            "GONE_S",
+            "LIVE_MAX_RATE_HZ",
+        ),
         topics: ("NAME", "LIVE", "VIEW"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),

@@ -53,6 +53,12 @@ class Admitted(TypedDict):
     key: str
 
 
+class ViewAnswer(TypedDict):
+    """Answers ``view``: of how many robots a live lane was asked for."""
+
+    asked: int
+
+
 class RobotPresence(TypedDict):
     """Whether a robot is connected, and since when it is or is not; null if it never was."""
 
@@ -300,6 +306,7 @@ class Logs(TypedDict):
 
 Answer = Union[
     Admitted,
+    ViewAnswer,
     AnalysisAnswer,
     AnalysisStarted,
     InsightsAnswer,

@@ -6,6 +6,7 @@ export const MAX_FIELD_CHARACTERS = 1024;
 export const MAX_NEXT_MS = 100000;
 export const STALE_S = 1.5;
 export const GONE_S = 4.5;
+export const LIVE_MAX_RATE_HZ = 10.0;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const LIVE = "live";
 export const VIEW = "view";
@@ -533,6 +534,11 @@ export interface Config {
 /** Answers ``key``, once for each token; or again for the key itself. */
 export interface Admitted {
   readonly key: string;
+}
+
+/** Answers ``view``: of how many robots a live lane was asked for. */
+export interface ViewAnswer {
+  readonly asked: number;
 }
 
 /** Whether a robot is connected, and since when it is or is not; null if it never was. */

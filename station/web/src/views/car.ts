@@ -178,6 +178,7 @@ export class CarView {
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
     const texts = {
       live: "live",
+      idle: `idle: newest values are ${age(now - robot.takenAt)} old`,
       stale: `stale: newest values are ${age(now - robot.takenAt)} old`,
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };
