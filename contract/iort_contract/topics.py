@@ -16,7 +16,9 @@ _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
 # A robot's questions to functions of the cloud, and their answers.
 ASK, ANSWER = "ask", "answer"
-LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG, ASK, ANSWER)
+# Who looks at a robot's live lane.
+VIEW = "view"
+LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG, ASK, ANSWER, VIEW)
 BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
 # Another question on the lanes ping and pong: upload addresses of a file.
 FILE = "file"
@@ -30,8 +32,8 @@ COMMANDS, ACCEPTED = "commands", "accepted"
 class Topic(NamedTuple):
     """A parsed topic, ``<lane>/<namespace>/<robot>/<name>``.
 
-    ``name`` is the stream (record, live), the path (ping, pong), the message's own name (fleet, cmd) or the
-    function (ask, answer).
+    ``name`` is the stream (record, live), the path (ping, pong), the message's own name (fleet, cmd, view)
+    or the function (ask, answer).
     """
 
     lane: str
