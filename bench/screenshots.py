@@ -33,11 +33,11 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from iort_station.data.runs import runs
 from iort_station.fleet import robots
 from iort_station.page import control
@@ -95,12 +95,13 @@ def _take(views: Sequence[str], out: Path) -> None:
             vehicles=vehicles,
             answers=answers(cloud.cloud),
             downloads=downloads(cloud.cloud),
-            actions=actions(cloud.cloud) | control.actions(cloud.cloud),
+            open_actions=actions(cloud.cloud),
+            actions=control.actions(cloud.cloud),
         )
-        url = stack.enter_context(server).url
+        stack.enter_context(server)
         pages = {
-            "laptop": _page(browser, url, LAPTOP, ratio=1),
-            "phone": _page(browser, url, PHONE, ratio=2),
+            "laptop": _page(browser, server.invitation(), LAPTOP, ratio=1),
+            "phone": _page(browser, server.invitation(), PHONE, ratio=2),
         }
         # Wait until the charts are full and CloudWatch has a minute of metrics.
         threading.Event().wait(_FILL_S)
@@ -114,7 +115,7 @@ def _take(views: Sequence[str], out: Path) -> None:
                 ("phone", "phone", on_phone),
             ]
             for name, device, theme in looks:
-                _look(pages[device], url + VIEWS[view], theme)
+                _look(pages[device], server.url + VIEWS[view], theme)
                 _write(out / f"{view}-{name}.webp", pages[device].screenshot())
 
 

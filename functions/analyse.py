@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from functions.shared import clients, recordings
+from functions.shared import clients
+from functions.shared.analysis import recordings
+from functions.shared.analysis.kept import Kept
+from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
-from functions.shared.recordings import Recordings
 from iort_analysis.archive.tables import write_table
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
@@ -22,7 +23,7 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import drive_prefix
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, decode_planned
+from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned
 
 
 def analysed(planned: PlannedDrive, recordings: Recordings) -> DriveResult:

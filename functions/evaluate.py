@@ -11,16 +11,16 @@ from itertools import chain
 from typing import Any
 
 from functions.shared import clients
+from functions.shared.analysis.kept import Kept
+from functions.shared.analysis.recordings import robots_of
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
-from functions.shared.recordings import robots_of
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.results import DriveResult, Measured, decode_result
 from iort_contract.catalog.environments import EvaluateEnvironment
 from iort_contract.cloud import drive_prefix, findings_key, plan_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis import AnalysedDrive, decode_planned
-from iort_contract.messages.findings import NO_RUN, DriveKey, Finding, encode_finding
+from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding, encode_finding
+from iort_contract.messages.analysis.run import AnalysedDrive, decode_planned
 
 # The newest drives of a robot before those of the run, and of each other robot up to its end, with which a
 # drive is compared.

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from functions.shared import clients, recordings
+from functions.shared import clients
+from functions.shared.analysis import recordings
+from functions.shared.analysis.kept import Kept
+from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
-from functions.shared.recordings import Recordings
 from iort_analysis.drives.finding import STAND_US, Heard, find
 from iort_analysis.drives.motion import motion_field, motion_stream, moving
 from iort_analysis.samples.batches import RefusedItems, blocks
@@ -26,7 +27,8 @@ from iort_contract.cloud import plan_key
 from iort_contract.dynamodb import Item
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.analysis import (
+from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis.run import (
     AnalysisRequest,
     PlannedDrive,
     decode_request,
@@ -34,7 +36,6 @@ from iort_contract.messages.analysis import (
     encode_request,
 )
 from iort_contract.messages.batch import batch_id
-from iort_contract.messages.findings import DriveKey
 from iort_contract.tables import BATCH
 
 _END_US = 2**53

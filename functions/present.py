@@ -11,13 +11,13 @@ from contextlib import suppress
 from typing import Any
 
 from functions.shared import clients
+from functions.shared.analysis.kept import Kept
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
-from iort_contract.catalog.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
 from iort_contract.cloud import findings_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.findings import NO_RUN, DriveKey, Finding, decode_finding
+from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]

@@ -58,8 +58,8 @@ Progress = Callable[[str], None]
 class EmbeddedCloud:
     """One embedded cloud, from `__enter__` to `__exit__`.
 
-    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub`` and ``relay``; the others are free ports. ``progress`` is called
-    with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
+    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub`` and ``relay``; the others are free ports. ``progress``
+    is called with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
     """
 
     def __init__(

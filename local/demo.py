@@ -104,7 +104,8 @@ class _Demo:
                     answers=answers(embedded.cloud),
                     downloads=downloads(embedded.cloud),
                     track=HALL if self._options.bag is None else None,
-                    actions=actions(embedded.cloud) | control.actions(embedded.cloud),
+                    open_actions=actions(embedded.cloud),
+                    actions=control.actions(embedded.cloud),
                     port=self._options.port,
                 )
             )
@@ -119,7 +120,11 @@ class _Demo:
             bundle = robots.add(
                 embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
             )
-            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}#/car/{ROBOT}", highlight=False)
+            self._console.print(
+                f"\n[bold]Watch the car:[/bold] {page.invitation(f'#/car/{ROBOT}')}",
+                highlight=False,
+                soft_wrap=True,
+            )
             ports = (page.port, embedded.pubnub.port)
             forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
             self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", highlight=False)
@@ -131,7 +136,7 @@ class _Demo:
             if sys.stdin.isatty() and sys.stdout.isatty():
                 # Ctrl-C after the figures is no failure.
                 with suppress(KeyboardInterrupt):
-                    self._stay(embedded, bundle, page.url)
+                    self._stay(embedded, bundle, page.invitation())
             return figures
 
     def _step(self, name: str) -> None:
@@ -215,7 +220,9 @@ class _Demo:
         if self._options.bag is not None:
             settings["sources"][0]["loop"] = True
         robots.configure(bundle, settings)
-        self._console.print(f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False)
+        self._console.print(
+            f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False, soft_wrap=True
+        )
         with _agent(embedded, bundle) as agent:
             while self._running(agent):
                 embedded.emulator.check()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.messages.viewing import LEASE
 from iort_contract.topics import (
     ANSWER,
     ASK,
@@ -25,6 +26,7 @@ from iort_contract.topics import (
     RECORD,
     RULE,
     SHADOW,
+    VIEW,
     build_topic,
     live_topic,
     record_topic,
@@ -79,6 +81,8 @@ ROWS = [
             build_topic(PING, A, LAMBDA),
             build_topic(ASK, A, CALIBRATION.name),
             build_topic(ASK, A, "nobody"),
+            # It wakes only itself.
+            build_topic(VIEW, A, LEASE),
             f"{_shadow(A)}/get",
             f"{_shadow(A)}/update",
         ),
@@ -93,6 +97,7 @@ ROWS = [
             build_topic(PONG, B, RULE),
             build_topic(ASK, B, CALIBRATION.name),
             build_topic(ANSWER, B, CALIBRATION.name),
+            build_topic(VIEW, B, LEASE),
             f"{_shadow(B)}/update",
             f"{_shadow(B)}/get",
             f"{_shadow(B)}/delete",
@@ -140,6 +145,7 @@ ROWS = [
             f"{CMD}/iort/{A}/#",
             f"{PONG}/iort/{A}/+",
             f"{ANSWER}/iort/{A}/+",
+            build_topic(VIEW, A, LEASE),
             build_topic(PING, A, BROKER),
             f"{PING}/iort/{A}/+",
             f"{FLEET}/iort/+/#",
@@ -159,6 +165,8 @@ ROWS = [
             f"{PING}/lab2/{A}/{BROKER}",
             f"{ANSWER}/iort/{B}/{CALIBRATION.name}",
             f"{ANSWER}/iort/+/{CALIBRATION.name}",
+            build_topic(VIEW, B, LEASE),
+            f"{VIEW}/iort/+/{LEASE}",
             f"{ASK}/iort/{A}/+",
             f"{ASK}/iort/{B}/{CALIBRATION.name}",
             f"{LIVE}/iort/{A}/vesc",
@@ -196,6 +204,7 @@ ROWS = [
             build_topic(CMD, A, "drive"),
             build_topic(PONG, A, RULE),
             build_topic(ANSWER, A, CALIBRATION.name),
+            build_topic(VIEW, A, LEASE),
             build_topic(FLEET, B, "pose"),
             f"{_shadow(A)}/update/accepted",
         ),
@@ -203,6 +212,7 @@ ROWS = [
             build_topic(CMD, B, "drive"),
             build_topic(PONG, B, RULE),
             build_topic(ANSWER, B, CALIBRATION.name),
+            build_topic(VIEW, B, LEASE),
             build_topic(LIVE, B, "vesc"),
             build_topic(PING, B, BROKER),
             f"{_shadow(B)}/update/accepted",
@@ -230,6 +240,7 @@ ROWS = [
             build_topic(LIVE, A, "vesc"),
             build_topic(CMD, A, "drive"),
             build_topic(FLEET, A, "pose"),
+            build_topic(VIEW, A, LEASE),
             f"{_shadow(A)}/update",
             f"$aws/things/{A}/jobs/start-next",
             "anything/else",

@@ -18,7 +18,7 @@ from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, st
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
 
 Miner = Callable[[Drive], Mined]
 # By the name that a result gives as missing if the miner fails.

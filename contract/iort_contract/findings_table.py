@@ -12,8 +12,8 @@ from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive, decode_analysed, encode_analysed
-from iort_contract.messages.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.messages.analysis.run import AnalysedDrive, decode_analysed, encode_analysed
 from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
 
 T = TypeVar("T")

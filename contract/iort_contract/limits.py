@@ -23,6 +23,8 @@ LIVE_MAX_AGE_MS = 2_000
 CLOCK_MAX_UNCERTAINTY_MS = 500
 # The slowest live lane. Alarms look at five minutes, and still see it.
 LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ = 0.01, 10.0
+# The longest time between two live messages of a stream: that of the slowest rate.
+MAX_NEXT_MS = 100_000
 # Most live messages go straight to their rule, which costs no messaging. One per this time, at least, passes
 # the broker, where other rules and subscribers see it.
 LIVE_BROKER_EVERY_S = 10.0

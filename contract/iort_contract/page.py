@@ -6,11 +6,12 @@ from __future__ import annotations
 from datetime import datetime, timezone
 from urllib.parse import quote, urlencode
 
-from iort_contract.messages.findings import Finding
+from iort_contract.messages.analysis.findings import Finding
 
 PUBNUB_ORIGIN = "ps.pndsn.com"
-# An action's request has the server's key in it.
+# An action's request has the server's key in it. A browser gets it once for the token in an address.
 KEY_HEADER = "X-Iort-Key"
+INVITATION = "key"
 # Where `iort dashboard` serves it, unless told otherwise.
 PAGE_URL = "http://localhost:8080/"
 # A link shows at least this much around the evidence.

@@ -9,7 +9,7 @@ from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
-from iort_contract.topics import ANSWER, ASK, CMD, FLEET, LIVE, RECORD, SHADOW, rule_name
+from iort_contract.topics import ASK, CMD, FLEET, LIVE, RECORD, SHADOW, rule_name
 
 # A robot's name is its thing name and its client id; the certificate is attached to the thing.
 _ME = "${iot:Connection.Thing.ThingName}"
@@ -17,7 +17,10 @@ _ME = "${iot:Connection.Thing.ThingName}"
 # character, and * any number of them ("Using wildcard characters in MQTT and AWS IoT Core policies").
 # A robot subscribes to its pongs, and to its own ping on the path broker.
 _PING_OR_PONG = "p?ng"
+# Of its own lanes this also allows view: a robot can wake nobody but itself.
 _LIVE_OR_PING = "?i??"
+# No other lane has a w there.
+_ANSWER_OR_VIEW = "???w*"
 
 
 def provisioning_template(namespace: str) -> dict[str, Any]:
@@ -90,7 +93,7 @@ def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
     subscribe = (
         f"{CMD}/{mine}/*",
         f"{_PING_OR_PONG}/{mine}/*",
-        f"{ANSWER}/{mine}/*",
+        f"{_ANSWER_OR_VIEW}/{mine}/*",
         *heard_by_all,
         f"{shadow}/*",
     )

@@ -22,6 +22,7 @@ from iort_contract.topics import (
     PING_PATHS,
     PONG,
     RECORD,
+    VIEW,
     build_topic,
     check_namespace,
     live_topic,
@@ -34,7 +35,7 @@ from tests.stacks.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"
 SHADOW = f"$aws/things/{ME}/shadow/name/agent/*"
-SUBSCRIBE = (f"cmd/iort/{ME}/*", f"p?ng/iort/{ME}/*", f"answer/iort/{ME}/*", "fleet/iort/*", SHADOW)
+SUBSCRIBE = (f"cmd/iort/{ME}/*", f"p?ng/iort/{ME}/*", f"???w*/iort/{ME}/*", "fleet/iort/*", SHADOW)
 RECEIVE = (f"*/iort/{ME}/*", "fleet/iort/*")
 ROBOT_POLICY = [
     {
@@ -127,7 +128,11 @@ def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy)
                 assert resource.endswith("/fleet/iort/*")
             # A wildcard stands only below the thing's own level, or for the lane of what was subscribed to.
             # No other variable is trusted.
-            if resource != f"{IOT}:topic/*/iort/{ME}/*" or "iot:Publish" in actions(statement):
+            lanes = {
+                f"{IOT}:topic/*/iort/{ME}/*": "iot:Receive",
+                f"{IOT}:topicfilter/???w*/iort/{ME}/*": "iot:Subscribe",
+            }
+            if actions(statement) != {lanes.get(resource)}:
                 assert "*" not in resource.removesuffix("/*")
             assert set(re.findall(r"\$\{iot:[^}]*\}", resource)) <= {ME}
 
@@ -171,6 +176,7 @@ def test_a_robot_may_not_publish_on_the_topics_of_others(robot_policy):
         build_topic(CMD, "car", "stop"),
         build_topic(PONG, "car", "rule"),
         build_topic(ANSWER, "car", "calibration"),
+        build_topic(VIEW, "car2", "lease"),
         # The record lane costs messaging unless it is sent by Basic Ingest.
         build_topic(RECORD, "car", "vesc"),
         "$aws/things/car/shadow/update",
@@ -188,6 +194,7 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         "cmd/iort/car/+",
         "pong/iort/car/+",
         "answer/iort/car/+",
+        "view/iort/car/lease",
         "fleet/iort/+/#",
         "fleet/iort/car2/pose",
     ):
@@ -201,6 +208,9 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         "pong/iort/+/rule",
         "ping/iort/+/broker",
         "answer/iort/+/calibration",
+        "view/iort/car2/lease",
+        "view/iort/+/lease",
+        "+/aw/iort/car2/x",
         "ask/iort/car/#",
         "dt/iort/car/#",
         "live/iort/car/#",
@@ -214,6 +224,7 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         build_topic(FLEET, "car2", "pose"),
         build_topic(PONG, "car", "rule"),
         build_topic(ANSWER, "car", "calibration"),
+        build_topic(VIEW, "car", "lease"),
     ):
         assert allows(robot_policy, "Receive", "topic", topic), topic
     for topic in (
@@ -221,6 +232,7 @@ def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
         build_topic(LIVE, "car2", "vesc"),
         build_topic(PONG, "car2", "rule"),
         build_topic(ANSWER, "car2", "calibration"),
+        build_topic(VIEW, "car2", "lease"),
     ):
         assert not allows(robot_policy, "Receive", "topic", topic), topic
 

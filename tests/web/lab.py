@@ -16,7 +16,7 @@ from tests.web.insights import delta, insights, laps
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.insights import Extent
+    from iort_contract.messages.analysis.insights import Extent
     from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 
@@ -114,8 +114,8 @@ class Lab:
             tls=False,
             vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
             answers=self.answers(),
+            open_actions={"acknowledge": self.acknowledge},
             actions={
-                "acknowledge": self.acknowledge,
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
                 "analyse": lambda _: {"run": "iort-1"},
                 "settings": lambda _: {"settings": SETTINGS, "online": False},

@@ -56,7 +56,7 @@ def test_every_view_is_accessible(
 ) -> None:
     found = {}
     with Lab().server(pubnub) as server:
-        page = open_page(server.url, color_scheme=theme, reduced_motion="reduce", **device)
+        page = open_page(server.invitation(), color_scheme=theme, reduced_motion="reduce", **device)
         page.evaluate(AXE.read_text())
         car = Car(pubnub)
         show(page, car.send({**SAMPLE, "fault_code": 2}))

@@ -61,18 +61,18 @@ def robot() -> Robot:
 
 
 @pytest.fixture
-def served(pubnub: PubNubStandIn, robot: Robot) -> Iterator[str]:
+def invite(pubnub: PubNubStandIn, robot: Robot) -> Iterator[Callable[[str], str]]:
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
     with PageServer(
         namespace="iort", actions={"send": robot.send, "settings": robot.settings, "set": robot.set}, **told
     ) as server:
-        yield server.url
+        yield server.invitation
 
 
 def test_a_command_is_sent_and_its_answer_shown(
-    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
 ) -> None:
-    page = open_page(f"{served}#/car/car-1")
+    page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Commands").click()
     said = page.locator(".control .said")
@@ -104,9 +104,9 @@ def test_a_command_is_sent_and_its_answer_shown(
 
 
 def test_a_setting_is_checked_changed_and_reset(
-    open_page: Callable[..., Page], served: str, robot: Robot, car: Car
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
 ) -> None:
-    page = open_page(f"{served}#/car/car-1")
+    page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Settings").click()
     rate, row = page.locator("[name='live.rate_hz']"), page.locator(".setting").first
@@ -136,3 +136,26 @@ def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
     show(page, car.send())
     assert page.get_by_role("heading", name="Commands").count() == 0
     assert page.get_by_role("heading", name="Settings").count() == 0
+
+
+def test_only_a_browser_that_was_invited_may_act(
+    open_page: Callable[..., Page], invite: Callable[[str], str], car: Car
+) -> None:
+    address = invite("#/car/car-1")
+    page = open_page(address.partition("?")[0])
+    show(page, car.send())
+    commands = page.get_by_role("heading", name="Commands")
+    assert "open the address in the server's terminal" in page.inner_text(".aside")
+    assert not commands.is_visible()
+    # In the same tab, only what follows the # is another.
+    with page.expect_event("load"):
+        page.goto(address)
+    until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
+    show(page, car.send())
+    assert commands.is_visible()
+    assert page.url == address.partition("?")[0]
+    again = page.context.new_page()
+    again.goto(page.url)
+    until(lambda: again.evaluate("window.iort?.link") == "live", "another tab to connect")
+    show(again, car.send())
+    assert again.get_by_role("heading", name="Commands").is_visible()

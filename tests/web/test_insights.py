@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
-    from iort_contract.messages.insights import InsightsAnswer
+    from iort_contract.messages.analysis.insights import InsightsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 END = START + 90_000_000
@@ -84,7 +84,7 @@ def laps_found(page: Page) -> None:
 def test_a_finding_has_its_interval_its_advice_and_its_evidence(
     open_page: Callable[..., Page], server: PageServer
 ) -> None:
-    page = open_page(f"{server.url}#/insights/car-1", timezone_id="UTC")
+    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
     finding = page.locator(".finding[data-severity=warning]")
     finding.wait_for()
     interval = finding.locator("[role=img]").get_attribute("aria-label")
@@ -99,7 +99,7 @@ def test_a_finding_has_its_interval_its_advice_and_its_evidence(
 def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(
     open_page: Callable[..., Page], server: PageServer
 ) -> None:
-    page = open_page(f"{server.url}#/insights/car-1", timezone_id="UTC")
+    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)
     times = [float(text.split()[0]) for text in page.locator(".laps-table td:nth-child(4)").all_inner_texts()]
     best, second = sorted(range(len(times)), key=times.__getitem__)[:2]
@@ -128,7 +128,7 @@ def test_before_the_first_analysis_the_page_says_so_and_shows_the_laps_of_the_ne
     open_page: Callable[..., Page], server: PageServer, lab: Analysed
 ) -> None:
     lab.analysed = False
-    page = open_page(f"{server.url}#/insights/car-1", timezone_id="UTC")
+    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)
     note = page.locator(".insights-view .history-note").first
     assert "No drive of car-1 has been analysed yet" in note.inner_text()

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -53,6 +54,14 @@ def ask(
     content = answer.read()
     connection.close()
     return answer, content
+
+
+def post(page: PageServer, name: str, body: str, kind: str = "application/json", **more: str) -> Any:
+    """Ask for an action from the page's own origin."""
+    given = {name.replace("_", "-"): value for name, value in more.items()}
+    headers = {"Host": "localhost", "Origin": "http://localhost", "Content-Type": kind, **given}
+    answer, content = ask(page, f"/{name}.json", "POST", headers, body)
+    return answer.status, json.loads(content)
 
 
 @pytest.mark.parametrize(
@@ -252,33 +261,53 @@ def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> Non
             raise StationError("nothing was asked")
         return {"done": True}
 
-    def post(page: PageServer, body: str, kind: str = "application/json", **more: str) -> Any:
-        key = json.loads(ask(page, "/config.json")[1])["key"]
-        own = {"Host": "localhost", "Origin": "http://localhost", "X-Iort-Key": key}
-        headers = {
-            "Content-Type": kind,
-            **own,
-            **{name.replace("_", "-"): value for name, value in more.items()},
-        }
-        answer, body_ = ask(page, "/act.json", "POST", headers, body)
-        return answer.status, json.loads(body_)
-
-    with PageServer(**TOLD, actions={"act": act}, built=built) as page:
+    with PageServer(**TOLD, actions={"act": act}, open_actions={"note": act}, built=built) as page:
+        key = post(page, "key", json.dumps({"token": page.invitation().rpartition("=")[2]}))[1]["key"]
+        act_ = partial(post, page, "act", X_Iort_Key=key)
         assert ask(page, "/act.json")[0].status == 404
-        assert post(page, '{"a": "b"}', "text/plain")[0] == 415
-        assert post(page, '{"a": "b"}', Host="evil.example")[0] == 403
+        assert act_('{"a": "b"}', "text/plain")[0] == 415
+        assert act_('{"a": "b"}', Host="evil.example")[0] == 403
         for origin in ("", "null", "http://evil.example", "http://localhost:81"):
-            assert post(page, '{"a": "b"}', Origin=origin)[0] == 403
-        for key in ("", "x", "\u00e4"):
-            assert post(page, '{"a": "b"}', X_Iort_Key=key)[0] == 403
+            assert act_('{"a": "b"}', Origin=origin)[0] == 403
+        for other in ("", "x", "\u00e4"):
+            assert act_('{"a": "b"}', X_Iort_Key=other)[0] == 403
         for wrong in ("", "[]", '{"a": 1}', "\ud800"):
-            assert post(page, wrong)[0] == 400
-        assert post(page, "[" * 100_000)[0] == 400
-        assert post(page, "{}", "application/json; charset=nonsense")[0] == 400
+            assert act_(wrong)[0] == 400
+        assert act_("[" * 100_000)[0] == 400
+        assert act_("{}", "application/json; charset=nonsense")[0] == 400
         assert not done
-        assert post(page, "{}") == (400, {"error": "nothing was asked"})
-        assert post(page, '{"a": "b"}') == (200, {"done": True})
-    assert done == [{}, {"a": "b"}]
+        assert act_("{}") == (400, {"error": "nothing was asked"})
+        assert act_('{"a": "b"}') == (200, {"done": True})
+        # What everybody may do needs no key, but the page's own origin as well.
+        assert post(page, "note", '{"c": "d"}') == (200, {"done": True})
+        assert post(page, "note", '{"c": "d"}', Origin="http://evil.example")[0] == 403
+    assert done == [{}, {"a": "b"}, {"c": "d"}]
+
+
+def test_the_key_comes_once_for_each_invitation_and_is_in_no_file(built: Path) -> None:
+    shown: list[str] = []
+
+    def token(address: str) -> str:
+        return json.dumps({"token": address.rpartition("=")[2]})
+
+    with PageServer(**TOLD, actions={"act": lambda _: {}}, admitted=shown.append, built=built) as page:
+        address = page.invitation("#/car/car-1")
+        assert address.startswith(f"{page.url}#/car/car-1?key=")
+        for wrong in ("{}", '{"token": "x"}', '{"token": ""}', '{"token": "\u00e4"}'):
+            assert post(page, "key", wrong)[0] == 400
+        assert post(page, "key", token(address), Origin="http://evil.example")[0] == 403
+        status, answer = post(page, "key", token(address))
+        assert status == 200
+        assert post(page, "key", token(address))[0] == 400
+        # A reload asks whether the kept key is still good.
+        assert post(page, "key", json.dumps({"token": answer["key"]})) == (200, answer)
+        assert len(shown) == 1
+        assert post(page, "key", token(shown[0])) == (200, answer)
+        told = ask(page, "/config.json")[1].decode()
+    assert answer["key"] not in told
+    assert json.loads(told)["keyed"] == ["act"]
+    with PageServer(**TOLD, open_actions={"act": lambda _: {}}, built=built) as page:
+        assert page.invitation() == f"{page.url}#/"
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
@@ -295,8 +324,8 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
-    assert len(told.pop("key")) > 30
-    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, "actions": [], "track": None}
+    nothing: dict[str, Any] = {"actions": [], "keyed": [], "track": None}
+    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, **nothing}
 
 
 def test_an_answer_has_null_for_nan_and_infinity(built: Path) -> None:

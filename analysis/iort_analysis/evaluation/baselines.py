@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile, tail
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.student import quantile, tail
+from iort_contract.messages.analysis.findings import INTERVAL, Estimate
 
 # An estimate's interval is so many standard errors to either side.
 _SIDES = quantile((1 + INTERVAL) / 2, math.inf)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.student import quantile
+from iort_contract.messages.analysis.findings import INTERVAL, Estimate
 
 _SIDES = quantile((1 + INTERVAL) / 2, math.inf)
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile, tail
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.student import quantile, tail
+from iort_contract.messages.analysis.findings import INTERVAL, Estimate
 
 US_PER_DAY = 86_400_000_000
 # The slopes between pairs take memory of the square of this.

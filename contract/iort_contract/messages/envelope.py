@@ -34,6 +34,13 @@ def entries(message: Any) -> dict[str, Any]:
     }
 
 
+def _number(envelope: Mapping[str, Any], key: str) -> float:
+    value = envelope.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ContractError(f"{key} must be a number, got {shown(value)}")
+    return value
+
+
 def _flag(envelope: Mapping[str, Any], key: str) -> bool:
     value = envelope[key]
     if not isinstance(value, bool):
@@ -64,6 +71,7 @@ def _bytes(envelope: Mapping[str, Any], key: str) -> bytes:
 
 _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "int": integer,
+    "float": _number,
     "str": text,
     "bool": _flag,
     "bytes": _bytes,

@@ -21,7 +21,7 @@ from iort_contract.checks import (
     wire_column,
     wire_sample,
 )
-from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
+from iort_contract.limits import MAX_FIELDS, MAX_NEXT_MS, SCHEMA_VERSION, ContractError, Value
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 from iort_contract.topics import check_robot, check_stream
 
@@ -33,7 +33,8 @@ class LiveSample:
     ``seq`` numbers the stream's live messages of a run. ``t_us`` is the sample's time, ``sent_us`` the time
     it left the car. ``sample`` maps field to value, in an object of its own, so that no ROS field can be
     mistaken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` converts the car's clock
-    to the cloud's by addition, if the car knows it to within `CLOCK_MAX_UNCERTAINTY_MS`.
+    to the cloud's by addition, if the car knows it to within `CLOCK_MAX_UNCERTAINTY_MS`. Within ``next_ms``
+    the stream's next message leaves the car, if it has samples; an older agent does not say.
     """
 
     boot: str
@@ -43,6 +44,7 @@ class LiveSample:
     sample: Mapping[str, Value]
     nonfinite: int = 0
     offset_us: int | None = None
+    next_ms: int | None = None
 
 
 def encode_live(live: LiveSample) -> bytes:
@@ -61,6 +63,7 @@ def encode_live(live: LiveSample) -> bytes:
         "sent_us": check_time(live.sent_us, "sent_us"),
         NONFINITE: nonfinite,
         **offset_entry(live.offset_us),
+        **_next_entry(live.next_ms),
         "sample": sample,
     }
     return COMPACT.encode(message).encode()
@@ -83,7 +86,23 @@ def decode_live(message: bytes | str | Mapping[str, Any]) -> LiveSample:
     sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
     offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
     offset_entry(offset_us)
-    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us)
+    next_ms = integer(envelope, "next_ms") if "next_ms" in envelope else None
+    _next_entry(next_ms)
+    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us, next_ms)
+
+
+def silent_s(next_ms: int | None) -> float:
+    """How long a stream may be silent after a message, as far as the message says: that long and `STALE_S`
+    later it is stale, that long and `GONE_S` later its car is gone."""
+    return 0.0 if next_ms is None else next_ms / 1000
+
+
+def _next_entry(next_ms: Any) -> dict[str, int]:
+    if next_ms is None:
+        return {}
+    if type(next_ms) is not int or not 1 <= next_ms <= MAX_NEXT_MS:
+        raise ContractError(f"next_ms must be an integer from 1 to {MAX_NEXT_MS}, got {shown(next_ms)}")
+    return {"next_ms": next_ms}
 
 
 def live_update(
@@ -99,6 +118,7 @@ def live_update(
         "boot": live.boot,
         "seq": live.seq,
         T_US: live.t_us,
+        **_next_entry(live.next_ms),
         "hops": {**hops, **offset_entry(live.offset_us)},
         "sample": dict(live.sample),
     }

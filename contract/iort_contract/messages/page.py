@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal, TypedDict, Union
 
 from iort_contract.limits import Value
-from iort_contract.messages.insights import (
+from iort_contract.messages.analysis.insights import (
     AnalysisAnswer,
     AnalysisStarted,
     DeltaAnswer,
@@ -48,9 +48,9 @@ class Config(TypedDict):
     says whether the action ``drive`` gives addresses that may send commands.
     ``token`` is PubNub's access token, or empty. ``answers`` says
     whether the server answers questions about the past; a static site does not. ``actions`` names what the
-    server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a
-    robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is
-    known."""
+    server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see
+    `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars
+    drive on, if it is known."""
 
     namespace: str
     live: Literal["pubnub", "iot"]
@@ -62,17 +62,24 @@ class Config(TypedDict):
     token: str
     answers: bool
     actions: list[str]
-    key: str
+    keyed: list[str]
     vehicles: dict[str, dict[str, float]]
     track: TrackMap | None
 
 
+<<<<<<< HEAD
 class SocketAnswer(TypedDict):
     """Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection
     to the broker, to be opened within 5 minutes, and the client id for it."""
 
     url: str
     client_id: str
+=======
+class Admitted(TypedDict):
+    """Answers ``key``, once for each token; or again for the key itself."""
+
+    key: str
+>>>>>>> main
 
 
 class RobotPresence(TypedDict):
@@ -321,6 +328,7 @@ class Logs(TypedDict):
 
 
 Answer = Union[
+    Admitted,
     AnalysisAnswer,
     AnalysisStarted,
     InsightsAnswer,

@@ -65,7 +65,7 @@ def config(
     token: str = "",
     answers: bool = False,
     actions: Iterable[str] = (),
-    key: str = "",
+    keyed: Iterable[str] = (),
     track: Track | None = None,
 ) -> Config:
     """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
@@ -106,7 +106,7 @@ def config(
         "token": token,
         "answers": answers,
         "actions": sorted(actions),
-        "key": key,
+        "keyed": sorted(keyed),
         "track": None if track is None else _track_map(track),
     }
 

@@ -3,7 +3,7 @@
     with PageServer(namespace="iort", subscribe_key="sub-c-...", origin="ps.pndsn.com") as page:
         print(page.url)
 
-The page reads from ``/config.json`` where to listen; it holds no key that can publish.
+The page reads from ``/config.json`` where to listen; it holds no key that can publish or act.
 """
 
 from __future__ import annotations
@@ -29,8 +29,15 @@ from typing_extensions import Self
 
 from iort_contract.cloud import PUBNUB
 from iort_contract.limits import ContractError
-from iort_contract.messages.page import Identity
-from iort_contract.page import HEADERS, KEY_HEADER, PUBNUB_ORIGIN, pubnub_address, security_policy
+from iort_contract.messages.page import Admitted, Identity
+from iort_contract.page import (
+    HEADERS,
+    INVITATION,
+    KEY_HEADER,
+    PUBNUB_ORIGIN,
+    pubnub_address,
+    security_policy,
+)
 from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
@@ -44,6 +51,8 @@ _T = TypeVar("_T")
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
+# Where a browser gets the key.
+ADMISSION = "/key.json"
 _CHUNK_BYTES = 256 * 1024
 # The most answers that are worked on at a time; further requests wait.
 MOST_ANSWERS = 16
@@ -56,11 +65,13 @@ class PageServer(BackgroundServer):
     """The page's web server, in threads of its own.
 
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
-    from the parameters of the request. ``actions`` are those that change something: they need a POST with
-    the page's own origin and the key of ``/config.json``. ``downloads`` maps a name to the function that
-    writes the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server accepts a Host that is localhost, an address or one of ``names``, and no
-    other. Raises `StationError` if the page is not built, if the port is in use, and for a configuration that
-    it must not serve.
+    from the parameters of the request. ``open_actions`` change something that everybody who reaches the page
+    may change; they need a POST with the page's own origin. ``actions`` need the server's key, too: a browser
+    gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``downloads`` maps
+    a name to the function that writes the file ``/<name>``. ``broker`` is the broker's
+    address for WebSockets, without a path. The server accepts a Host that is localhost, an
+    address or one of ``names``, and no other. Raises `StationError` if the page is not built, if the port is
+    in use, and for a configuration that it must not serve.
     """
 
     def __init__(
@@ -77,6 +88,8 @@ class PageServer(BackgroundServer):
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
         actions: Mapping[str, Answer] | None = None,
+        open_actions: Mapping[str, Answer] | None = None,
+        admitted: Callable[[str], None] | None = None,
         downloads: Mapping[str, Download] | None = None,
         track: Track | None = None,
         host: str = "127.0.0.1",
@@ -86,10 +99,14 @@ class PageServer(BackgroundServer):
     ) -> None:
         super().__init__(host, port, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
-        self._actions = {f"/{name}.json": action for name, action in (actions or {}).items()}
+        keyed, free = actions or {}, open_actions or {}
+        self._actions = {f"/{name}.json": action for name, action in {**free, **keyed}.items()}
+        self._keyed = frozenset(f"/{name}.json" for name in keyed)
         self._downloads = {f"/{name}": download for name, download in (downloads or {}).items()}
-        # A page elsewhere cannot read it.
+        # No file has the key, because every user of this machine can read the files.
         self._key = secrets.token_urlsafe(32)
+        self._tokens: set[str] = set()
+        self._admitted = admitted or (lambda _: None)
         self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._free_to_write = asyncio.Semaphore(MOST_DOWNLOADS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
@@ -103,8 +120,8 @@ class PageServer(BackgroundServer):
             vehicles=vehicles,
             token=token,
             answers=bool(answers),
-            actions=actions or (),
-            key=self._key,
+            actions=[*free, *keyed],
+            keyed=keyed,
             track=track,
         )
         pubnub = [pubnub_address(origin, tls=tls)] if live == PUBNUB else []
@@ -132,6 +149,15 @@ class PageServer(BackgroundServer):
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)  # noqa: S104 - compared
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
 
+    def invitation(self, view: str = "#/") -> str:
+        """An address that gives one browser the key, once; the page's plain address if no action needs it."""
+        if not self._keyed:
+            return self.url + view
+        token = secrets.token_urlsafe(32)
+        self._tokens.add(token)
+        # What follows the # stays in the browser; it is in no log.
+        return f"{self.url}{view}?{INVITATION}={token}"
+
     def start(self) -> Self:
         """Listen, and return once the page can be requested."""
         where = f"cannot serve the page on {self.host} port {self.port}"
@@ -150,8 +176,10 @@ class PageServer(BackgroundServer):
             refused = "this server answers to localhost, to addresses and to what --name says"
             return self._response(request, as_json({"error": refused}), 403)
         path = request.raw_path.partition("?")[0]
+        if request.method == "POST" and path == ADMISSION and self._keyed:
+            return await self._act(request, self._admit)
         if request.method == "POST" and path in self._actions:
-            return await self._act(request, self._actions[path])
+            return await self._act(request, self._actions[path], keyed=path in self._keyed)
         if request.method not in {"GET", "HEAD"}:
             return self._response(request, packed(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
         answer = self._answers.get(path)
@@ -215,15 +243,33 @@ class PageServer(BackgroundServer):
         threading.Thread(target=run, name="page answer", daemon=True).start()
         return await asyncio.wrap_future(done)
 
-    async def _act(self, request: web.BaseRequest, action: Answer) -> web.StreamResponse:
+    def _admit(self, asked: Mapping[str, str]) -> Admitted:
+        """The key, for a token that was not used before; or whether a kept key is still the server's."""
+        token = asked.get("token", "")
+        if self._is_key(token):
+            return {"key": self._key}
+        try:
+            self._tokens.remove(token)
+        except KeyError as error:
+            known = "this address was used before, or is of an earlier start of the server"
+            raise StationError(f"{known}: open the one in the server's terminal") from error
+        self._admitted(self.invitation())
+        return {"key": self._key}
+
+    def _is_key(self, told: str) -> bool:
+        return secrets.compare_digest(told.encode(errors="surrogateescape"), self._key.encode())
+
+    async def _act(
+        self, request: web.BaseRequest, action: Answer, *, keyed: bool = False
+    ) -> web.StreamResponse:
         """Answer with the result of an action; its parameters are texts in a JSON object."""
         # Every browser sends the origin with a POST, and no script can change it.
         origin = urlsplit(request.headers.get("Origin", "")).netloc
-        known = secrets.compare_digest(
-            request.headers.get(KEY_HEADER, "").encode(errors="surrogateescape"), self._key.encode()
-        )
-        if not known or origin.lower() != request.headers["Host"].lower():
-            refused = "an action needs this page's own origin and key: reload the page"
+        if origin.lower() != request.headers["Host"].lower():
+            refused = "an action needs this page's own origin"
+            return self._response(request, as_json({"error": refused}), 403)
+        if keyed and not self._is_key(request.headers.get(KEY_HEADER, "")):
+            refused = "this browser may only look: open the address in the server's terminal"
             return self._response(request, as_json({"error": refused}), 403)
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:

@@ -2,6 +2,7 @@
 
 import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
+import { invited } from "./server/admission";
 import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
 import { Alarms } from "./live/alarms";
@@ -69,7 +70,7 @@ class Page {
     this.cloudWatchView = new CloudWatchView(config);
     this.alarmsView = new AlarmsView(config, alarms);
     for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
-    window.addEventListener("hashchange", () => this.go());
+    window.addEventListener("hashchange", () => (invited(location.hash) ? location.reload() : this.go()));
     window.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("visibilitychange", () => !document.hidden && this.frame());
     Object.defineProperty(window, "iort", { value: observer(this.fleet, this.feed, GONE_SHOWN_S), writable: false });

@@ -16,13 +16,13 @@ import pytest
 from typing_extensions import Self
 
 from iort_analysis.samples.blocks import Block, values
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from tests.fakes import item_of
 from tests.local.conftest import run_agent, until
 from tests.unit.analysis.simulated import streams

@@ -50,6 +50,7 @@ def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundl
 
     # The operator need not wait until no batch may follow.
     (mark,) = until(marked)
+    assert "nothing is archived yet" in iort("archive", "show", car.robot).stderr
     ran = iort("archive", "run", car.robot, "vesc", "--json")
     assert (ran.exit_code, json.loads(ran.stdout)) == (0, {"hours": 1}), ran.output
     row = archived_hour(rows(embedded, topic)[0])

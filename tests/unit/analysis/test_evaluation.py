@@ -15,10 +15,10 @@ from iort_analysis.evaluation.baselines import baseline, fleet_baseline
 from iort_analysis.evaluation.combined import combined
 from iort_analysis.evaluation.discovery import false_discovery_rates
 from iort_analysis.evaluation.evaluate import evaluate
-from iort_analysis.evaluation.student import quantile, tail
 from iort_analysis.evaluation.trends import US_PER_DAY, trend
 from iort_analysis.results import DriveResult, Event, Measured, Mined
-from iort_contract.messages.findings import DriveKey, Estimate, Finding
+from iort_analysis.statistics.student import quantile, tail
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
 
 NAME = "battery_resistance_ohm"
 

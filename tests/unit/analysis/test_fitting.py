@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from iort_analysis.mining.fitting import Prior, fit, propagated
-from iort_analysis.mining.normal import between
-from iort_analysis.mining.signals import lagged, resolution
+from iort_analysis.statistics.fitting import Prior, fit, propagated
+from iort_analysis.statistics.normal import between
+from iort_analysis.statistics.signals import lagged, resolution
 
 
 def test_intervals_hold_although_neighbouring_errors_are_alike() -> None:

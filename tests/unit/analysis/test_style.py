@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from iort_analysis.mining import style
-from iort_analysis.mining.clusters import cluster
+from iort_analysis.statistics.clusters import cluster
 from tests.unit.analysis.drives import START_US, sampled
 
 

@@ -8,7 +8,7 @@ from functions import live
 from functions.shared.summary import stored
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
-from iort_contract.messages import ask, commands, files
+from iort_contract.messages import ask, commands, files, viewing
 from iort_contract.ros1.message import MAX_LAYOUT
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
@@ -30,11 +30,13 @@ UNITS = {
     "GONE_S": (1, "s"),
     **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
     **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS", "MAX_ASK_MS"), (1, "ms")),
+    **dict.fromkeys(("MAX_NEXT_MS", "VIEW_LEASE_MS"), (1, "ms")),
+    "VIEW_RENEW_S": (1, "s"),
     "upload_gb_a_day": (1, "GB"),
 }
 
 # The modules that define limits.
-MODULES = (limits, commands, files, ask)
+MODULES = (limits, commands, files, ask, viewing)
 
 
 def test_each_limit_has_its_value_on_the_page() -> None:

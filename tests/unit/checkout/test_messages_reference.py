@@ -59,6 +59,7 @@ from iort_contract.messages.live import (
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.messages.settings import CHANGEABLE
 from iort_contract.messages.shadow import decode_desired, decode_reported, encode_reported
+from iort_contract.messages.viewing import Lease, decode_lease, encode_lease
 from iort_contract.tables import (
     OVER_SHARE,
     PUT_OFF,
@@ -73,7 +74,8 @@ from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
 RUN, T_US = "3f2a9c01d4e5b678", 1_767_261_600_000_000
 SAMPLE = {"speed": 25.2, "voltage_input": 11.9, "fault_code": 0}
-LIVE = LiveSample(RUN, 12, T_US, T_US + 4_000, SAMPLE, offset_us=-1_500)
+LIVE = LiveSample(RUN, 12, T_US, T_US + 4_000, SAMPLE, offset_us=-1_500, next_ms=100)
+LEASE = Lease("7c0d5e9a21b4f638", 10, 15_000, broker=True)
 HASH = "a591a6d40bf420404a011733cfb7b190d62c65bf0bcda32b57b277d9ad9f146e"
 FILE = File("notes.txt", "log", "text/plain", 12, HASH, T_US)
 ASKED, KEY = "5f0c2b7a9e1d4c38", file_key("car7", FILE)
@@ -121,6 +123,7 @@ def as_object(decode: Callable[[str], Any]) -> Callable[[dict[str, Any]], Any]:
 WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
     "batch": (encode_batch(BATCH), as_object(decode_batch), BATCH),
     "live": (encode_live(LIVE), as_object(decode_live), LIVE),
+    "lease": (encode_lease(LEASE), as_object(decode_lease), LEASE),
     "ping": (PING, as_object(decode_pong), Pong(17, T_US, None)),
     "pong": (PONG, as_object(decode_pong), Pong(17, T_US, T_US // 1000 + 30)),
     "command": (encode_command(COMMAND), as_object(decode_command), COMMAND),
@@ -225,6 +228,13 @@ BOUNDS = [
     ("batch", "v", 2, 3, "2"),
     ("batch", "nonfinite", 25_600_000, 25_600_001, "25,600,000"),
     ("live", "v", 1, 2, "1"),
+    ("live", "next_ms", 1, 0, "1 to 100,000"),
+    ("live", "next_ms", 100_000, 100_001, "1 to 100,000"),
+    ("lease", "viewer", "f" * 32, "f" * 33, "8 to 32 of `0-9a-f`"),
+    ("lease", "rate_hz", 10, 10.1, "0.01 to 10"),
+    ("lease", "rate_hz", 0.01, 0, "0.01 to 10"),
+    ("lease", "lease_ms", 15_000, 15_001, "0 to 15,000"),
+    ("lease", "lease_ms", 0, -1, "0 to 15,000"),
     ("command", "session", "f" * 32, "F" * 32, "`boot`"),
     ("command", "valid_ms", 60_000, 60_001, "1 to 60,000"),
     ("command", "valid_ms", 1, 0, "1 to 60,000"),

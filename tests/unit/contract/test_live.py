@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
+from iort_contract.limits import MAX_NEXT_MS, MAX_PUBNUB_BYTES, ContractError
 from iort_contract.messages.event import event_message, rule_event
 from iort_contract.messages.live import (
     LiveSample,
@@ -38,7 +38,17 @@ from tests.unit.contract.contract_values import (
 )
 
 samples = st.dictionaries(names, values, max_size=8)
-lives = st.builds(LiveSample, boots, seqs, times, times, samples, st.integers(0, 1000), st.none() | times)
+lives = st.builds(
+    LiveSample,
+    boots,
+    seqs,
+    times,
+    times,
+    samples,
+    st.integers(0, 1000),
+    st.none() | times,
+    st.none() | st.integers(1, MAX_NEXT_MS),
+)
 
 
 @given(lives)
@@ -81,6 +91,8 @@ def test_live_nonfinite_becomes_null_and_is_counted(sample):
         ({"sent_us": True}, "sent_us"),
         ({"offset_us": 0.5}, "offset_us"),
         ({"offset_us": 2**53}, "offset_us"),
+        ({"next_ms": 0}, "next_ms"),
+        ({"next_ms": 10.0}, "next_ms"),
         ({"sample": {f"f{i}": 0 for i in range(513)}}, "fields, got 513"),
         ({"sample": {"a b": 1}}, "field name"),
         ({"sample": {"speed": math.nan}, "nonfinite": MOST_NONFINITE}, "nonfinite"),
@@ -106,7 +118,7 @@ def test_live_update_carries_every_hop():
 
 
 def test_a_live_update_is_decoded_as_it_was_encoded():
-    live = LiveSample("0123abcd", 3, 5_000, 6_000, {"speed": 1.5, "name": None}, offset_us=-7)
+    live = LiveSample("0123abcd", 3, 5_000, 6_000, {"speed": 1.5, "name": None}, offset_us=-7, next_ms=9_000)
     sent = json.loads(json.dumps(live_update("car", "vesc", live, 8, 9_000)))
     assert decode_live_update(sent) == ("car", "vesc", live, 8, 9_000)
     for bad in (

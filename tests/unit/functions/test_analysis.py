@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 
 from functions import analyse, evaluate, plan, present
-from functions.shared.kept import Kept
+from functions.shared.analysis.kept import Kept
 from iort_analysis.archive.tables import read_table
 from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.archive import ArchivedHour, hour_of
-from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, SERIOUS
 from iort_contract.cloud import drive_prefix, plan_key
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, encode_planned
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
+from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, encode_planned
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.findings import DriveKey, Estimate, Finding
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic

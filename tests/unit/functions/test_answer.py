@@ -14,14 +14,15 @@ from hypothesis import strategies as st
 
 from functions import answer
 from functions.quarantine import entries
-from functions.shared.bodies import Bodies
+from functions.shared.questions.bodies import Bodies
+from functions.shared.questions.work import RefusedError, work_of
 from functions.shared.quota import HOUR, Quota
-from functions.shared.work import RefusedError, work_of
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, RACELINE, Question
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.messages.ask import (
     FAILED,
     INVALID,
@@ -43,7 +44,6 @@ from iort_contract.messages.ask import (
 )
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import File, file_key
-from iort_contract.messages.findings import DriveKey, Estimate
 from iort_contract.tables import FINDING, ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_contract.track import parse_track

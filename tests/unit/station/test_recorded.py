@@ -22,6 +22,7 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station import data
 from iort_station.data import archive as station_archive
 from iort_station.data.overview import overview
+from iort_station.data.recorded import Origin
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.operations import accounts, audit
@@ -231,10 +232,16 @@ def test_the_audit_is_the_same(before, cloud, stream):
     assert audit.last_figures(cloud, "car") == audit.last_figures(before, "car")
 
 
-def test_runs_and_streams_are_the_same(before, cloud):
-    for end_us in (None, START + HOUR, START + 100 * S):
+def test_runs_and_streams_are_the_same_and_say_where_they_are_from(before, cloud):
+    for find in (runs, overview):
+        origins = Origin(), Origin()
+        expected, found = (
+            find(one, "car", origin=origin) for one, origin in zip((before, cloud), origins, strict=True)
+        )
+        assert found == expected
+        assert (origins[0].told(), bool(origins[1].told())) == (None, cloud.state != "archived")
+    for end_us in (START + HOUR, START + 100 * S):
         assert runs(cloud, "car", end_us=end_us) == runs(before, "car", end_us=end_us)
-    assert overview(cloud, "car") == overview(before, "car")
 
 
 def test_the_page_gets_the_same_and_says_where_it_is_from(before, cloud):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iort_analysis.mining.anomalies.readings import Array
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_contract.messages.analysis.findings import INTERVAL, Estimate
 
 # The 95 % quantile of the normal distribution: 90 % lie within, either way.
 _Z = 1.645

@@ -9,7 +9,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.drives.motion import motion_field, moving
 from iort_analysis.results import Event, Mined
 from iort_analysis.samples.blocks import Block
-from iort_contract.messages.findings import Estimate
+from iort_contract.messages.analysis.findings import Estimate
 
 KIND = "can_intermittent"
 # A gap is longer than so many intervals between samples, and shorter than a pause.

@@ -9,9 +9,9 @@ import numpy as np
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
-from iort_analysis.mining.intervals import mean_of
 from iort_analysis.results import Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.intervals import mean_of
+from iort_contract.messages.analysis.findings import Estimate
 
 SLIP = "slip_under_torque"
 # Distances over this time are compared: long enough for a pose with a centimetre's noise.

@@ -3,16 +3,23 @@
 export const SCHEMA_VERSION = 1;
 export const MAX_FIELDS = 512;
 export const MAX_FIELD_CHARACTERS = 1024;
+export const MAX_NEXT_MS = 100000;
 export const STALE_S = 1.5;
 export const GONE_S = 4.5;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
+export const LIVE = "live";
+export const VIEW = "view";
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TACHOMETER_COUNTS = 6;
 export const ANALYSIS_FAILED = "analysis_failed";
 export const STYLE_GROUP = "Driving style";
 export const MAX_LEASE_MS = 10000;
+export const LEASE = "lease";
+export const VIEW_LEASE_MS = 15000;
+export const VIEW_RENEW_S = 5.0;
 export const KEY_HEADER = "X-Iort-Key";
+export const INVITATION = "key";
 export const POSE_STREAM = "pose";
 export const LOG_STREAM = "log";
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
@@ -429,7 +436,7 @@ export interface TrackMap {
   readonly w_left_m: readonly number[];
 }
 
-/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked with ``key``, which is a new one at every start. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
+/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
   readonly subscribe_key: string;
@@ -438,9 +445,14 @@ export interface Config {
   readonly token: string;
   readonly answers: boolean;
   readonly actions: readonly string[];
-  readonly key: string;
+  readonly keyed: readonly string[];
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
   readonly track: TrackMap | null;
+}
+
+/** Answers ``key``, once for each token; or again for the key itself. */
+export interface Admitted {
+  readonly key: string;
 }
 
 /** Whether a robot is connected, and since when it is or is not; null if it never was. */

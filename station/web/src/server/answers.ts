@@ -1,6 +1,10 @@
 // Questions and requests to the server that serves the page; the answers' types are in contract.ts.
 
-import { KEY_HEADER, type Config } from "../base/contract";
+import { KEY_HEADER } from "../base/contract";
+import { kept } from "../base/kept";
+
+/** The server's key, as this browser keeps it: see admission.ts. */
+export const KEPT_KEY = "key";
 
 export class AnswerError extends Error {}
 
@@ -14,9 +18,7 @@ export async function ask<T>(name: string, parameters: Parameters, signal?: Abor
 
 /** Have the server change something; throws `AnswerError` if it does not, or if the change is refused. */
 export async function act<T>(name: string, parameters: Parameters): Promise<T> {
-  // Asked each time, because a server that was started again has another key.
-  const { key } = await ask<Config>("config", {});
-  const headers = { "Content-Type": "application/json", [KEY_HEADER]: key };
+  const headers = { "Content-Type": "application/json", [KEY_HEADER]: kept(KEPT_KEY) ?? "" };
   const answer = await answered(`${name}.json`, { method: "POST", headers, body: JSON.stringify(parameters) });
   return (await answer.json()) as T;
 }

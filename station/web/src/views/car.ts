@@ -19,10 +19,13 @@ import { Commands } from "../car/commands";
 import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
+import { barred, may } from "../server/admission";
 import { StreamSection } from "../car/field_tiles";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
+
+const ONLY_LOOK = "This browser may only look. To send commands, open the address in the server's terminal.";
 
 export class CarView {
   readonly node: HTMLElement;
@@ -71,7 +74,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(config.actions.includes("send") ? [this.commands.node, this.settings.node] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note" }, ONLY_LOOK)] : []))),
       this.streams,
     );
   }

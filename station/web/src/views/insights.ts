@@ -11,6 +11,7 @@ import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { styles } from "../insights/styles";
+import { may } from "../server/admission";
 import { ask, AnswerError } from "../server/answers";
 
 export class InsightsView {
@@ -30,7 +31,7 @@ export class InsightsView {
 
   constructor(private readonly config: Config) {
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
-    const status = el("div", { class: "history-status" }, this.note.node, ...(config.actions.includes("analyse") ? [this.analyse.node] : []));
+    const status = el("div", { class: "history-status" }, this.note.node, ...(may(config, "analyse") ? [this.analyse.node] : []));
     const served = [status, this.found, this.laps.node, this.parameters.node, this.driven];
     this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
   }

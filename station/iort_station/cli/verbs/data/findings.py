@@ -8,15 +8,15 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract.catalog.kinds import KINDS
-from iort_contract.messages.analysis import AnalysedDrive, encode_analysed
-from iort_contract.messages.findings import Estimate, Finding, encode_finding
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.messages.analysis.findings import Estimate, Finding, encode_finding
+from iort_contract.messages.analysis.run import AnalysedDrive, encode_analysed
 from iort_contract.page import PAGE_URL, history_link
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples
-from iort_station.data import findings as stored
+from iort_station.data.analysis import findings as stored
 from iort_station.fleet import registry
 from iort_station.times import iso_s
 

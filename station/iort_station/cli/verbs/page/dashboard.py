@@ -9,7 +9,7 @@ import typer
 
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, Token, TrackFile
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say
 from iort_station.fleet import registry
 from iort_station.page import keys
 
@@ -50,13 +50,16 @@ def dashboard(
         token=token,
         answers=answers(cloud),
         downloads=downloads(cloud),
-        # Whoever reaches the page can use it, and only people at this machine may move a robot.
-        actions=actions(cloud) | (control.actions(cloud) if on_loopback(host) else {}),
+        open_actions=actions(cloud),
+        # Only people at this machine may move a robot.
+        actions=control.actions(cloud) if on_loopback(host) else {},
+        admitted=lambda address: say(f"another browser: {address}"),
         track=None if track is None else load_track(track),
         host=host,
         port=port,
         names=name or (),
         **keys.load(cloud).reading(),
     ) as page:
-        tell({"url": page.url}, f"{page.url}  (Ctrl-C stops)", as_json=as_json)
+        address = page.invitation()
+        tell({"url": page.url, "address": address}, f"{address}  (Ctrl-C stops)", as_json=as_json)
         threading.Event().wait()

@@ -10,8 +10,8 @@ from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from functions.shared import clients
+from functions.shared.analysis.expired import Expired
 from functions.shared.environment import variables
-from functions.shared.expired import Expired
 from iort_contract.archive import ArchiveTable
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.environments import PlanEnvironment

@@ -7,7 +7,7 @@ from typing import Any, Mapping
 
 from iort_contract.checks import integer, shown, text
 from iort_contract.limits import ContractError
-from iort_contract.messages.findings import DriveKey, Estimate, decode_estimate, encode_estimate
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, decode_estimate, encode_estimate
 from iort_contract.topics import check_robot, check_stream
 
 # The longest range of one run.

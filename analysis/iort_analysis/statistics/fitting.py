@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.mining.intervals import t95
-from iort_analysis.mining.normal import between
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.intervals import t95
+from iort_analysis.statistics.normal import between
+from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,33 @@
+// The server's key, without which a browser may only look. It comes once, for the token in the address that the
+// server's terminal shows, and is kept in this browser.
+
+import { INVITATION, type Admitted, type Config } from "../base/contract";
+import { keep, kept } from "../base/kept";
+import { act, AnswerError, KEPT_KEY } from "./answers";
+
+const IN_ADDRESS = new RegExp(`[?&]${INVITATION}=([\\w-]+)`);
+let admitted = false;
+
+/** Whether an address has a token. */
+export const invited = (hash: string): boolean => IN_ADDRESS.test(hash);
+
+/** Take the token out of the address, or see if the kept key is still the server's. */
+export async function enter(config: Config): Promise<void> {
+  const token = IN_ADDRESS.exec(location.hash)?.[1] ?? kept(KEPT_KEY);
+  history.replaceState(null, "", location.hash.replace(IN_ADDRESS, ""));
+  if (config.keyed.length === 0 || !token) return;
+  try {
+    const { key } = await act<Admitted>("key", { token });
+    keep(KEPT_KEY, key);
+    admitted = true;
+  } catch (error) {
+    // The page is for looking, then, and says where the address is.
+    if (!(error instanceof AnswerError)) throw error;
+  }
+}
+
+/** Whether the server takes an action, and takes it from this browser. */
+export const may = (config: Config, action: string): boolean => config.actions.includes(action) && (admitted || !config.keyed.includes(action));
+
+/** Whether the server takes an action, but only from a browser that has its key. */
+export const barred = (config: Config, action: string): boolean => config.keyed.includes(action) && !admitted;
