@@ -45,12 +45,11 @@ class Identity(TypedDict):
 class Config(TypedDict):
     """``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or
     ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers``
-    says whether the action ``drive`` gives addresses that may send commands.
-    ``token`` is PubNub's access token, or empty. ``answers`` says
-    whether the server answers questions about the past; a static site does not. ``actions`` names what the
-    server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see
-    `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars
-    drive on, if it is known."""
+    says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access
+    token, or empty. ``answers`` says whether the server answers questions about the past; a static site does
+    not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is
+    a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters.
+    ``track`` is the track that the cars drive on, if it is known."""
 
     namespace: str
     live: Literal["pubnub", "iot"]
@@ -67,19 +66,18 @@ class Config(TypedDict):
     track: TrackMap | None
 
 
-<<<<<<< HEAD
 class SocketAnswer(TypedDict):
     """Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection
     to the broker, to be opened within 5 minutes, and the client id for it."""
 
     url: str
     client_id: str
-=======
+
+
 class Admitted(TypedDict):
     """Answers ``key``, once for each token; or again for the key itself."""
 
     key: str
->>>>>>> main
 
 
 class RobotPresence(TypedDict):
