@@ -31,6 +31,7 @@ from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_contract.messages.ask import REASONS
+from iort_contract.messages.driving import REFUSALS
 from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
@@ -60,6 +61,7 @@ __all__ = [
     "page_contract",
     "questions",
     "reasons",
+    "refusals",
     "rules",
     "settings",
     "stream",
@@ -214,6 +216,11 @@ def _kib(size: int) -> str:
 def reasons() -> None:
     """Why a question has no answer."""
     _table(("`refused`", "meaning"), [(f"`{name}`", text) for name, text in REASONS.items()], right=False)
+
+
+def refusals() -> None:
+    """Why a motion was refused."""
+    _table(("`outcome`", "meaning"), [(f"`{name}`", text) for name, text in REFUSALS.items()], right=False)
 
 
 def rules() -> None:

@@ -16,16 +16,16 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
-from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
+from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, page, viewing
-from iort_contract.messages.analysis import insights
+from iort_contract.messages import commands, driving, page, viewing
+from iort_contract.messages.analysis import insights, notes
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3
 # Their fields have names that other streams use for something else.
-_NAMED = (POSE_STREAM, LOG_STREAM)
+_NAMED = (POSE_STREAM, LOG_STREAM, DRIVE_STREAM)
 
 
 class Symbol:
@@ -68,13 +68,23 @@ def page_contract() -> None:
 
 def _constants() -> Iterator[str]:
     for module, names in {
-        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "MAX_NEXT_MS", "STALE_S", "GONE_S"),
+        limits: (
+            "SCHEMA_VERSION",
+            "MAX_FIELDS",
+            "MAX_FIELD_CHARACTERS",
+            "MAX_NEXT_MS",
+            "STALE_S",
+            "GONE_S",
+            "LIVE_MAX_RATE_HZ",
+        ),
         topics: ("NAME", "LIVE", "VIEW"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
         kinds: ("ANALYSIS_FAILED",),
         parameters: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
+        driving: ("DRIVE_RATE_HZ", "DRIVE_LEASE_MS", "DRIVE_MAX_RTT_MS", "DRIVE_MAX_AGE_MS"),
+        notes: ("MAX_NOTE_CHARACTERS",),
         viewing: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
         served: ("KEY_HEADER", "INVITATION"),
     }.items():
@@ -84,6 +94,8 @@ def _constants() -> Iterator[str]:
             yield f"export const {name} = {literal};"
     yield f"export const POSE_STREAM = {json.dumps(POSE_STREAM)};"
     yield f"export const LOG_STREAM = {json.dumps(LOG_STREAM)};"
+    yield f"export const DRIVE_STREAM = {json.dumps(DRIVE_STREAM)};"
+    yield f"export const REFUSALS = {json.dumps(driving.REFUSALS, indent=2)} as const;"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
     # The alarms that the page can see in a car's live values.

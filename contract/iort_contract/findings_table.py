@@ -1,4 +1,4 @@
-"""The table of findings in DynamoDB: findings, and a row of each analysed drive, by robot and time.
+"""The table of findings in DynamoDB: findings, a row of each analysed drive, and notes, by robot and time.
 
 The content of a row is JSON, so that numbers come back as they were.
 """
@@ -13,8 +13,9 @@ from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.messages.analysis.notes import Note, decode_note, encode_note
 from iort_contract.messages.analysis.run import AnalysedDrive, decode_analysed, encode_analysed
-from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
+from iort_contract.tables import CONTENT, FINDING, NOTE_PREFIX, PARAMETERS_PREFIX, ROBOT
 
 T = TypeVar("T")
 _FIRST, _LAST = "0", "9~"
@@ -47,10 +48,21 @@ class FindingsTable:
         most: int | None = None,
     ) -> Iterator[AnalysedDrive]:
         """A robot's analysed drives that begin in a range, the newest first; at most so many."""
-        first = f"{PARAMETERS_PREFIX}{'' if start_us is None else f'{start_us:016d}'}"
-        last = f"{PARAMETERS_PREFIX}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
-        rows = self._content(robot, first, last, newest_first=True, page_items=most)
+        rows = self._newest(robot, PARAMETERS_PREFIX, start_us, end_us, most)
         yield from islice(_decoded(decode_analysed, rows), most)
+
+    def notes(
+        self,
+        robot: str,
+        start_us: int | None = None,
+        end_us: int | None = None,
+        *,
+        most: int | None = None,
+    ) -> Iterator[Note]:
+        """A robot's notes about a range, the newest first; at most so many."""
+        yield from islice(
+            _decoded(decode_note, self._newest(robot, NOTE_PREFIX, start_us, end_us, most)), most
+        )
 
     def put_finding(self, finding: Finding) -> None:
         """Write a finding; one of the same id is replaced."""
@@ -61,10 +73,35 @@ class FindingsTable:
         key = f"{PARAMETERS_PREFIX}{analysed.drive}"
         self._put(analysed.drive.robot, key, encode_analysed(analysed))
 
+    def put_note(self, note: Note) -> None:
+        """Write a note."""
+        self._put(note.robot, f"{NOTE_PREFIX}{note.id}", encode_note(note))
+
     def remove(self, finding: Finding) -> None:
         """Remove a finding that a later analysis of its drive no longer has."""
-        key = {ROBOT: {"S": finding.drive.robot}, FINDING: {"S": finding.id}}
-        self._client.delete_item(TableName=self._name, Key=key)
+        self._delete(finding.drive.robot, finding.id)
+
+    def remove_drive(self, drive: DriveKey) -> None:
+        """Remove the row of an analysed drive."""
+        self._delete(drive.robot, f"{PARAMETERS_PREFIX}{drive}")
+
+    def remove_note(self, robot: str, note_id: str) -> bool:
+        """Remove a note; False if there is none of this id."""
+        return self._delete(robot, f"{NOTE_PREFIX}{note_id}")
+
+    def _delete(self, robot: str, key: str) -> bool:
+        answer = self._client.delete_item(
+            TableName=self._name, Key={ROBOT: {"S": robot}, FINDING: {"S": key}}, ReturnValues="ALL_OLD"
+        )
+        return "Attributes" in answer
+
+    def _newest(
+        self, robot: str, prefix: str, start_us: int | None, end_us: int | None, most: int | None
+    ) -> Iterator[Mapping[str, Any]]:
+        """The rows of a prefix in a range, the newest first."""
+        first = f"{prefix}{'' if start_us is None else f'{start_us:016d}'}"
+        last = f"{prefix}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
+        return self._content(robot, first, last, newest_first=True, page_items=most)
 
     def _put(self, robot: str, key: str, content: Mapping[str, Any]) -> None:
         text = json.dumps(content, separators=(",", ":"), allow_nan=False)

@@ -88,6 +88,7 @@ ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMITTED_CER
 ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
 
 # The table of findings: by robot and a text that begins with the time of the drive. Beside the findings it
-# has a row of each analysed drive, for comparing with later ones, whose key begins with a prefix.
+# has a row of each analysed drive, for comparing with later ones, and the operators' notes: the keys of each
+# begin with a prefix.
 FINDING, CONTENT = "finding", "content"
-PARAMETERS_PREFIX = "parameters#"
+PARAMETERS_PREFIX, NOTE_PREFIX = "parameters#", "note#"

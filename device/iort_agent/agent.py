@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import uuid
+from typing import Callable, Mapping
 
 from iort_agent.clock import Clock
 from iort_agent.common.logs import Troubles, set_level
 from iort_agent.common.version import agent_version
 from iort_agent.config import Config
+from iort_agent.control.commands import Operator
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
 from iort_agent.lanes.attachment import make_attachments
 from iort_agent.lanes.clock_offset import OffsetEstimator
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes.config import IOT, RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import RecordLane
 from iort_agent.lanes.streams import Streams
+from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.run import SourceRun
@@ -26,6 +29,8 @@ from iort_agent.sources.sim.source import SimSource
 from iort_agent.spool.interface import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
+from iort_contract.catalog.streams import DRIVE_STREAM
+from iort_contract.limits import Value
 
 
 class Agent:
@@ -44,6 +49,8 @@ class Agent:
             live_rate_hz=config.live.rate_hz,
             ping_rate_hz=config.ping.rate_hz,
             log_level=config.log_level,
+            live_when=config.live.when,
+            motion_stopped=config.motion.stopped,
         )
         self.record = RecordLane(
             robot=config.robot,
@@ -57,6 +64,7 @@ class Agent:
         self.live = LiveLane(
             link, boot=self.boot, rate_hz=config.live.rate_hz, offset_us=self.offset.known_us
         )
+        self.viewers = Viewers(link, self.live, base, to_broker=config.live.transport == IOT)
         self.streams = Streams(
             boot=self.boot,
             batch_s=config.record.batch_s,
@@ -72,6 +80,8 @@ class Agent:
             apply=self.apply,
             known_fields=self.streams.known_fields,
             version=agent_version(),
+            drive=config.downlink.drive_limits(),
+            moves=config.downlink.moves(),
         )
         self.sources = [SourceRun(source, clock) for source in config.sources]
         # Folders and questions share it: the broker's answers have one handler.
@@ -86,7 +96,7 @@ class Agent:
             sources=config.sources,
             graph=next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None),
             offset=self.offset.known,
-            answer=self.shadow.answer,
+            operator=Operator(self.shadow.answer, self._drove(config), self.shadow.known),
             uploader=uploader,
             root_ca=config.root_ca,
         )
@@ -116,6 +126,14 @@ class Agent:
         if settings.log_level != self.streams.settings.log_level:
             set_level(settings.log_level)
         self.live.enabled = settings.live_enabled
-        self.live.set_rate(settings.live_rate_hz)
+        self.viewers.apply(settings)
         self.pings.set_rate(settings.ping_rate_hz)
         self.streams.apply(settings)
+        if self.downlink is not None:
+            self.downlink.set_stopped(settings.motion_stopped)
+
+    def _drove(self, config: Config) -> Callable[[Mapping[str, Value]], None]:
+        """Takes the samples of who drove; a source with a stream of this name goes first."""
+        if any(DRIVE_STREAM in source.streams() for source in config.sources):
+            return lambda _: None
+        return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values)

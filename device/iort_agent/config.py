@@ -20,7 +20,7 @@ from iort_agent.common.schema import (
     text,
     variant,
 )
-from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
+from iort_agent.control.config import DownlinkConfig, MotionState, ShareConfig, share_rule
 from iort_agent.errors import ConfigError
 from iort_agent.files.config import FilesConfig
 from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
@@ -28,8 +28,8 @@ from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.spool.config import QueueConfig
 from iort_agent.status.metrics import MetricsConfig
-from iort_contract.catalog.streams import OWN_STREAMS
-from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
+from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.messages.settings import SETTINGS
 from iort_contract.topics import check_namespace, check_robot
 
@@ -59,6 +59,7 @@ class Config:
     files: FilesConfig = setting(section(FilesConfig), FilesConfig())
     metrics: MetricsConfig = setting(section(MetricsConfig), MetricsConfig())
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
+    motion: MotionState = setting(section(MotionState), MotionState())
     share: tuple[tuple[str, ShareConfig], ...] = setting(share_rule(), ())
     status_socket: Path | None = setting(any_path(), None)
     log_level: str = setting(allowed(SETTINGS["log_level"]), "info")
@@ -71,6 +72,10 @@ def load_config(file: Path) -> Config:
     if content is None:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, place)
+    try:
+        config.downlink.drive_limits()
+    except ContractError as error:
+        raise place.child("downlink.drive").problem(str(error)) from error
     _check_streams(config, place.child("sources"))
     if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
         raise place.child("files.large_folder").problem(
@@ -83,7 +88,8 @@ def load_config(file: Path) -> Config:
 
 def _check_streams(config: Config, place: Place) -> None:
     """Two sources must not write one stream: their samples would mix into one time series."""
-    taken: list[str] = sorted(OWN_STREAMS)
+    # A car whose commands no stick drives may record another stream of this name.
+    taken: list[str] = sorted(OWN_STREAMS - ({DRIVE_STREAM} if config.downlink.drive is None else set()))
     for i, source in enumerate(config.sources):
         for stream in source.streams():
             if stream in taken:

@@ -85,6 +85,8 @@ class Lab:
     def __init__(self) -> None:
         self.asked: list[dict[str, str]] = []
         self.refuses = False
+        self.notes: list[dict[str, Any]] = []
+        self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
             alarm("FaultSamples", robots=["car-1", "car-2"], named=True),
             alarm("Quarantined"),
@@ -97,6 +99,10 @@ class Lab:
             raise StationError("no such right")
         return {"alarms": self.alarms, "user": "operator@lab"}
 
+    def answer_notes(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        low, high = (int(asked.get(name, 0)) for name in ("from_us", "to_us"))
+        return {"notes": [one for one in self.notes if low <= one["t_us"] < (high or math.inf)]}
+
     def acknowledge(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.asked.append(dict(asked))
         seen = {"by": asked["by"] or "operator@lab", "at_s": time.time()}
@@ -105,6 +111,17 @@ class Lab:
             for one in self.alarms
         ]
         return seen
+
+    def write(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        t_us = int(asked.get("t_us") or time.time_ns() // 1000)
+        note = {"robot": asked["robot"], "t_us": t_us, "text": asked["text"], "by": "operator@lab"}
+        self.notes.append({"id": f"{t_us:016d}-{len(self.notes):08x}", **note})
+        self.notes.sort(key=lambda one: one["id"], reverse=True)
+        return {"notes": self.notes}
+
+    def delete(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.notes = [one for one in self.notes if one["id"] != asked["id"]]
+        return {"notes": self.notes}
 
     def server(self, pubnub: PubNubStandIn) -> PageServer:
         return PageServer(
@@ -118,6 +135,8 @@ class Lab:
             actions={
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
                 "analyse": lambda _: {"run": "iort-1"},
+                "note": self.write,
+                "delete_note": self.delete,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
             },
         )
@@ -132,6 +151,7 @@ class Lab:
             "runs": lambda _: runs(),
             "history": history,
             "insights": insights,
+            "notes": self.answer_notes,
             "laps": laps,
             "delta": delta,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},

@@ -10,8 +10,9 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
-from tests.browser import show, until
+from tests.browser import drawn, show, until
 from tests.web.cars import SUBSCRIBE_KEY, Car
+from tests.web.lab import Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -130,6 +131,41 @@ def test_a_setting_is_checked_changed_and_reset(
     rate.fill("3")
     row.get_by_role("button", name="Set").click()
     until(lambda: "pending; in force is 10" in row.inner_text(), "the pending value")
+
+
+def test_a_note_is_written_marked_in_the_history_and_deleted(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    with lab.server(pubnub) as server:
+        page = open_page(server.invitation())
+        page.goto(
+            f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
+            "&to=2026-05-04T10:01:00.000Z&at=2026-05-04T10:00:30.000Z"
+        )
+        chart = page.locator(".history .charts .plot canvas").first
+        chart.wait_for()
+        page.locator(".scrub-at").filter(has_text="10:00:30").wait_for()
+        drawn(page)
+        before = chart.screenshot()
+        page.fill("[name=note]", "<b>hit</b> the wall")
+        page.get_by_role("button", name="Add note").click()
+        # About the cursor's time, and as text.
+        page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
+        assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
+        drawn(page)
+        assert chart.screenshot() != before
+        # A note links to its time.
+        page.goto(f"{server.url}#/insights/car-1")
+        page.locator(".insights-view .notes-list a").last.click()
+        page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
+        page.locator(".history .notes-list li").wait_for()
+        for name in ("Delete the note", "Really delete"):
+            page.locator(".history .notes-list").get_by_role("button").filter(
+                has_text=name.split()[0]
+            ).click()
+        until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
+        assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
 
 
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:

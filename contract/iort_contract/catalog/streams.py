@@ -7,7 +7,7 @@ from iort_contract.catalog.vesc import VESC
 from iort_contract.topics import PING_PATHS
 
 RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM = "rtt", "agent", "types", "account"
-LOG_STREAM, POSE_STREAM = "log", "pose"
+LOG_STREAM, POSE_STREAM, DRIVE_STREAM = "log", "pose", "drive"
 # One sample per pong, with null in the other paths' fields.
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 
@@ -56,6 +56,39 @@ CATALOG = {
                 Field("clock_uncertainty_ms", "ms", "uncertainty of the clock offset, either way"),
                 Field("files_waiting", "files", "files waiting to be uploaded"),
                 Field("files_sent_bytes", "bytes", "bytes of files sent", label="Files sent"),
+            ),
+            own=True,
+        ),
+        Stream(
+            DRIVE_STREAM,
+            "who drove the robot, and when: its motion commands; recorded and live",
+            (
+                Field("session", "", "the operator's session that sent the command"),
+                Field("by", "", "who sent it, as they say; null if they do not"),
+                Field("seq", "", "the command's number in its session"),
+                Field("sent_us", "us", "when it was sent, by the cloud's clock"),
+                Field(
+                    "outcome",
+                    "",
+                    "`accepted`, or why it was refused; `stopped` when the robot was stopped after it",
+                ),
+                Field("driver", "", "the session that drives now; null if none does"),
+                Field("driver_by", "", "who drives now"),
+                Field("lease_left_ms", "ms", "how long the driver's lease still holds"),
+                Field(
+                    "speed",
+                    "m/s",
+                    "the speed that the robot was told; null if refused",
+                    "motion",
+                    label="Speed asked for",
+                ),
+                Field(
+                    "steering",
+                    "rad",
+                    "the steering angle that it was told",
+                    "motion",
+                    label="Steering asked for",
+                ),
             ),
             own=True,
         ),

@@ -21,6 +21,7 @@ from iort_contract.messages.envelope import entries, read
 
 # Upper limits, whatever an operator asks for: a command expires, and a motion must end.
 MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
+MAX_BY_CHARACTERS = 64
 # Other robots act on fleet messages, so they expire sooner than live samples for people (LIVE_MAX_AGE_MS).
 FLEET_MAX_AGE_MS = 2_000
 
@@ -30,11 +31,12 @@ class Command:
     """A ROS message for a robot to publish.
 
     Commands are ordered by ``started_us``, ``session``, ``seq``. ``session`` names an operator's session,
-    which began at ``started_us``; ``seq`` numbers its commands. A later session takes over. The command is
+    which began at ``started_us``; ``seq`` numbers its commands, and ``by`` is who sends them. The command is
     stale ``valid_ms`` after ``sent_us``, by the cloud's clock. ``lease_ms`` limits a motion, also from
-    ``sent_us``; a motion without it is refused. ``message`` is the ROS message. With ``answer`` the robot
-    reports the result in its shadow: `COMMANDS`, name, ``session``, ``seq`` and ``outcome``, which is
-    `ACCEPTED` or the reason.
+    ``sent_us``; a motion without it is refused. While the lease of one session holds, motions of another are
+    refused, unless it is later and says ``takeover``. A session that was refused so stays refused.
+    ``message`` is the ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`,
+    name, ``session``, ``seq`` and ``outcome``, which is `ACCEPTED` or the reason.
     """
 
     session: str
@@ -45,6 +47,8 @@ class Command:
     message: Mapping[str, Any]
     lease_ms: int | None = None
     answer: bool = False
+    by: str | None = None
+    takeover: bool = False
 
     @property
     def order(self) -> tuple[int, str, int]:
@@ -97,11 +101,21 @@ def _check_fleet(fleet: FleetMessage) -> None:
     offset_entry(fleet.offset_us)
 
 
+def check_by(by: Any) -> str:
+    """Return ``by`` if it is a valid name of an operator; raises `ContractError`."""
+    if not isinstance(by, str) or not 1 <= len(by) <= MAX_BY_CHARACTERS or not by.isprintable():
+        raise ContractError(f"by must be 1 to {MAX_BY_CHARACTERS} printable characters, got {shown(by)}")
+    return by
+
+
 def _check_command(command: Command) -> None:
     checked(BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
     check_header(command.session, command.seq, 0)
-    if not isinstance(command.answer, bool):
-        raise ContractError(f"answer must be true or false, got {shown(command.answer)}")
+    for name, flag in (("answer", command.answer), ("takeover", command.takeover)):
+        if not isinstance(flag, bool):
+            raise ContractError(f"{name} must be true or false, got {shown(flag)}")
+    if command.by is not None:
+        check_by(command.by)
     if check_time(command.started_us, "started_us") > check_time(command.sent_us, "sent_us"):
         raise ContractError("the command was sent before its session started")
     for name, value, most in (

@@ -15,6 +15,7 @@ from iort_contract.messages.analysis.insights import (
     Extent,
     InsightsAnswer,
     LapsAnswer,
+    NotesAnswer,
 )
 
 
@@ -78,6 +79,12 @@ class Admitted(TypedDict):
     """Answers ``key``, once for each token; or again for the key itself."""
 
     key: str
+
+
+class ViewAnswer(TypedDict):
+    """Answers ``view``: of how many robots a live lane was asked for."""
+
+    asked: int
 
 
 class RobotPresence(TypedDict):
@@ -327,11 +334,13 @@ class Logs(TypedDict):
 
 Answer = Union[
     Admitted,
+    ViewAnswer,
     AnalysisAnswer,
     AnalysisStarted,
     InsightsAnswer,
     LapsAnswer,
     DeltaAnswer,
+    NotesAnswer,
     RobotsAnswer,
     SocketAnswer,
     TagsAnswer,

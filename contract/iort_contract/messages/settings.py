@@ -14,7 +14,10 @@ from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractErr
 from iort_contract.topics import check_stream
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
+# When the live lane sends at its full rate.
+WATCHED, ALWAYS = "watched", "always"
 FIELDS = "fields"
+MOTION_STOPPED = "motion.stopped"
 FIELD_LIST = "a list of field names; an empty one means all fields"
 
 
@@ -72,8 +75,11 @@ SETTINGS: Mapping[str, Flag | Number | Choice] = {
     "record.enabled": Flag(),
     "live.enabled": Flag(),
     "live.rate_hz": Number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, "Hz"),
+    "live.when": Choice((WATCHED, ALWAYS)),
     "ping.rate_hz": Number(0, 20, "Hz"),
     "log_level": Choice(LOG_LEVELS),
+    # The emergency stop.
+    MOTION_STOPPED: Flag(),
 }
 CHANGEABLE = (*SETTINGS, f"{FIELDS}.<stream>")
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Iterator, Mapping, NamedTuple
 
+from iort_contract.messages.driving import DriveLimits, decode_limits, encode_limits
 from iort_contract.messages.settings import FIELDS, SETTINGS
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
 from iort_contract.topics import COMMANDS
 
-REJECTED = "rejected"
+REJECTED, DRIVE = "rejected", "drive"
 # Larger than any count, and than any time of a calendar.
 _MOST = 10**15
 _SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
@@ -52,12 +53,14 @@ class Desired:
 
 @dataclass(frozen=True)
 class Reported:
-    """The settings in force and the rejected ones, by name; the newest outcome of each command."""
+    """The settings in force and the rejected ones, by name; the newest outcome of each command; what a stick
+    drives, if the robot can be driven by hand."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     rejected: Mapping[str, Rejection] = field(default_factory=dict)
     commands: Mapping[str, Outcome] = field(default_factory=dict)
     agent_version: str = ""
+    drive: DriveLimits | None = None
 
 
 def decode_desired(document: Any) -> Desired:
@@ -75,6 +78,7 @@ def decode_reported(document: Any) -> Reported:
     rejected = _mapping(found.pop(REJECTED, None))
     commands = _mapping(found.pop(COMMANDS, None))
     version = found.pop(AGENT_VERSION, "")
+    drive = decode_limits(found.pop(DRIVE, None))
     return Reported(
         dict(sorted(_flat(found))),
         {
@@ -88,6 +92,7 @@ def decode_reported(document: Any) -> Reported:
             if isinstance(one, dict) and isinstance(one.get("session"), str) and type(one.get("seq")) is int
         },
         version if isinstance(version, str) else "",
+        drive,
     )
 
 
@@ -99,6 +104,7 @@ def encode_reported(reported: Reported) -> dict[str, Any]:
         REJECTED: {name: one._asdict() for name, one in reported.rejected.items()},
         COMMANDS: {name: one._asdict() for name, one in reported.commands.items()},
         AGENT_VERSION: reported.agent_version,
+        DRIVE: encode_limits(reported.drive),
     }
 
 

@@ -4,66 +4,132 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import Any, Callable, Optional
+from dataclasses import dataclass, replace
+from typing import Any, Callable, Mapping
 
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import CommandConfig, DownlinkConfig
+from iort_agent.control.driving import drive_sample, limited
 from iort_agent.control.leases import Leases, Limits
 from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
-from iort_contract.limits import ContractError, MessageError
+from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.commands import Command, decode_command
+from iort_contract.messages.driving import NO_ROS, SETTINGS_UNKNOWN, STOPPED, DriveLimits
 from iort_contract.ros1.definition import Definition
-from iort_contract.topics import CMD
+from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)
 
-# Takes a command's name, the command, and why it was rejected (None: it passed).
-Answer = Callable[[str, Command, Optional[str]], None]
+# Between two samples of refused motions: others drive meanwhile.
+_REFUSED_S = 0.1
+
+
+@dataclass(frozen=True)
+class Operator:
+    """The operator's side of the commands.
+
+    ``answer`` takes a command's name, the command, and why it was rejected (None: it passed). ``drove`` takes
+    a sample of the stream `DRIVE_STREAM`. ``settings_known`` tells whether the operator's settings, with the
+    emergency stop, are known on this connection.
+    """
+
+    answer: Callable[[str, Command, str | None], None]
+    drove: Callable[[Mapping[str, Value]], None]
+    settings_known: Callable[[], bool]
 
 
 class _Command:
-    """The commands of one name."""
+    """The commands of one name. ``limits`` are those of a stick, if it drives this command."""
 
-    def __init__(self, name: str, config: CommandConfig, definition: Definition, skew_s: float) -> None:
-        self.name, self.config, self.definition = name, config, definition
+    def __init__(
+        self,
+        name: str,
+        config: CommandConfig,
+        definition: Definition,
+        skew_s: float,
+        limits: DriveLimits | None,
+    ) -> None:
+        self.name, self.config, self.definition, self.limits = name, config, definition, limits
         motion = config.motion
         self.leases = Leases(Limits(config.max_age_s, skew_s, motion.lease_s if motion is not None else None))
-        self.passed = self.stops = 0
+        self.passed = self.stops = self.limited = 0
         self.stopping = False
+        # When the next refused motion becomes a sample.
+        self.refused_due = 0.0
+
+    def check(self, now_us: int) -> None:
+        """Raise `ConfigError` if the stop, or what a stick drives, does not fit the ROS type."""
+        try:
+            self.stop(now_us)
+        except MessageError as error:
+            raise ConfigError(f"downlink.cmd.{self.name}.motion.stop: {error}") from error
+        if self.limits is not None:
+            try:
+                self.data(self.limits.message(0.0, 0.0), now_us)
+            except MessageError as error:
+                raise ConfigError(
+                    f"downlink.drive: {error}; downlink.cmd.{self.name}.partial must be true if the message "
+                    "has other fields"
+                ) from error
 
     def stop(self, now_us: int) -> bytes:
         fields = self.config.motion.stop if self.config.motion is not None else {}
         return encode(self.definition, fields, now_us=now_us, partial=True)
 
+    def data(self, message: Mapping[str, Any], now_us: int) -> bytes:
+        return encode(self.definition, message, now_us=now_us, partial=self.config.partial)
+
+    def sample(self, command: Command, outcome: str, now: float) -> Mapping[str, Value]:
+        left_s = self.leases.left_s(now)
+        return drive_sample(command, outcome, self.leases.driver(now), left_s, self.limits)
+
+    def report(self) -> dict[str, int]:
+        counts = {"passed": self.passed, "stops": self.stops}
+        return {**counts, "limited": self.limited} if self.limits is not None else counts
+
 
 class Commands:
     """Publishes commands that may pass, and stops when a lease ends. ``wake`` is called when a stop may be
-    due earlier; ``answer`` for each command that asks for an answer.
+    due earlier.
 
     Raises `SourceError` for a ROS type that is not installed, `ConfigError` for a stop that does not fit its
     type.
     """
 
     def __init__(
-        self, config: DownlinkConfig, bridge: Bridge, *, answer: Answer, wake: Callable[[], None]
+        self, config: DownlinkConfig, bridge: Bridge, *, operator: Operator, wake: Callable[[], None]
     ) -> None:
         self._bridge, self._graph, self._clock = bridge, bridge.graph, bridge.link.clock
-        self._answer, self._wake = answer, wake
+        self._operator, self._wake = operator, wake
         self._lock = threading.Lock()
         self._commands: dict[str, _Command] = {}
+        stick = config.drive_limits()
         for name, settings in config.cmd:
-            command = _Command(name, settings, self._graph.definition(settings.type), config.clock_skew_s)
-            try:
-                command.stop(self._clock.now_us())
-            except MessageError as error:
-                raise ConfigError(f"downlink.cmd.{name}.motion.stop: {error}") from error
+            limits = stick if stick is not None and stick.command == name else None
+            definition = self._graph.definition(settings.type)
+            command = _Command(name, settings, definition, config.clock_skew_s, limits)
+            command.check(self._clock.now_us())
             topic = bridge.link.topic(CMD, name)
             self._commands[topic] = command
             self._graph.advertise(settings.topic, settings.type)
             bridge.link.uplink.subscribe(topic, self._on_message)
         bridge.link.uplink.on_connection(self._on_connection)
+
+    def set_stopped(self, stopped: bool) -> None:  # noqa: FBT001 - a setting's value
+        """Begin or release the emergency stop of every motion."""
+        now = self._clock.monotonic()
+        with self._lock:
+            for command in self._commands.values():
+                if command.config.motion is None:
+                    continue
+                if stopped:
+                    command.leases.hold(now)
+                else:
+                    command.leases.free()
+        self.tick()
+        self._wake()
 
     def halt(self) -> None:
         """Stop all motion, and let no further command pass."""
@@ -75,12 +141,13 @@ class Commands:
     def tick(self) -> float | None:
         """Publish the stops that are due. Returns when to call again; None while nothing moves."""
         ended: set[str] = set()
+        stopped: list[Mapping[str, Value]] = []
         with self._lock:
+            now = self._clock.monotonic()
             for command in self._commands.values():
-                if command.leases.stop_due(self._clock.monotonic()):
+                if command.leases.stop_due(now):
                     if not command.stopping:
-                        _log.warning("command %s: nobody renews it, stopping", command.name)
-                    command.stopping = True
+                        stopped += self._begin_stop(command, now)
                     data = command.stop(self._clock.now_us())
                     command.stops += self._graph.publish(command.config.topic, data)
                 elif command.stopping and command.leases.next_due() is None:
@@ -94,11 +161,20 @@ class Commands:
             # Under the lock, so that no command that has just passed is released.
             for topic in ended.difference(topic for _, topic in due):
                 self._graph.release(topic)
+        for sample in stopped:
+            self._operator.drove(sample)
         return min((at for at, _ in due), default=None)
 
     def report(self) -> dict[str, Any]:
-        """The passed commands and the published stops, by name."""
-        return {one.name: {"passed": one.passed, "stops": one.stops} for one in self._commands.values()}
+        """The passed and the limited commands and the published stops, by name."""
+        return {one.name: one.report() for one in self._commands.values()}
+
+    def _begin_stop(self, command: _Command, now: float) -> list[Mapping[str, Value]]:
+        """Note that a stop begins; the sample of it, if somebody drove before."""
+        command.stopping = True
+        last = command.leases.last
+        _log.warning("command %s: %s, stopping", command.name, command.leases.why_stopped())
+        return [] if last is None else [command.sample(last, STOPPED, now)]
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - as the uplink calls it
         if connected:
@@ -116,34 +192,49 @@ class Commands:
         except ContractError as error:
             self._bridge.reject(message.topic, "malformed", str(error))
             return
-        rejection = self._offer(command, offered)
+        if command.limits is not None:
+            within, beyond = limited(offered.message, command.limits)
+            offered = replace(offered, message=within)
+            command.limited += beyond
+        rejection, sample = self._offer(command, offered)
         if rejection is not None:
             self._bridge.reject(message.topic, *rejection)
         if offered.answer:
-            self._answer(command.name, offered, rejection[1] if rejection is not None else None)
+            self._operator.answer(command.name, offered, rejection[1] if rejection is not None else None)
+        if sample is not None:
+            self._operator.drove(sample)
         self._wake()
 
-    def _offer(self, command: _Command, offered: Command) -> tuple[str, str] | None:
-        """Publish the command if it may pass; otherwise return the reason, as a word and as a text."""
+    def _offer(
+        self, command: _Command, offered: Command
+    ) -> tuple[tuple[str, str] | None, Mapping[str, Value] | None]:
+        """Publish the command if it may pass. Returns the reason if not, as a word and as a text, and the
+        sample of a motion."""
         now_us = self._clock.now_us()
         try:
-            data = encode(command.definition, offered.message, now_us=now_us, partial=command.config.partial)
+            data = command.data(offered.message, now_us)
         except MessageError as error:
-            return "malformed", str(error)
+            return ("malformed", str(error)), None
         offset = self._bridge.offset()
         uncertainty_us = None
         if offset is not None:
             now_us += round(offset.offset_ms * 1000)
             uncertainty_us = round(offset.uncertainty_ms * 1000)
+        moves = command.config.motion is not None
         with self._lock:
-            reason = command.leases.offer(
-                offered, now_us=now_us, uncertainty_us=uncertainty_us, now=self._clock.monotonic()
-            )
-            if reason is None:
-                if self._graph.publish(command.config.topic, data):
-                    command.passed += 1
-                    return None
-                reason = "no_ros"
+            now = self._clock.monotonic()
+            reason: str | None = SETTINGS_UNKNOWN
+            if not moves or self._operator.settings_known():
+                reason = command.leases.offer(offered, now_us=now_us, uncertainty_us=uncertainty_us, now=now)
+            if reason is None and not self._graph.publish(command.config.topic, data):
+                reason = NO_ROS
+            command.passed += reason is None
+            sample = None
+            if moves and (reason is None or now >= command.refused_due):
+                command.refused_due = now + _REFUSED_S if reason is not None else command.refused_due
+                sample = command.sample(offered, reason or ACCEPTED, now)
+        if reason is None:
+            return None, sample
         ago_s = (now_us - offered.sent_us) / 1e6
         by = f"to within {uncertainty_us / 1e6:.3f} s" if uncertainty_us is not None else "by its own clock"
-        return reason, f"{reason.replace('_', ' ')}, sent {ago_s:.3f} s ago, {by}"
+        return (reason, f"{reason.replace('_', ' ')}, sent {ago_s:.3f} s ago, {by}"), sample

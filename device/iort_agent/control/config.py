@@ -6,6 +6,7 @@ downlink:
       topic: /drive
       type: ackermann_msgs/AckermannDriveStamped
       motion: {lease_s: 0.5, stop: {drive: {speed: 0.0}}}
+  drive: {command: drive}                 # what a stick on the page or `iort drive` drives, and its limits
   ask:                                    # the service /iort/ask/calibration, and topics of that name
     calibration: {}
   fleet:                                  # fleet/<namespace>/+/<name>, of all other robots
@@ -21,13 +22,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Mapping
 
-from iort_agent.common.schema import Place, Rule, existing_path, flag, number, pairs, section, setting, text
+from iort_agent.common.schema import (
+    Place,
+    Rule,
+    allowed,
+    existing_path,
+    flag,
+    number,
+    pairs,
+    section,
+    setting,
+    text,
+)
 from iort_agent.errors import AskError
 from iort_agent.sources.ros1 import ros_name
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.ask import INVALID, MAX_ASK_MS
 from iort_contract.messages.commands import FLEET_MAX_AGE_MS, MAX_LEASE_MS, MAX_VALID_MS
+from iort_contract.messages.driving import DriveLimits, check_limits, check_path
+from iort_contract.messages.settings import MOTION_STOPPED, SETTINGS
 from iort_contract.topics import check_stream
 
 ROBOT_IN_TOPIC = "{robot}"
@@ -79,6 +93,22 @@ class CommandConfig:
     motion: MotionConfig | None = setting(section(MotionConfig), default=None)
 
 
+def _path(value: str) -> str:
+    return check_path(value, "field")
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """The motion command that an operator's stick drives. ``speed`` and ``steering`` are
+    fields of its ROS message. Both are limited in every command of this name, to either side."""
+
+    command: str = setting(text(check_stream), "drive")
+    speed: str = setting(text(_path), "drive.speed")
+    steering: str = setting(text(_path), "drive.steering_angle")
+    max_speed_mps: float = setting(number(0.01, 100, unit="m/s"), 2.0)
+    max_steering_rad: float = setting(number(0.01, 10, unit="rad"), 0.4)
+
+
 @dataclass(frozen=True)
 class FleetConfig:
     """The ROS topic for other robots' messages of one name. ``{robot}`` in it becomes the robot's name, with
@@ -122,12 +152,21 @@ _FLEET = "a mapping of name to ROS topic and type"
 
 
 @dataclass(frozen=True)
+class MotionState:
+    """Motion by commands. If it is ``stopped``, the robot starts in an emergency stop, which an operator
+    releases."""
+
+    stopped: bool = setting(allowed(SETTINGS[MOTION_STOPPED]), default=False)
+
+
+@dataclass(frozen=True)
 class DownlinkConfig:
     """The ROS topics of received messages. An operator's clock may be ahead by ``clock_skew_s``."""
 
     cmd: tuple[tuple[str, CommandConfig], ...] = setting(
         pairs(section(CommandConfig), what=_COMMANDS, key=_STREAM), ()
     )
+    drive: DriveConfig | None = setting(section(DriveConfig), default=None)
     fleet: tuple[tuple[str, FleetConfig], ...] = setting(
         pairs(section(FleetConfig), what=_FLEET, key=_STREAM), ()
     )
@@ -135,6 +174,29 @@ class DownlinkConfig:
         pairs(section(AskConfig), what="a mapping of question to its settings", key=text(_question)), ()
     )
     clock_skew_s: float = setting(number(0, 60, unit="s"), 1.0)
+
+    def moves(self) -> bool:
+        """Whether a command moves the robot."""
+        return any(command.motion is not None for _, command in self.cmd)
+
+    def drive_limits(self) -> DriveLimits | None:
+        """What a stick drives; None if nothing. Raises `ContractError` if the command is no motion."""
+        drive = self.drive
+        if drive is None:
+            return None
+        command = dict(self.cmd).get(drive.command)
+        if command is None or command.motion is None:
+            raise ContractError(f"command must be one of downlink.cmd with motion, got {drive.command}")
+        return check_limits(
+            DriveLimits(
+                drive.command,
+                drive.speed,
+                drive.steering,
+                drive.max_speed_mps,
+                drive.max_steering_rad,
+                round(command.motion.lease_s * 1000),
+            )
+        )
 
 
 def share_rule() -> Rule:

@@ -11,7 +11,7 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.control.asks import Asks
 from iort_agent.control.bridge import Bridge
-from iort_agent.control.commands import Answer, Commands
+from iort_agent.control.commands import Commands, Operator
 from iort_agent.control.config import DownlinkConfig, ShareConfig
 from iort_agent.control.peers import Peers
 from iort_agent.control.questions import Questions
@@ -44,7 +44,7 @@ class Downlink:
         boot: str,
         graph: Graph,
         offset: Callable[[], ClockOffset | None],
-        answer: Answer,
+        operator: Operator,
         questions: Questions | None = None,
     ) -> None:
         self._clock, self._graph = link.clock, graph
@@ -52,7 +52,7 @@ class Downlink:
         self._thread = threading.Thread(target=self._run, name="downlink", daemon=True)
         self._rejections = ThrottledLog(_log, link.clock)
         bridge = Bridge(link, graph, offset, self._rejections)
-        self._commands = Commands(config, bridge, answer=answer, wake=self._wake.set)
+        self._commands = Commands(config, bridge, operator=operator, wake=self._wake.set)
         self._peers = Peers(config, bridge)
         self._shares = Shares(share, bridge, boot=boot, wake=self._wake.set)
         self._asks = Asks(config.ask, bridge, questions) if questions is not None else None
@@ -63,6 +63,10 @@ class Downlink:
         self._thread.start()
         if self._asks is not None:
             self._asks.start()
+
+    def set_stopped(self, stopped: bool) -> None:  # noqa: FBT001 - a setting's value
+        """Begin or release the emergency stop."""
+        self._commands.set_stopped(stopped)
 
     def halt(self) -> None:
         """Stop all motion, and let no further command pass. Stops are repeated until `close`."""
@@ -122,7 +126,7 @@ def make_downlink(
     sources: Iterable[object],
     graph: Graph | None,
     offset: Callable[[], ClockOffset | None],
-    answer: Answer,
+    operator: Operator,
     uploader: Uploader | None = None,
     root_ca: Path | None = None,
 ) -> Downlink | None:
@@ -146,6 +150,6 @@ def make_downlink(
         boot=boot,
         graph=graph,
         offset=offset,
-        answer=answer,
+        operator=operator,
         questions=questions,
     )

@@ -5,6 +5,11 @@ that waited in a frozen robot, has less of its lease left, or nothing. When the 
 command, a stop is due. It is repeated a few times, because a single message may miss a node that is just
 starting. Then it ends, so that another driver (a joystick, a planner on board) is not blocked for ever.
 
+One session drives at a time: while its lease holds, another one is refused unless it takes over. A session
+that was refused so, or that an emergency stop ended, stays refused: a stick that is still held must not move
+the robot at the moment when the other driver lets go, or when the stop is released. An emergency stop is
+repeated for as long as it holds, so that it keeps its place before other drivers of the topic.
+
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
 within the uncertainty of its measured offset (`iort_agent.lanes.clock_offset`), and counts a command as old
 as it may be. Without a known offset, no motion command passes. Leases run on the monotonic clock.
@@ -12,24 +17,32 @@ as it may be. Without a known offset, no motion command passes. Leases run on th
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import NamedTuple
 
 from iort_contract.messages.commands import Command
+from iort_contract.messages.driving import (
+    BEGIN_AGAIN,
+    CLOCK_UNKNOWN,
+    CLOSED,
+    DRIVEN_BY_ANOTHER,
+    EARLY,
+    EMERGENCY_STOP,
+    LEASE_OVER,
+    NO_LEASE,
+    REPEATED,
+    STALE,
+    SUPERSEDED,
+)
 
 # Repetitions of a stop after the first one.
 STOP_REPEATS = 4
 STOP_REPEAT_S = 0.25
-
-STALE, LEASE_OVER, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED = (
-    "stale",
-    "lease_over",
-    "from_the_future",
-    "repeated_or_out_of_order",
-    "from_an_earlier_session",
-    "without_lease",
-    "clock_offset_unknown",
-    "shutting_down",
-)
+# Between the stops of an emergency stop. A multiplexer that ranks drivers forgets one after some 200 ms.
+STOP_HOLD_S = 0.1
+# Refused sessions to remember.
+_MAX_REFUSED = 64
 
 
 class Limits(NamedTuple):
@@ -45,11 +58,13 @@ class Leases:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._last: Command | None = None
-        self._closed = False
-        # The end of the current lease, and the stops still to publish.
+        # The newest command that passed.
+        self.last: Command | None = None
+        self._refused: deque[str] = deque(maxlen=_MAX_REFUSED)
+        self._closed = self._held = False
+        # The end of the current lease, and the stops still to publish: infinitely many in an emergency stop.
         self._ends: float | None = None
-        self._stops = 0
+        self._stops = 0.0
         self._next_stop = 0.0
 
     def offer(self, command: Command, *, now_us: int, uncertainty_us: int | None, now: float) -> str | None:
@@ -60,9 +75,11 @@ class Leases:
         age_us = now_us - command.sent_us + (uncertainty_us or 0)
         lease_s = self._lease_s(command, age_us)
         reason = self._rejection(command, age_us, uncertainty_us, lease_s)
+        if reason is None and lease_s is not None:
+            reason = self._other_driver(command, now)
         if reason is not None:
             return reason
-        self._last = command
+        self.last = command
         if lease_s is not None:
             self._ends = now + lease_s
             self._stops = 0
@@ -76,8 +93,36 @@ class Leases:
         if not self._stops or now < self._next_stop:
             return False
         self._stops -= 1
-        self._next_stop = now + STOP_REPEAT_S
+        self._next_stop = now + (STOP_HOLD_S if self._held else STOP_REPEAT_S)
         return True
+
+    def why_stopped(self) -> str:
+        """Why a stop begins, for a person."""
+        if self._held:
+            return "emergency stop"
+        return "the agent ends" if self._closed else "nobody renews it"
+
+    def driver(self, now: float) -> Command | None:
+        """The newest command of the session that drives now."""
+        return self.last if self.left_s(now) else None
+
+    def left_s(self, now: float) -> float:
+        """How long the lease still holds."""
+        return max(0.0, self._ends - now) if self._ends is not None else 0.0
+
+    def hold(self, now: float) -> None:
+        """The emergency stop: end the lease, and repeat the stop until `free`."""
+        if self._held or self._closed:
+            return
+        if self.last is not None:
+            self._refuse(self.last.session)
+        self._held, self._ends = True, None
+        self._stops, self._next_stop = math.inf, now
+
+    def free(self) -> None:
+        """Release the emergency stop. The car stands until a session begins that was not refused."""
+        if self._held:
+            self._held, self._stops = False, min(self._stops, STOP_REPEATS)
 
     def cut(self, now: float) -> None:
         """End the lease now: its sender cannot be heard any more."""
@@ -86,6 +131,7 @@ class Leases:
 
     def close(self, now: float) -> None:
         """End the lease now, and let no further command pass."""
+        self.free()
         self._closed = True
         self.cut(now)
 
@@ -94,6 +140,24 @@ class Leases:
         if self._ends is not None:
             return self._ends
         return self._next_stop if self._stops else None
+
+    def _refuse(self, session: str) -> None:
+        if session not in self._refused:
+            self._refused.append(session)
+
+    def _other_driver(self, command: Command, now: float) -> str | None:
+        """Why a motion that is in time may not pass beside another driver or an emergency stop."""
+        driver = self.driver(now)
+        reason = None
+        if self._held:
+            reason = EMERGENCY_STOP
+        elif driver is not None and driver.session != command.session and not command.takeover:
+            reason = DRIVEN_BY_ANOTHER
+        elif command.session in self._refused:
+            reason = BEGIN_AGAIN
+        if reason is not None:
+            self._refuse(command.session)
+        return reason
 
     def _lease_s(self, command: Command, age_us: int) -> float | None:
         """The rest of the lease; None for a command that moves nothing."""
@@ -105,7 +169,7 @@ class Leases:
     def _rejection(
         self, command: Command, age_us: int, uncertainty_us: int | None, lease_s: float | None
     ) -> str | None:
-        limits, last = self._limits, self._last
+        limits, last = self._limits, self.last
         if self._closed:
             return CLOSED
         if limits.lease_s is not None and uncertainty_us is None:

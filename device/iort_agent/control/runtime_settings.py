@@ -10,7 +10,7 @@ from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_contract.checks import check_field
-from iort_contract.messages.settings import CHANGEABLE, FIELD_LIST, FIELDS, SETTINGS
+from iort_contract.messages.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS
 from iort_contract.messages.shadow import Rejection
 from iort_contract.topics import check_stream
 
@@ -23,10 +23,13 @@ def overlay(
     in_force: RuntimeSettings,
     desired: Mapping[str, Any],
     known_fields: Mapping[str, Iterable[str]],
+    *,
+    moves: bool = True,
 ) -> tuple[RuntimeSettings, dict[str, Rejection]]:
     """The base with the desired settings, and the rejected ones by name; these keep what is ``in_force``.
 
-    ``known_fields`` holds the fields of the streams seen so far; only these can be selected.
+    ``known_fields`` holds the fields of the streams seen so far; only these can be selected. A robot that no
+    command ``moves`` must not seem to be stopped.
     """
     values: dict[str, Any] = {}
     fields = dict(base.fields)
@@ -41,6 +44,10 @@ def overlay(
                     fields[stream] = names
             elif name in SETTINGS:
                 values[attribute] = allowed(SETTINGS[name])(value, _PLACE.child(name))
+                if name == MOTION_STOPPED and value and not moves:
+                    raise _PLACE.child(name).problem(
+                        "nothing to stop: downlink.cmd has no command with motion"
+                    )
             else:
                 hint = did_you_mean(name, CHANGEABLE)
                 raise _PLACE.child(name).problem(

@@ -17,6 +17,7 @@ from iort_agent.errors import UplinkError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.messages.commands import Command
+from iort_contract.messages.driving import DriveLimits
 from iort_contract.messages.shadow import (
     Outcome,
     OverShare,
@@ -37,7 +38,8 @@ _NOT_FOUND = 404
 
 class Shadow:
     """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
-    the cloud's last report of batches that it put off."""
+    the cloud's last report of batches that it put off. ``drive`` is reported; ``moves`` tells whether the
+    robot has a motion that can be stopped."""
 
     def __init__(
         self,
@@ -47,11 +49,13 @@ class Shadow:
         apply: Callable[[RuntimeSettings], None],
         known_fields: Callable[[], Mapping[str, Any]],
         version: str,
+        drive: DriveLimits | None = None,
+        moves: bool = False,
     ) -> None:
         self._base = self.settings = base
         self._apply = apply
         self._known_fields = known_fields
-        self._agent_version = version
+        self._agent_version, self._drive, self._moves = version, drive, moves
         self._link, self._uplink, self._clock = link, link.uplink, link.clock
         prefix = f"$aws/things/{link.robot}/shadow/name/{SHADOW}"
         self._get, self._update = f"{prefix}/get", f"{prefix}/update"
@@ -67,7 +71,8 @@ class Shadow:
         self._answers: dict[str, Outcome] = {}
         # The reported part of the shadow, as far as known; None before it was fetched.
         self._reported: dict[str, Any] | None = None
-        self._version = 0
+        # The version that is followed, and the newest one that was heard of on this connection.
+        self._version = self._newest = 0
         self._fetch_at: float | None = None
         self._report_at: float | None = None
         for topic_filter, handler in self._filters.items():
@@ -89,6 +94,10 @@ class Shadow:
             else:
                 self._report_at = None
 
+    def known(self) -> bool:
+        """Whether the operator's settings are known: fetched on this connection, and no change was missed."""
+        return self._reported is not None and self._fetch_at is None
+
     def answer(self, name: str, command: Command, rejection: str | None) -> None:
         """Report the outcome of a command; only the newest of each name is kept."""
         outcome = ACCEPTED if rejection is None else _quoted(rejection)
@@ -98,14 +107,19 @@ class Shadow:
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
         self._fetch_at = self._clock.monotonic() if connected else None
         self._reported = None
+        self._newest = 0
 
     def _on_document(self, message: MqttMessage) -> None:
         """Take the whole shadow, the answer to a fetch."""
         document = _read(message)
         if document is None:
             return
-        self._fetch_at = None
-        self._version = _version(document)
+        version = _version(document)
+        if version < self._newest:
+            # A change has overtaken it.
+            self._fetch_at = self._clock.monotonic()
+            return
+        self._fetch_at, self._version = None, version
         state = _mapping(document.get("state"))
         self._desired = _mapping(state.get("desired"))
         self._reported = _mapping(state.get("reported"))
@@ -116,6 +130,10 @@ class Shadow:
         if document.get("code") != _NOT_FOUND:
             _log.warning("the shadow %s cannot be fetched: %s", SHADOW, document.get("message"))
             return
+        if self._newest:
+            # It was made meanwhile.
+            self._fetch_at = self._clock.monotonic()
+            return
         # There is no shadow yet; the first report creates it.
         self._fetch_at, self._version = None, 0
         self._desired, self._reported = {}, {}
@@ -124,10 +142,11 @@ class Shadow:
     def _on_change(self, message: MqttMessage) -> None:
         """Take an accepted change, by the operator or by ourselves."""
         document = _read(message)
-        if document is None or self._reported is None:
+        if document is None:
             return
         version = _version(document)
-        if version <= self._version:
+        self._newest = max(self._newest, version)
+        if self._reported is None or version <= self._version:
             return
         if version > self._version + 1:
             # A change was missed.
@@ -150,7 +169,9 @@ class Shadow:
         desired = decode_desired(self._desired)
         if desired.over_share is not None:
             self._note_over_share(desired.over_share)
-        settings, rejected = overlay(self._base, self.settings, desired.settings, self._known_fields())
+        settings, rejected = overlay(
+            self._base, self.settings, desired.settings, self._known_fields(), moves=self._moves
+        )
         for name, rejection in rejected.items():
             if self._rejected.get(name) != rejection:
                 _log.warning("rejected: %s", rejection.reason)
@@ -173,7 +194,9 @@ class Shadow:
     def _state(self) -> dict[str, Any]:
         rejected = {name: one._replace(value=_quoted(one.value)) for name, one in self._rejected.items()}
         settings = self.settings.by_name()
-        return encode_reported(Reported(settings, rejected, dict(self._answers), self._agent_version))
+        return encode_reported(
+            Reported(settings, rejected, dict(self._answers), self._agent_version, self._drive)
+        )
 
     def _publish(self, topic: str, payload: bytes) -> None:
         self._link.publish(topic, payload, qos=1, done=_log_error)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import getpass
 import secrets
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.commands import Command, encode_command
+from iort_contract.messages.commands import MAX_BY_CHARACTERS, Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
@@ -24,6 +25,15 @@ class Sent(NamedTuple):
     outcome: str | None
 
 
+def operator() -> str:
+    """Who sends commands from this computer: the user's name, as the computer knows it."""
+    try:
+        name = getpass.getuser()
+    except (OSError, KeyError):  # no such user, as in a container
+        name = "unknown"
+    return "".join(filter(str.isprintable, name))[:MAX_BY_CHARACTERS] or "unknown"
+
+
 def send(
     cloud: Cloud,
     robot: str,
@@ -36,8 +46,8 @@ def send(
 ) -> Sent:
     """Send a command and wait for the robot's answer, at most ``seconds``.
 
-    Every call is an operator's session of its own, which takes over from earlier ones. ``lease_ms`` is how
-    long the robot may move. Raises `UsageError` for an unknown robot and for an invalid command.
+    Every call is an operator's session of its own, which takes over from the one that drives. ``lease_ms`` is
+    how long the robot may move. Raises `UsageError` for an unknown robot and for an invalid command.
     """
     shadow = Shadow(cloud, robot)
     now_us = time.time_ns() // 1000
@@ -52,6 +62,8 @@ def send(
             message=message,
             lease_ms=lease_ms,
             answer=True,
+            by=operator(),
+            takeover=True,
         )
         payload = encode_command(command)
     except ContractError as error:

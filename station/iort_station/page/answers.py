@@ -24,7 +24,7 @@ from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.fleet import registry, tags
 from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
-from iort_station.page import insights, laps, socket
+from iort_station.page import insights, laps, notes, socket, viewing
 from iort_station.page.parameters import text, whole
 
 # No chart is wider, in points.
@@ -63,12 +63,14 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "analysis": lambda asked: insights.progress(cloud, asked),
         **laps.answers(cloud),
         **socket.answers(cloud),
+        **notes.answers(cloud),
     }
 
 
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
-    """Every action, by its name."""
+    """What everybody who reaches the page may do, by its name."""
     return {
+        "view": lambda asked: viewing.view(cloud, asked),
         "acknowledge": lambda asked: alarms.acknowledge(
             cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
         ),

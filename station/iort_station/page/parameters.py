@@ -1,4 +1,4 @@
-"""The parameters of a request to the page's server: texts, and whole numbers in a range."""
+"""The parameters of a request to the page's server: texts and numbers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,15 @@ def text(asked: Mapping[str, str], name: str) -> str:
     if not asked.get(name):
         raise StationError(f"the request must have the parameter {name}")
     return asked[name]
+
+
+def number(asked: Mapping[str, str], name: str) -> float:
+    """A number; raises `StationError`."""
+    found = text(asked, name)
+    try:
+        return float(found)
+    except ValueError as error:
+        raise StationError(f"{name} must be a number, got {found[:40]!r}") from error
 
 
 def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:

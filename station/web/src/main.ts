@@ -1,6 +1,6 @@
 // The page: listens to the whole fleet, shows one view of it, and costs nothing while hidden.
 
-import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
+import { FIELD_TABLE, LIVE_MAX_RATE_HZ, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
 import { invited } from "./server/admission";
 import { load } from "./server/config";
@@ -10,6 +10,7 @@ import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
 import { observer } from "./live/observer";
+import { GLANCE_HZ, NONE, Viewing, type Looks } from "./link/viewing";
 import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
@@ -33,6 +34,7 @@ class Page {
   private readonly fleet: Fleet;
   private readonly feed: Feed;
   private readonly registry: Registry;
+  private readonly viewing: Viewing;
   private readonly waiting: Waiting;
   private readonly bar: StatusBar;
   private readonly fleetView: FleetView;
@@ -59,9 +61,10 @@ class Page {
       this.clockAt = -Infinity;
     });
     this.registry = new Registry(config);
+    this.viewing = new Viewing(config);
     this.waiting = new Waiting(config, this.registry);
     const alarms = new Alarms(config, this.fleet, table);
-    this.bar = new StatusBar(config, this.fleet, alarms, table);
+    this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
     this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
@@ -99,11 +102,19 @@ class Page {
     if (this.route.view === "insights") this.insightsView.show(this.route.robot, this.route.query);
     else this.insightsView.leave();
     this.cloudWatchView.show(view === "cloudwatch");
+    this.viewing.look(this.looks());
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
     if (this.route.view === "car") this.carView.open(this.route.robot, this.route.query);
     else this.carView.open(undefined);
     this.arrange();
+  }
+
+  /** The cars that the viewer sees, and how closely: alarms, the past and dashboards need no more than a car sends by itself. */
+  private looks(): Looks {
+    if (this.route.view === "car") return new Map([[this.route.robot, LIVE_MAX_RATE_HZ]]);
+    if (this.route.view === "history") return new Map([[this.route.robot, GLANCE_HZ]]);
+    return this.route.view === "fleet" ? new Map(this.fleetView.looked.map((robot) => [robot, GLANCE_HZ])) : NONE;
   }
 
   /** Called for a new car, a new stream and another view. */
@@ -164,6 +175,7 @@ class Page {
     }
     if (at - this.clockAt < CLOCK_S) return;
     this.clockAt = at;
+    this.viewing.look(this.looks());
     const linked = this.feed.state.kind === "live";
     this.bar.clock(at, this.feed.state);
     if (document.body.dataset["empty"] === "true") this.waiting.show("robot" in this.route ? this.route.robot : undefined);

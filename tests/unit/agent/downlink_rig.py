@@ -11,11 +11,13 @@ from typing import Any
 
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
+from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.trigger import OnTrigger
+from iort_contract.limits import Value
 from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
 from tests.agent_fakes import Loopback, ManualClock, link_of
@@ -134,6 +136,8 @@ class Rig:
         self.uplink = uplink or Loopback(self.clock, self.dispatcher)
         self.graph = FakeGraph()
         self.answers: list[tuple[str, int, str | None]] = []
+        self.drove: list[Mapping[str, Value]] = []
+        self.settings_known = True
         self.offset: ClockOffset | None = ClockOffset(0.0, 0.0)
         where = Place(Path("car.yaml"))
         self.downlink = Downlink(
@@ -143,7 +147,11 @@ class Rig:
             boot="0badcafe",
             graph=graph or self.graph,
             offset=lambda: self.offset,
-            answer=lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
+            operator=Operator(
+                lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
+                self.drove.append,
+                lambda: self.settings_known,
+            ),
         )
         if uplink is None:
             self.uplink.connect()

@@ -8,20 +8,20 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from iort_agent.control.leases import (
+from iort_agent.control.leases import STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS, Leases, Limits
+from iort_contract.messages.commands import Command
+from iort_contract.messages.driving import (
+    BEGIN_AGAIN,
     CLOSED,
+    DRIVEN_BY_ANOTHER,
     EARLY,
+    EMERGENCY_STOP,
     LEASE_OVER,
     NO_LEASE,
     REPEATED,
     STALE,
-    STOP_REPEAT_S,
-    STOP_REPEATS,
     SUPERSEDED,
-    Leases,
-    Limits,
 )
-from iort_contract.messages.commands import Command
 
 T0 = 1_700_000_000_000_000
 LIMITS = Limits(max_age_s=1.0, max_ahead_s=0.5, lease_s=0.5)
@@ -58,7 +58,10 @@ def test_a_single_command(changes: dict[str, Any], refusal: str | None) -> None:
 
 def test_only_a_later_command_passes() -> None:
     leases = Leases(LIMITS)
-    later, earlier = {"started_us": T0, "session": "1badcafe"}, {"started_us": T0 - 1_000_000}
+    later, earlier = (
+        {"started_us": T0, "session": "1badcafe", "takeover": True},
+        {"started_us": T0 - 1_000_000},
+    )
     offers: list[tuple[int, dict[str, Any], str | None]] = [
         (5, earlier, None),
         (5, earlier, REPEATED),
@@ -70,6 +73,59 @@ def test_only_a_later_command_passes() -> None:
     ]
     for seq, session, refusal in offers:
         assert leases.offer(command(seq, **session), now_us=T0, uncertainty_us=0, now=0) == refusal
+
+
+def offered(leases: Leases, session: str, now: float = 0.0, **changes: Any) -> str | None:
+    started_us = T0 - 1_000_000 + int(session[0], 16)
+    one = command(session=session, started_us=started_us, sent_us=T0 + round(now * 1e6), **changes)
+    return leases.offer(one, now_us=T0 + round(now * 1e6), uncertainty_us=0, now=now)
+
+
+A, B, C = "aaaaaaaa", "bbbbbbbb", "cccccccc"
+
+
+def test_one_session_drives_until_another_takes_over() -> None:
+    leases = Leases(LIMITS)
+    assert offered(leases, A, seq=0) is None
+    assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
+    assert offered(leases, C, seq=0, takeover=True) is None
+    assert offered(leases, A, seq=1) == SUPERSEDED
+    driver = leases.driver(0.2)
+    assert (driver.session if driver else None, leases.left_s(0.2)) == (C, pytest.approx(0.1))
+    assert leases.driver(0.3) is None
+
+
+def test_a_stick_held_while_another_drove_moves_nothing_when_that_one_lets_go() -> None:
+    leases = Leases(LIMITS)
+    assert offered(leases, A, seq=0) is None
+    assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
+    assert offered(leases, B, 0.4, seq=1) == BEGIN_AGAIN
+    assert offered(leases, B, 0.4, seq=2, takeover=True) == BEGIN_AGAIN
+    assert offered(leases, C, 0.4, seq=0) is None, "the next press of the same driver"
+
+
+def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -> None:
+    leases = Leases(LIMITS)
+    assert offered(leases, A, seq=0) is None
+    leases.hold(0.1)
+    assert leases.driver(0.1) is None
+    assert len(stops(leases, 0.95)) == pytest.approx(0.85 / STOP_HOLD_S, abs=1)
+    assert offered(leases, A, 1.0, seq=1) == EMERGENCY_STOP
+    assert offered(leases, B, 1.0, seq=0, takeover=True) == EMERGENCY_STOP
+    leases.free()
+    assert offered(leases, A, 1.1, seq=2) == BEGIN_AGAIN
+    assert offered(leases, B, 1.1, seq=1, takeover=True) == BEGIN_AGAIN
+    assert offered(leases, C, 1.2, seq=0) is None
+
+
+def test_a_released_emergency_stop_ends_after_a_few_stops_and_so_does_a_closed_one() -> None:
+    for end in (Leases.free, lambda leases: leases.close(0.0)):
+        leases = Leases(LIMITS)
+        leases.hold(0.0)
+        assert leases.stop_due(0.0)
+        end(leases)
+        assert len(stops(leases, 10)) == STOP_REPEATS
+        assert leases.next_due() is None
 
 
 def test_a_command_without_motion_needs_no_lease_and_no_stop() -> None:
@@ -144,6 +200,7 @@ COMMANDS = st.builds(
     seq=st.integers(0, 6),
     session=st.sampled_from(["0badcafe", "1badcafe"]),
     started_us=st.sampled_from([T0 - 1_000_000, T0 - 2_000_000]),
+    takeover=st.booleans(),
     sent_us=st.integers(T0 - 3_000_000, T0 + 3_000_000),
     valid_ms=st.integers(1, 3000),
     lease_ms=st.one_of(st.none(), st.integers(1, 2000)),
@@ -152,7 +209,7 @@ EVENTS = st.lists(
     st.one_of(
         COMMANDS,
         st.floats(0, 1, allow_nan=False),  # time passes
-        st.sampled_from(["cut", "close", "back", "forth"]),  # the wall clock may jump
+        st.sampled_from(["cut", "close", "back", "forth", "hold", "free"]),  # the wall clock may jump
         # The uncertainty of the clock offset from now on.
         st.tuples(st.one_of(st.none(), st.integers(0, 500_000))),
     ),
@@ -169,60 +226,91 @@ def left_s(motion: Command, latest_us: int) -> float:
     return left
 
 
+class Model:
+    """The leases, and what must be true of them."""
+
+    def __init__(self) -> None:
+        self.leases = Leases(LIMITS)
+        self.now, self.offset_us = 0.0, 0
+        self.uncertainty_us: int | None = 0
+        self.closed = self.held = False
+        self.passed: list[Command] = []
+        self.refused: set[str] = set()  # sessions that an emergency stop ended
+        self.moving_until: float | None = None  # the last motion's end
+
+    def tick(self) -> None:
+        due = self.leases.next_due()
+        said = self.leases.stop_due(self.now)
+        assert said == (due is not None and due <= self.now)
+        assert due is not None or not self.held, "an emergency stop goes on"
+        if self.moving_until is not None and self.now >= self.moving_until:
+            assert said, "a stop follows the last motion by the first tick after its lease"
+            self.moving_until = None
+        elif said:
+            assert self.moving_until is None, "nothing stops a motion whose lease holds"
+
+    def wait(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end:
+            self.now = min(end, self.now + TICK)
+            self.tick()
+
+    def end(self, how: str) -> None:
+        if how == "hold":
+            self.leases.hold(self.now)
+            if not self.closed:
+                self.held = True
+                self.refused |= {one.session for one in self.passed[-1:]}
+        else:
+            (self.leases.close if how == "close" else self.leases.cut)(self.now)
+            self.closed = self.closed or how == "close"
+            self.held = self.held and not self.closed
+        if self.moving_until is not None:
+            self.moving_until = min(self.moving_until, self.now)
+        self.tick()
+
+    def free(self) -> None:
+        self.leases.free()
+        self.held = False
+
+    def offer(self, event: Command) -> None:
+        now_us = T0 + round(self.now * 1e6) + self.offset_us
+        uncertainty_us = self.uncertainty_us
+        if self.leases.offer(event, now_us=now_us, uncertainty_us=uncertainty_us, now=self.now) is not None:
+            return
+        assert not self.closed
+        assert not self.held
+        assert uncertainty_us is not None
+        assert all(event.order > before.order for before in self.passed)
+        assert now_us + uncertainty_us - event.sent_us <= min(event.valid_ms * 1000, 1_000_000)
+        # A command is early only if it is early at every possible time.
+        assert event.sent_us - now_us - uncertainty_us <= 500_000
+        assert event.session not in self.refused
+        if self.moving_until is not None and self.now < self.moving_until:
+            assert event.takeover or event.session == self.passed[-1].session
+        self.passed.append(event)
+        self.moving_until = self.now + left_s(event, now_us + uncertainty_us)
+
+
 @given(EVENTS)
 @example([(1,), command(seq=0, sent_us=T0 + 500_001, valid_ms=1, lease_ms=1)])
 def test_the_promises_hold_for_any_events(events: list[Any]) -> None:
-    leases = Leases(LIMITS)
-    now, offset_us, closed = 0.0, 0, False
-    uncertainty_us: int | None = 0
-    passed: list[Command] = []
-    moving_until: float | None = None  # of the model: the last motion's end
-
-    def tick() -> None:
-        nonlocal moving_until
-        due = leases.next_due()
-        said = leases.stop_due(now)
-        assert said == (due is not None and due <= now)
-        if moving_until is not None and now >= moving_until:
-            assert said, "a stop follows the last motion by the first tick after its lease"
-            moving_until = None
-        elif said:
-            assert moving_until is None, "nothing stops a motion whose lease holds"
-
+    model = Model()
     for event in events:
         if isinstance(event, float):
-            end = now + event
-            while now < end:
-                now = min(end, now + TICK)
-                tick()
-        elif event == "cut":
-            leases.cut(now)
-            moving_until = None if moving_until is None else min(moving_until, now)
-            tick()
-        elif event == "close":
-            leases.close(now)
-            closed = True
-            moving_until = None if moving_until is None else min(moving_until, now)
-            tick()
+            model.wait(event)
+        elif event in ("cut", "close", "hold"):
+            model.end(event)
+        elif event == "free":
+            model.free()
         elif isinstance(event, tuple):
-            (uncertainty_us,) = event
+            (model.uncertainty_us,) = event
         elif isinstance(event, str):
-            offset_us += -3_600_000_000 if event == "back" else 3_600_000_000
+            model.offset_us += -3_600_000_000 if event == "back" else 3_600_000_000
         else:
-            now_us = T0 + round(now * 1e6) + offset_us
-            if leases.offer(event, now_us=now_us, uncertainty_us=uncertainty_us, now=now) is None:
-                assert not closed
-                assert uncertainty_us is not None
-                assert all(event.order > before.order for before in passed)
-                assert now_us + uncertainty_us - event.sent_us <= min(event.valid_ms * 1000, 1_000_000)
-                # A command is early only if it is early at every possible time.
-                assert event.sent_us - now_us - uncertainty_us <= 500_000
-                passed.append(event)
-                moving_until = now + left_s(event, now_us + uncertainty_us)
+            model.offer(event)
     # From here on nobody sends.
-    end = now + 3
-    while now < end:
-        now += TICK
-        tick()
-    assert moving_until is None
-    assert leases.next_due() is None
+    model.free()
+    model.wait(3)
+    assert model.moving_until is None
+    assert model.leases.next_due() is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from typing import Any
@@ -40,6 +41,7 @@ class Rig:
             apply=self.applied.append,
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
             version="1.2.3",
+            moves=True,
         )
         self.seen = 0
         self.uplink.connect()
@@ -90,7 +92,7 @@ def test_without_a_shadow_the_agent_creates_it() -> None:
 def test_an_earlier_desired_setting_is_applied() -> None:
     rig = Rig(live={"rate_hz": 2}, record={"enabled": False})
     assert rig.applied[-1].live_rate_hz == 2
-    assert rig.reported["live"] == {"enabled": True, "rate_hz": 2}
+    assert rig.reported["live"] == {"enabled": True, "rate_hz": 2, "when": "always"}
     assert rig.reported["record"] == {"enabled": False}
 
 
@@ -224,6 +226,49 @@ def test_a_robot_over_its_share_logs_it_once_and_does_not_reject_it(
 )
 def test_malformed_reports_about_its_share_are_ignored(said: Any) -> None:
     assert Rig(over_share=said).shadow.over_share is None
+
+
+def test_an_emergency_stop_that_overtakes_the_fetched_document_is_not_missed() -> None:
+    rig = Rig(live={"rate_hz": 2})
+    rig.uplink.cut()
+    rig.uplink.connect()
+    rig.dispatcher.run_pending()
+    rig.shadow.tick()
+    old = {"state": copy.deepcopy(rig.document), "version": rig.version}
+    rig.seen = len(rig.uplink.published)
+    rig.change({"desired": {"motion": {"stopped": True}}})
+    rig.deliver("get/accepted", old)
+    rig.dispatcher.run_pending()
+    assert not rig.shadow.known()
+    rig.settle()
+    assert rig.shadow.known()
+    assert rig.applied[-1].motion_stopped
+    assert rig.reported["motion"] == {"stopped": True}
+
+
+def test_the_settings_are_unknown_without_a_connection_and_after_a_missed_change() -> None:
+    rig = Rig()
+    assert rig.shadow.known()
+    rig.uplink.cut()
+    rig.dispatcher.run_pending()
+    assert not rig.shadow.known()
+    rig.uplink.connect()
+    rig.settle()
+    assert rig.shadow.known()
+    rig.change({"desired": {"log_level": "debug"}}, arrives=False)
+    rig.change({"desired": {"motion": {"stopped": True}}})
+    rig.dispatcher.run_pending()
+    assert not rig.shadow.known()
+    rig.settle()
+    assert rig.applied[-1].motion_stopped
+
+
+def test_a_robot_without_motion_does_not_seem_to_be_stopped() -> None:
+    desired = {"motion.stopped": True}
+    settings, rejected = overlay(BASE, BASE, desired, {}, moves=False)
+    assert not settings.motion_stopped
+    assert "nothing to stop" in rejected["motion.stopped"].reason
+    assert overlay(BASE, BASE, {"motion.stopped": False}, {}, moves=False)[1] == {}
 
 
 def test_an_unanswered_report_is_repeated() -> None:

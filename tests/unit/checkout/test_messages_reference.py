@@ -12,7 +12,7 @@ from awsiot import iotidentity
 
 from functions.echo import pong
 from iort_agent.control.runtime_settings import RuntimeSettings, overlay
-from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
+from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.ask import (
@@ -93,6 +93,8 @@ COMMAND = Command(
     message={"speed": 1.0, "steering_angle": 0.1},
     lease_ms=500,
     answer=True,
+    by="anna",
+    takeover=True,
 )
 SAID = FleetMessage(RUN, 7, T_US, {"pose": {"position": {"x": 1.5, "y": 0.0, "z": 0.0}}}, -1_500)
 PING = encode_ping(17, T_US)
@@ -153,7 +155,7 @@ SAMPLES: dict[str, accounts.Account | MessageType] = {
         "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
     ),
 }
-STREAMS = (LOG_STREAM, POSE_STREAM)
+STREAMS = (LOG_STREAM, DRIVE_STREAM, POSE_STREAM)
 SHADOW = ("desired", "reported")
 PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
 
@@ -241,6 +243,7 @@ BOUNDS = [
     ("command", "lease_ms", 10_000, 10_001, "1 to 10,000"),
     ("command", "lease_ms", 1, 0, "1 to 10,000"),
     ("command", "seq", 2**53, 2**53 + 1, "0 to 2<sup>53</sup>"),
+    ("command", "by", "a" * 64, "a" * 65, "1 to 64"),
     ("command", "seq", 0, -1, "0 to 2<sup>53</sup>"),
     ("command", "started_us", COMMAND.sent_us, COMMAND.sent_us + 1, "not after `sent_us`"),
     ("fleet", "v", 1, 2, "1"),

@@ -1,1 +1,1 @@
-"""The analysis' messages: a run, the findings it makes, and both for the page."""
+"""The analysis' messages: a run, its findings, people's notes beside them, and all of it for the page."""

@@ -1,4 +1,7 @@
-"""The messages to the live page about the analysis: findings, drives and laps. They are sent as in `page`."""
+"""The messages to the live page about the analysis: findings, drives, laps, and people's notes beside them.
+
+They are sent as in `page`.
+"""
 
 from __future__ import annotations
 
@@ -70,6 +73,22 @@ class InsightsAnswer(TypedDict):
     findings: list[FindingEntry]
     drives: list[DriveEntry]
     groups: dict[str, dict[str, ParameterEntry]]
+
+
+class NoteEntry(TypedDict):
+    """What ``by`` wrote about a robot at a time."""
+
+    id: str
+    robot: str
+    t_us: int
+    text: str
+    by: str
+
+
+class NotesAnswer(TypedDict):
+    """Answers ``notes``, ``note`` and ``delete_note``: notes about a robot or the fleet, the newest first."""
+
+    notes: list[NoteEntry]
 
 
 class AnalysisStarted(TypedDict):

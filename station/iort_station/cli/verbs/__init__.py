@@ -21,6 +21,7 @@ VERBS = {
     "data.laps": "List laps: time, distance, energy, and compare two.",
     "operations.analyse": "Analyse robots' drives in the cloud, now.",
     "data.findings": "List what the analysis found about drives.",
+    "data.note": "Write, list or delete notes about a robot.",
     "data.calibrate": "Print a car's parameters, for vesc.yaml too.",
     "operations.trace": "Measure the delay of live updates, hop by hop.",
     "page.watch": "Show every car in the terminal, live, until Ctrl-C.",

@@ -23,7 +23,7 @@ def findings(
     """Findings about drives that begin in a range, the newest first; of all robots without one."""
     found = [
         one
-        for name in _named(cloud, robot)
+        for name in named(cloud, robot)
         for one in islice(table(cloud).findings(name, start_us, end_us), most)
     ]
     return sorted(found, key=lambda one: one.id, reverse=True)[:most]
@@ -39,7 +39,7 @@ def drives(
 ) -> list[AnalysedDrive]:
     """Analysed drives that begin in a range, the newest first; of all robots without one."""
     found = [
-        one for name in _named(cloud, robot) for one in table(cloud).drives(name, start_us, end_us, most=most)
+        one for name in named(cloud, robot) for one in table(cloud).drives(name, start_us, end_us, most=most)
     ]
     return sorted(found, key=lambda one: str(one.drive), reverse=True)[:most]
 
@@ -49,7 +49,8 @@ def table(cloud: Cloud) -> FindingsTable:
     return FindingsTable(cloud.client("dynamodb"), cloud.output("storage", "FindingsTable"))
 
 
-def _named(cloud: Cloud, robot: str | None) -> Iterator[str]:
+def named(cloud: Cloud, robot: str | None) -> Iterator[str]:
+    """The robot, or every robot without one."""
     if robot is not None:
         yield robot
         return

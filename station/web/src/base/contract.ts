@@ -6,6 +6,7 @@ export const MAX_FIELD_CHARACTERS = 1024;
 export const MAX_NEXT_MS = 100000;
 export const STALE_S = 1.5;
 export const GONE_S = 4.5;
+export const LIVE_MAX_RATE_HZ = 10.0;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const LIVE = "live";
 export const VIEW = "view";
@@ -15,6 +16,11 @@ export const TACHOMETER_COUNTS = 6;
 export const ANALYSIS_FAILED = "analysis_failed";
 export const STYLE_GROUP = "Driving style";
 export const MAX_LEASE_MS = 10000;
+export const DRIVE_RATE_HZ = 20.0;
+export const DRIVE_LEASE_MS = 500;
+export const DRIVE_MAX_RTT_MS = 500;
+export const DRIVE_MAX_AGE_MS = 1000;
+export const MAX_NOTE_CHARACTERS = 500;
 export const LEASE = "lease";
 export const VIEW_LEASE_MS = 15000;
 export const VIEW_RENEW_S = 5.0;
@@ -22,6 +28,23 @@ export const KEY_HEADER = "X-Iort-Key";
 export const INVITATION = "key";
 export const POSE_STREAM = "pose";
 export const LOG_STREAM = "log";
+export const DRIVE_STREAM = "drive";
+export const REFUSALS = {
+  "driven_by_another": "another session drives; begin a new one that takes over",
+  "emergency_stop": "the robot is stopped until somebody releases it",
+  "begin_again": "this session was refused before, or a stop ended it; let go, and begin a new one",
+  "from_an_earlier_session": "a later session has driven since",
+  "repeated_or_out_of_order": "a later command of the session has passed",
+  "settings_unknown": "the robot has just connected, and does not know yet whether it must stand still",
+  "clock_offset_unknown": "the robot does not know the cloud's time yet",
+  "lease_over": "the command's lease had ended when it came",
+  "stale": "the command was too old when it came",
+  "from_the_future": "the command's time lies in the future: the sender's clock is wrong",
+  "without_lease": "a motion needs `lease_ms`",
+  "guard_not_ready": "the process that stops the robot if the agent dies is not running yet",
+  "no_ros": "the agent is not in the ROS graph",
+  "shutting_down": "the agent is ending"
+} as const;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
 export const CAR_ALARMS = {
@@ -252,6 +275,50 @@ export const FIELD_TABLE: FieldTable = {
         "unit": "lines",
         "meaning": "lines that were too many to send, since the line before"
       }
+    },
+    "drive": {
+      "session": {
+        "unit": "",
+        "meaning": "the operator's session that sent the command"
+      },
+      "by": {
+        "unit": "",
+        "meaning": "who sent it, as they say; null if they do not"
+      },
+      "seq": {
+        "unit": "",
+        "meaning": "the command's number in its session"
+      },
+      "sent_us": {
+        "unit": "us",
+        "meaning": "when it was sent, by the cloud's clock"
+      },
+      "outcome": {
+        "unit": "",
+        "meaning": "`accepted`, or why it was refused; `stopped` when the robot was stopped after it"
+      },
+      "driver": {
+        "unit": "",
+        "meaning": "the session that drives now; null if none does"
+      },
+      "driver_by": {
+        "unit": "",
+        "meaning": "who drives now"
+      },
+      "lease_left_ms": {
+        "unit": "ms",
+        "meaning": "how long the driver's lease still holds"
+      },
+      "speed": {
+        "unit": "m/s",
+        "meaning": "the speed that the robot was told; null if refused",
+        "label": "Speed asked for"
+      },
+      "steering": {
+        "unit": "rad",
+        "meaning": "the steering angle that it was told",
+        "label": "Steering asked for"
+      }
     }
   },
   "ros_units": {
@@ -383,6 +450,20 @@ export interface InsightsAnswer {
   readonly groups: Readonly<Record<string, Readonly<Record<string, ParameterEntry>>>>;
 }
 
+/** What ``by`` wrote about a robot at a time. */
+export interface NoteEntry {
+  readonly id: string;
+  readonly robot: string;
+  readonly t_us: number;
+  readonly text: string;
+  readonly by: string;
+}
+
+/** Answers ``notes``, ``note`` and ``delete_note``: notes about a robot or the fleet, the newest first. */
+export interface NotesAnswer {
+  readonly notes: readonly NoteEntry[];
+}
+
 /** Answers ``analyse``: the run of the analysis. */
 export interface AnalysisStarted {
   readonly run: string;
@@ -472,6 +553,11 @@ export interface SocketAnswer {
 /** Answers ``key``, once for each token; or again for the key itself. */
 export interface Admitted {
   readonly key: string;
+}
+
+/** Answers ``view``: of how many robots a live lane was asked for. */
+export interface ViewAnswer {
+  readonly asked: number;
 }
 
 /** Whether a robot is connected, and since when it is or is not; null if it never was. */

@@ -98,7 +98,7 @@ export class StreamSection {
   clock(now: number, charted: ReadonlySet<string>): void {
     const { stream } = this;
     const old = now - stream.takenAt;
-    setAttribute(this.node, "data-stale", String(old > STALE_S));
+    setAttribute(this.node, "data-stale", String(old > STALE_S + stream.silent_s));
     const rate = `${stream.rate(now).toFixed(1)} Hz`;
     this.facts.set(`${old > STALE_S ? `${age(old)} old` : rate} · message ${stream.seq} of run ${stream.boot.slice(0, 8)}`);
     for (const [field, tile] of this.tiles) {

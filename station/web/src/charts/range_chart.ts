@@ -18,6 +18,12 @@ export interface Curve {
   readonly points?: boolean;
 }
 
+/** A place on the x axis with a short label. */
+export interface Mark {
+  readonly at: number;
+  readonly label: string;
+}
+
 /** What a viewer does on a chart. Without it the chart only has a cursor. */
 export interface Hands {
   /** The viewer has dragged over a range. */
@@ -59,8 +65,10 @@ export class RangeChart {
   private readonly themed: () => void;
   private palette: string[] = [];
   private paint = paint();
+  private marked = { line: "", label: "" };
   private range: Range;
   private hole_s: number;
+  private marks: readonly Mark[] = [];
 
   constructor(host: HTMLElement, options: RangeChartOptions, data: uPlot.AlignedData, range: Range) {
     this.range = range;
@@ -68,6 +76,7 @@ export class RangeChart {
     const read = (): void => {
       this.palette = options.curves.map((curve) => colour(curve.colour));
       this.paint = paint();
+      this.marked = { line: colour("--accent"), label: colour("--panel") };
     };
     read();
     const colours = () => this.paint;
@@ -108,6 +117,7 @@ export class RangeChart {
         hooks: {
           setCursor: [(plot) => options.onCursor?.(plot.cursor.idx ?? null)],
           setSelect: [(plot) => this.selected(plot, hands)],
+          draw: [(plot) => this.drawMarks(plot)],
         },
       },
       data,
@@ -145,6 +155,12 @@ export class RangeChart {
     this.spoken.changed();
   }
 
+  /** Draw a line with its label at each of these places. */
+  mark(marks: readonly Mark[]): void {
+    this.marks = marks;
+    this.plot.redraw(false);
+  }
+
   /** Put the cursor on a row. */
   point(index: number): void {
     // After uPlot has drawn new data or another range, in a microtask of its own.
@@ -176,6 +192,25 @@ export class RangeChart {
     over.addEventListener("click", (event) => Math.abs(event.clientX - at) < LEAST_DRAG_PX && hands.pick());
     over.addEventListener("dblclick", () => hands.back());
     gestures(over, { range: () => this.range, move: hands.move });
+  }
+
+  private drawMarks({ ctx, bbox, valToPos }: uPlot): void {
+    const size = rem(0.8) * devicePixelRatio;
+    ctx.save();
+    ctx.font = `600 ${Math.round(size * 0.9)}px ${getComputedStyle(document.body).fontFamily}`;
+    ctx.textAlign = "center";
+    ctx.textBaseline = "top";
+    for (const { at, label } of this.marks) {
+      const x = Math.round(valToPos(at, "x", true));
+      if (x < bbox.left || x > bbox.left + bbox.width) continue;
+      ctx.fillStyle = this.marked.line;
+      ctx.fillRect(x, bbox.top, Math.max(1, devicePixelRatio), bbox.height);
+      const width = ctx.measureText(label).width + size * 0.6;
+      ctx.fillRect(x - width / 2, bbox.top, width, size * 1.1);
+      ctx.fillStyle = this.marked.label;
+      ctx.fillText(label, x, bbox.top + size * 0.12);
+    }
+    ctx.restore();
   }
 
   private selected(plot: uPlot, hands: Hands | undefined): void {

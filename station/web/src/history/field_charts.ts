@@ -4,7 +4,7 @@ import type { HistoryAnswer } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
 import { linear, number, write, type Spec } from "../base/format";
 import type { Range } from "../base/range";
-import { RangeChart, type Hands } from "../charts/range_chart";
+import { RangeChart, type Hands, type Mark } from "../charts/range_chart";
 
 const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
 const FIRST_CHARTS = 6;
@@ -33,6 +33,7 @@ export class FieldCharts {
   private readonly shown = new Map<string, Shown>();
   private drive: HistoryAnswer | undefined;
   private range: Range = [0, 1];
+  private marks: readonly Mark[] = [];
 
   constructor(private readonly options: FieldChartsOptions) {}
 
@@ -74,6 +75,12 @@ export class FieldCharts {
   move(range: Range): void {
     this.range = range;
     for (const { chart } of this.shown.values()) chart.move(range);
+  }
+
+  /** Mark times on every chart. */
+  mark(marks: readonly Mark[]): void {
+    this.marks = marks;
+    for (const { chart } of this.shown.values()) chart.mark(marks);
   }
 
   point(index: number): void {
@@ -119,6 +126,7 @@ export class FieldCharts {
     const about = { title: label, write: (value: number) => `${number(value, digits)} ${unit}` };
     const options = { about, curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
     const shown = { node, chart: new RangeChart(plot, options, data, this.range), band, reading, extent };
+    shown.chart.mark(this.marks);
     this.shown.set(field, shown);
     return shown;
   }

@@ -4,7 +4,7 @@ import type { FieldTable, HistoryAnswer } from "../base/contract";
 import { el } from "../base/dom";
 import { asSpeed, spec, type Spec } from "../base/format";
 import type { Range } from "../base/range";
-import type { Hands } from "../charts/range_chart";
+import type { Hands, Mark } from "../charts/range_chart";
 import type { Fleet } from "../live/fleet";
 import { Comparison } from "../widgets/comparison";
 import { Download } from "./download";
@@ -81,6 +81,11 @@ export class Result {
   /** Show another range of the same samples. */
   move(range: Range): void {
     this.charts.move(range);
+  }
+
+  /** Mark times on the charts. */
+  mark(marks: readonly Mark[]): void {
+    this.charts.mark(marks);
   }
 
   stop(): void {

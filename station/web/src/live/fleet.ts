@@ -54,9 +54,7 @@ export class Fleet {
       this.outOfOrder += 1;
       return;
     }
-    robot.heardAt = at;
-    robot.takenAt = Math.max(...[...robot.streams.values()].map((each) => each.takenAt));
-    robot.version += 1;
+    robot.heard(at);
     robot.logFault(stream, this.table, at);
     robot.logLine(stream);
     const { received_ms, lambda_us, offset_us } = update.hops;

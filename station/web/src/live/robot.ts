@@ -6,7 +6,8 @@ import { lineOf, type Line } from "./lines";
 import { Ring } from "./ring";
 import type { Stream } from "./stream";
 
-export type Freshness = "live" | "stale" | "gone";
+/** An idle car's values are as new as it said that they would be: it sends less while nobody looks. */
+export type Freshness = "live" | "idle" | "stale" | "gone";
 
 /** A message's hops, in the order of the columns of `Robot.delays` after arrival and total. */
 export const LEGS = ["car", "toCloud", "toLambda", "toPubNub", "toPage"] as const;
@@ -33,6 +34,9 @@ export class Robot {
   readonly lines: Line[] = [];
   heardAt = -Infinity;
   takenAt = -Infinity;
+  /** Until then the car may be silent, and its newest values old. */
+  private silentUntil = -Infinity;
+  private freshUntil = -Infinity;
   version = 0;
 
   constructor(readonly name: string) {}
@@ -44,9 +48,25 @@ export class Robot {
     for (const stream of this.streams.values()) stream.watch(watched);
   }
 
+  /** Note that a stream has a newer sample. */
+  heard(at: number): void {
+    const streams = [...this.streams.values()];
+    this.heardAt = at;
+    this.takenAt = Math.max(...streams.map((each) => each.takenAt));
+    this.silentUntil = Math.max(...streams.map((each) => each.heardAt + each.silent_s));
+    this.freshUntil = Math.max(...streams.map((each) => each.takenAt + each.silent_s));
+    this.version += 1;
+  }
+
+  /** For how long the car has been silent, beyond what it said. */
+  overdue_s(now: number): number {
+    return now - this.silentUntil;
+  }
+
   freshness(now: number): Freshness {
-    if (now - this.heardAt > GONE_S) return "gone";
-    return now - this.takenAt > STALE_S ? "stale" : "live";
+    if (this.overdue_s(now) > GONE_S) return "gone";
+    if (now - this.freshUntil > STALE_S) return "stale";
+    return now - this.takenAt > STALE_S ? "idle" : "live";
   }
 
   /** The stream of the motor controller, if the car has one. */

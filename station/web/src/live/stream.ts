@@ -48,6 +48,8 @@ export class Stream {
   /** The newest sample's time on the page's clock, as if it were as fast as the fastest message. */
   takenAt = -Infinity;
   heardAt = -Infinity;
+  /** How long the stream may be silent after its newest sample, by what that says. */
+  silent_s = 0;
   received = 0;
   /** Grows with every newer sample. */
   version = 0;
@@ -132,6 +134,7 @@ export class Stream {
     const t = update.t_us / 1e6;
     this.takenAt = Math.min(now, t + this.offset.take(now - t, now));
     this.heardAt = now;
+    this.silent_s = update.next_ms / 1000;
     this.received += 1;
     this.version += 1;
     this.arrivals.push([now]);

@@ -16,10 +16,13 @@ export async function ask<T>(name: string, parameters: Parameters, signal?: Abor
   return (await answer.json()) as T;
 }
 
-/** Have the server change something; throws `AnswerError` if it does not, or if the change is refused. */
-export async function act<T>(name: string, parameters: Parameters): Promise<T> {
+/**
+ * Have the server change something, with `keepalive` even if the page is closed meanwhile. Throws `AnswerError` if it
+ * does not, or if the change is refused.
+ */
+export async function act<T>(name: string, parameters: Parameters, keepalive = false): Promise<T> {
   const headers = { "Content-Type": "application/json", [KEY_HEADER]: kept(KEPT_KEY) ?? "" };
-  const answer = await answered(`${name}.json`, { method: "POST", headers, body: JSON.stringify(parameters) });
+  const answer = await answered(`${name}.json`, { method: "POST", keepalive, headers, body: JSON.stringify(parameters) });
   return (await answer.json()) as T;
 }
 

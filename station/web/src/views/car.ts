@@ -15,6 +15,7 @@ import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
+import { NotesPanel } from "../widgets/notes_panel";
 import { Commands } from "../car/commands";
 import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
@@ -40,6 +41,7 @@ export class CarView {
   private readonly commands = new Commands();
   private readonly settings = new Settings();
   private readonly log: AgentLog;
+  private readonly notes: NotesPanel;
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
@@ -60,6 +62,7 @@ export class CarView {
   ) {
     this.past = new Past(config);
     this.log = new AgentLog(config);
+    this.notes = new NotesPanel(config);
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     this.board = new Board(table, config.track, () => this.tools.arranged());
@@ -74,7 +77,7 @@ export class CarView {
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note" }, ONLY_LOOK)] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note" }, ONLY_LOOK)] : []))),
       this.streams,
     );
   }
@@ -96,6 +99,7 @@ export class CarView {
     this.commands.of(name);
     this.settings.of(name);
     this.log.of(name);
+    void this.notes.show(name);
     this.tools.read(query);
     this.drawn = -1;
   }
@@ -174,6 +178,7 @@ export class CarView {
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
     const texts = {
       live: "live",
+      idle: `idle: newest values are ${age(now - robot.takenAt)} old`,
       stale: `stale: newest values are ${age(now - robot.takenAt)} old`,
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };

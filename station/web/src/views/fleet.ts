@@ -14,6 +14,8 @@ import { OfflineCars } from "../widgets/offline_cars";
 const FOLD_S = 60;
 // Cards change places at most this often, and never under the viewer's pointer or keyboard.
 const PLACE_S = 2;
+// A car that is asked sends its newest sample at once, and then has a card.
+const MOST_UNHEARD = 50;
 
 export class FleetView {
   readonly node: HTMLElement;
@@ -80,6 +82,12 @@ export class FleetView {
     this.refresh();
   }
 
+  /** The cars whose cards are on the screen; and those that are connected and have not been heard yet. */
+  get looked(): string[] {
+    const unheard = Object.entries(this.registry.robots ?? {}).filter(([name, { online }]) => online && !this.fleet.robots.has(name));
+    return [...this.seen, ...unheard.slice(0, MOST_UNHEARD).map(([name]) => name)];
+  }
+
   /** Arrow keys move between the cards, which are links: Enter opens one. A slash searches. */
   key(event: KeyboardEvent): void {
     const field = event.target instanceof Element && event.target.matches("input, select");
@@ -103,7 +111,7 @@ export class FleetView {
       if (!this.fleet.robots.has(name)) this.remove(card);
     }
     const found = [...this.fleet.robots.values()].filter(({ name }) => this.tools.finds(name));
-    const folded = (robot: Robot): boolean => now - robot.heardAt > FOLD_S;
+    const folded = (robot: Robot): boolean => robot.overdue_s(now) > FOLD_S;
     const nodes: HTMLElement[] = [];
     for (const [heading, robots] of this.tools.arrange(found.filter((robot) => !folded(robot)), now)) {
       if (heading !== "") nodes.push(this.heading(heading, robots.length));

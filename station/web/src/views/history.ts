@@ -10,6 +10,7 @@ import { fromArchive } from "../history/origin";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import type { Fleet } from "../live/fleet";
+import { NotesPanel } from "../widgets/notes_panel";
 import { ask, AnswerError } from "../server/answers";
 
 // What is shown first, unless nothing was stored in it.
@@ -28,6 +29,7 @@ export class HistoryView {
   private readonly form: RangeForm;
   private readonly runs = new RunsList((before_us) => void this.findRuns(before_us));
   private readonly result: Result;
+  private readonly notes: NotesPanel;
   private robot = "";
   private range: Range | undefined;
   /** The ranges from which the viewer zoomed in. */
@@ -51,7 +53,11 @@ export class HistoryView {
       asked: () => this.asked(),
       changed: () => this.write(),
     });
-    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result.node];
+    this.notes = new NotesPanel(config, {
+      at: () => (Number.isNaN(this.result.at) ? Math.min(this.range![1], Date.now() / 1000) : this.result.at),
+      shown: (notes) => this.result.mark(notes.map(({ t_us }, i) => ({ at: t_us / 1e6, label: String(i + 1) }))),
+    });
+    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result.node, this.notes.node];
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
     this.node = el(
       "article",
@@ -218,6 +224,7 @@ export class HistoryView {
   private async load(range: Range): Promise<void> {
     this.loading?.abort();
     const loading = (this.loading = new AbortController());
+    void this.notes.show(this.robot, range);
     this.note.set("Loading …");
     const began = performance.now();
     try {

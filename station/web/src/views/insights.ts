@@ -12,6 +12,7 @@ import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { styles } from "../insights/styles";
 import { may } from "../server/admission";
+import { NotesPanel } from "../widgets/notes_panel";
 import { ask, AnswerError } from "../server/answers";
 
 export class InsightsView {
@@ -22,6 +23,7 @@ export class InsightsView {
   private readonly found = el("div", { class: "insights-part" });
   private readonly driven = el("div", { class: "insights-part" });
   private readonly parameters = new Parameters();
+  private readonly notes: NotesPanel;
   private readonly laps = new LapsPanel((laps) => this.write(laps));
   private readonly analyse = new Analyse((text) => this.note.set(text), (drives) => void this.analysed(drives));
   private loading: AbortController | undefined;
@@ -30,9 +32,10 @@ export class InsightsView {
   private drive: Range | undefined;
 
   constructor(private readonly config: Config) {
+    this.notes = new NotesPanel(config);
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
     const status = el("div", { class: "history-status" }, this.note.node, ...(may(config, "analyse") ? [this.analyse.node] : []));
-    const served = [status, this.found, this.laps.node, this.parameters.node, this.driven];
+    const served = [status, this.found, this.notes.node, this.laps.node, this.parameters.node, this.driven];
     this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
   }
 
@@ -42,6 +45,7 @@ export class InsightsView {
     this.tools.replaceChildren(...(robot === undefined ? [] : [el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"), el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"), el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet")]));
     if (!this.config.answers) return;
     this.analyse.of(robot);
+    void this.notes.show(robot);
     if (robot === this.robot && this.answer) void this.present(query);
     else void this.load(robot, query);
   }

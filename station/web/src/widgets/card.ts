@@ -30,7 +30,7 @@ export class Card {
     const fresh = robot.freshness(now);
     const shown = linked || fresh === "live" ? fresh : "unlinked";
     setAttribute(this.node, "data-state", shown);
-    this.state.set({ live: "online", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
+    this.state.set({ live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
     setAttribute(this.node, "data-fault", String(robot.fault(table) !== undefined));
     this.inside.update(robot, fleet, table, now);
   }

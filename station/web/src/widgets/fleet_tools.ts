@@ -13,7 +13,7 @@ const SORTS: Readonly<Record<string, { readonly label: string; readonly of: (rob
   name: { label: "Name", of: () => 0 },
   trouble: {
     label: "Trouble first",
-    of: (robot, table, now) => (robot.fault(table) !== undefined ? 0 : { gone: 1, stale: 2, live: 3 }[robot.freshness(now)]),
+    of: (robot, table, now) => (robot.fault(table) !== undefined ? 0 : { gone: 1, stale: 2, idle: 3, live: 3 }[robot.freshness(now)]),
   },
   battery: { label: "Lowest battery", of: (robot, table) => newest(robot, table)("voltage_input") },
   temperature: { label: "Hottest", of: (robot, table) => -hottest(newest(robot, table)) },

@@ -3,11 +3,13 @@
 import type { Config, FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
 import type { Alarms } from "../live/alarms";
+import type { Viewing } from "../link/viewing";
 import type { Fleet } from "../live/fleet";
 import { age, number } from "../base/format";
 import { now } from "../base/clock";
 import type { LinkState } from "../link/worker_messages";
 
+const UNABLE = "This page can only listen: a car sends a value every few seconds until somebody else looks at it more closely.";
 const ANNOUNCE_S = 8;
 const WORDS = { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" } as const;
 
@@ -18,8 +20,10 @@ export class StatusBar {
     config: Config,
     private readonly fleet: Fleet,
     private readonly alarms: Alarms,
+    private readonly viewing: Viewing,
     private readonly table: FieldTable,
   ) {
+    write("way", "live over PubNub");
     write("empty-channel", `${config.namespace}.*`);
     write("empty-origin", config.origin);
   }
@@ -30,9 +34,9 @@ export class StatusBar {
 
   clock(at: number, link: LinkState): void {
     const { fleet } = this;
-    const count = { live: 0, stale: 0, gone: 0 };
+    const count = { live: 0, idle: 0, stale: 0, gone: 0 };
     for (const robot of fleet.robots.values()) count[robot.freshness(at)] += 1;
-    const counts = (["live", "stale", "gone"] as const).filter((state) => count[state] > 0);
+    const counts = (["live", "idle", "stale", "gone"] as const).filter((state) => count[state] > 0);
     const words = counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`);
     // The state of a car that is gone is unknown.
     const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
@@ -43,6 +47,9 @@ export class StatusBar {
     write("malformed", number(fleet.malformed));
     byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";
     write("late", number(fleet.outOfOrder));
+    const { able, awake, error } = this.viewing;
+    write("awake", able ? `${awake} ${awake === 1 ? "car" : "cars"} held awake` : "cannot wake cars");
+    byId("awake").title = able ? error : UNABLE;
     setAttribute(byId("link"), "data-state", link.kind);
     write("link-text", WORDS[link.kind]);
     this.announce(link, at);

@@ -41,7 +41,7 @@ def send(
     """Send a command and print the robot's answer.
 
     Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own,
-    which takes over from earlier ones.
+    which takes over from the one that drives.
     """
     asked = _message(message)
     cloud = context.obj.cloud()

@@ -1,0 +1,61 @@
+// The leases that this page holds on cars' live lanes: a car sends at the highest rate that its viewers ask for, and
+// next to nothing without one. A lease ends by itself, so a page that dies costs no more than the rest of it.
+
+import { VIEW_LEASE_MS, VIEW_RENEW_S, type Config } from "../base/contract";
+import { act, AnswerError } from "../server/answers";
+
+/** The rate of a card among others, and of a value beside the past. */
+export const GLANCE_HZ = 1;
+
+/** Robot -> messages a second. */
+export type Looks = ReadonlyMap<string, number>;
+
+export const NONE: Looks = new Map();
+
+export class Viewing {
+  /** Whether this page can ask cars for more than they send by themselves. */
+  readonly able: boolean;
+  /** Why the newest lease was not sent. */
+  error = "";
+  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
+  private looks = NONE;
+  private held = NONE;
+
+  constructor(config: Config) {
+    this.able = config.actions.includes("view");
+    if (!this.able) return;
+    document.addEventListener("visibilitychange", () => this.hold());
+    window.addEventListener("pagehide", () => this.hold(NONE));
+    window.setInterval(() => this.hold(undefined, true), VIEW_RENEW_S * 1000);
+  }
+
+  /** The cars that this page holds awake. */
+  get awake(): number {
+    return this.error === "" ? this.held.size : 0;
+  }
+
+  /** Look at these cars from now on. */
+  look(looks: Looks): void {
+    this.looks = looks;
+    if (this.able) this.hold();
+  }
+
+  /** Ask for what is looked at and not held yet, or for all of it, and end the other leases. */
+  private hold(looks = document.hidden ? NONE : this.looks, again = false): void {
+    const asked = [...looks].filter(([robot, rate_hz]) => again || this.held.get(robot) !== rate_hz);
+    for (const rate_hz of new Set(asked.map(([, each_hz]) => each_hz))) {
+      this.send(asked.flatMap(([robot, each_hz]) => (each_hz === rate_hz ? [robot] : [])), rate_hz, VIEW_LEASE_MS);
+    }
+    const ended = [...this.held.keys()].filter((robot) => !looks.has(robot));
+    if (ended.length > 0) this.send(ended, GLANCE_HZ, 0);
+    this.held = looks;
+  }
+
+  private send(robots: readonly string[], rate_hz: number, lease_ms: number): void {
+    const asked = { robots: robots.join(","), viewer: this.viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms) };
+    // The last request of a page that is closed must outlive it.
+    act("view", asked, lease_ms === 0)
+      .then(() => (this.error = ""))
+      .catch((error: unknown) => (this.error = error instanceof AnswerError ? error.message : String(error)));
+  }
+}

@@ -1,0 +1,117 @@
+"""What the page asks of the cars: leases on what is on the screen, and nothing while nobody looks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from iort_contract.limits import LIVE_MAX_RATE_HZ
+from iort_contract.messages.viewing import VIEW_LEASE_MS
+from iort_station.page.server import PageServer
+from tests.browser import show, until
+from tests.web.cars import SUBSCRIBE_KEY, Car
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from playwright.sync_api import Page
+
+    from local.pubnub.standin import PubNubStandIn
+
+HIDE = """(hidden) => {
+  Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+class Leases:
+    """Keeps what the page's server was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[Mapping[str, str]] = []
+
+    def view(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.asked.append(asked)
+        return {"asked": asked["robots"].count(",") + 1}
+
+    def held(self) -> dict[str, float]:
+        """The highest rate of each robot with a lease."""
+        held: dict[tuple[str, str], float] = {}
+        for asked in list(self.asked):
+            for robot in asked["robots"].split(","):
+                held.pop((robot, asked["viewer"]), None)
+                if asked["lease_ms"] != "0":
+                    held[robot, asked["viewer"]] = float(asked["rate_hz"])
+        return {robot: rate_hz for (robot, _), rate_hz in sorted(held.items(), key=lambda one: one[1])}
+
+
+@pytest.fixture
+def leases() -> Leases:
+    return Leases()
+
+
+@pytest.fixture
+def served(pubnub: PubNubStandIn, leases: Leases) -> Iterator[str]:
+    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    presence = {"online": True, "since_ms": 0}
+    answers = {
+        "robots": lambda _: {"robots": {"car-99": presence, "car-98": {**presence, "online": False}}},
+        "tags": lambda _: {"tags": {}},
+        "vehicles": lambda _: {"vehicles": {}},
+    }
+    with PageServer(namespace="iort", answers=answers, open_actions={"view": leases.view}, **told) as server:
+        yield server.url
+
+
+def test_the_page_holds_what_is_on_the_screen_and_nothing_while_hidden_or_closed(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn, served: str, leases: Leases
+) -> None:
+    page = open_page(served, viewport={"width": 700, "height": 400})
+    # It is connected, and has not been heard.
+    until(lambda: leases.held() == {"car-99": 1.0}, "a look at the registered car")
+    for number in range(20):
+        show(page, Car(pubnub, f"car-{number}").send())
+    until(lambda: "car-0" in leases.held(), "a look at the first cards")
+    assert "car-19" not in leases.held()
+    until(lambda: f"{len(leases.held())} cars held awake" in page.inner_text(".foot"), "the bar to say so")
+    page.goto(f"{served}#/car/car-7")
+    until(lambda: leases.held() == {"car-7": LIVE_MAX_RATE_HZ}, "one car in full")
+    until(lambda: "1 car held awake" in page.inner_text(".foot"), "the bar to say so")
+    last = leases.asked[-1]
+    until(lambda: leases.asked[-1] is not last, "the lease to be renewed", 10)
+    assert leases.asked[-1] == {**leases.asked[-1], "robots": "car-7", "lease_ms": str(VIEW_LEASE_MS)}
+    page.evaluate(HIDE, True)
+    until(lambda: leases.held() == {}, "the hidden page to let it sleep")
+    page.evaluate(HIDE, False)
+    until(lambda: leases.held() == {"car-7": LIVE_MAX_RATE_HZ}, "the page that is seen again")
+    page.goto(f"{served}#/alarms")
+    until(lambda: leases.held() == {}, "a view that needs no more than cars send by themselves")
+    page.goto(f"{served}#/history/car-7")
+    until(lambda: leases.held() == {"car-7": 1.0}, "the value beside the past")
+    assert len({asked["viewer"] for asked in leases.asked}) == 1
+    other = open_page(f"{served}#/car/car-7")
+    until(lambda: leases.held() == {"car-7": LIVE_MAX_RATE_HZ}, "another viewer")
+    assert len({asked["viewer"] for asked in leases.asked}) == 2
+    other.close()
+    until(lambda: leases.held() == {"car-7": 1.0}, "the closed page's last word")
+
+
+def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page, car: Car) -> None:
+    show(page, car.send(next_ms=4_000))
+    until(lambda: page.get_attribute("#car", "data-state") == "idle", "the car to be idle")
+    assert "idle: newest values are" in page.inner_text(".car-state")
+    assert page.inner_text("#count") == "1 idle"
+    assert "cannot wake cars" in page.inner_text(".foot")
+    states = set()
+    until(
+        lambda: states.add(state := page.evaluate("iort.robots['car-1'].state")) or state == "stale",
+        "the car to be stale",
+    )
+    assert states == {"idle", "stale"}
+    assert page.evaluate("iort.robots['car-1'].silent_s") >= 5.4
+    show(page, car.send(next_ms=100))
+    assert page.get_attribute("#car", "data-state") == "live"
+    until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "the promise of ten a second", 3)
+    car.send(next_ms=10**6)
+    until(lambda: page.evaluate("iort.malformed") == 1, "a time that no car may say")
