@@ -74,7 +74,7 @@ def main() -> None:
 
     try:
         with TemporaryDirectory() as folder, EmbeddedCloud(Path(folder), progress=say) as embedded:
-            figures = measure(embedded.cloud, given.hours, console)
+            figures = measure(embedded, given.hours, console)
     except (BenchError, LocalError, StationError) as error:
         sys.exit(f"bench-analysis-cloud: {error}")
     except KeyboardInterrupt:
@@ -86,6 +86,7 @@ def main() -> None:
         f"{figures.drives} drives, {figures.findings} findings\n"
         f"{cpu_s / hours:.2f} s of processor a robot-hour: {by_function}",
         highlight=False,
+        soft_wrap=True,
     )
     write(given.json, {**made(), **asdict(figures)})
 
@@ -96,8 +97,9 @@ def _hours(text: str) -> int:
     return int(text)
 
 
-def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
+def measure(embedded: EmbeddedCloud, hours: int, console: Console) -> Figures:
     """Write the hours, and analyse them; raises `BenchError` if a drive is not analysed."""
+    cloud = embedded.cloud
     _without_lambda_2(cloud)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
@@ -110,7 +112,7 @@ def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
         for robot in robots:
             _record(cloud, robot, batches)
             progress.advance(writing)
-        before, began = _cpu_s(), time.monotonic()
+        before, began = _cpu_s(embedded), time.monotonic()
         run = analysis.start(cloud, AnalysisRequest((), start_us, start_us + round(HOUR_S) * _S, again=True))
         finding = progress.add_task("robots searched for drives", total=None)
         analysing = progress.add_task("drives analysed", total=None, start=False)
@@ -119,7 +121,7 @@ def measure(cloud: Cloud, hours: int, console: Console) -> Figures:
                 progress.update(finding, total=hours, completed=hours)
                 progress.start_task(analysing)
                 progress.update(analysing, total=last.drives, completed=last.done)
-        took_s, after = time.monotonic() - began, _cpu_s()
+        took_s, after = time.monotonic() - began, _cpu_s(embedded)
     without = [robot for robot in robots if not findings.drives(cloud, robot)]
     if without:
         said = [one.text for one in findings.findings(cloud, without[0])]
@@ -152,10 +154,10 @@ def _without_lambda_2(cloud: Cloud) -> None:
         client.update_event_source_mapping(UUID=mapping["UUID"], Enabled=False)
 
 
-def _cpu_s() -> dict[str, float]:
+def _cpu_s(embedded: EmbeddedCloud) -> dict[str, float]:
     """The processor time of the functions' processes so far."""
     spent = dict.fromkeys(_FUNCTIONS, 0.0)
-    for name, process in _workers():
+    for name, process in _workers(embedded):
         # A process may end meanwhile.
         with suppress(OSError):
             fields = (process / "stat").read_text().rpartition(")")[2].split()
@@ -163,12 +165,12 @@ def _cpu_s() -> dict[str, float]:
     return spent
 
 
-def _workers() -> Iterator[tuple[str, Path]]:
+def _workers(embedded: EmbeddedCloud) -> Iterator[tuple[str, Path]]:
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             command = (process / "cmdline").read_bytes().decode(errors="replace")
             for name in _FUNCTIONS:
-                if f"-analysis-{name}" in command:
+                if str(embedded.folder) in command and f"-analysis-{name}" in command:
                     yield name, process
 
 

@@ -15,7 +15,7 @@ from functions.shared.analysis.kept import Kept
 from functions.shared.environment import variables
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
-from iort_contract.cloud import findings_key
+from iort_contract.cloud import drive_prefix, findings_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
@@ -45,6 +45,14 @@ def present(
         for gone in before.keys() - {one.id for one in found}:
             table.remove(before[gone])
     return {"findings": kept, "mails": len(mailed)}
+
+
+def remove(drive: DriveKey, table: FindingsTable, kept: Kept) -> None:
+    """Remove a drive that others stand for now; its row comes last, because it tells of the rest."""
+    for finding in table.of_drive(drive):
+        table.remove(finding)
+    kept.remove(drive_prefix(drive))
+    table.remove_drive(drive)
 
 
 def mail(finding: Finding, page_url: str) -> tuple[str, str]:
@@ -107,9 +115,12 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:
         found = failure(event)
         table.put_finding(found)
         return {"findings": 1, "mails": 0}
-    content = Kept(clients.s3(), given.files_bucket).json(findings_key(event["job"]))
+    kept = Kept(clients.s3(), given.files_bucket)
+    content = kept.json(findings_key(event["job"]))
+    for drive in (DriveKey(**one) for one in content["gone"]):
+        remove(drive, table, kept)
     drives = (
         (DriveKey(**one["drive"]), [decode_finding(finding) for finding in one["findings"]])
-        for one in content
+        for one in content["drives"]
     )
     return present(drives, table, _notify, given.page_url)

@@ -81,6 +81,10 @@ class FindingsTable:
         """Remove a finding that a later analysis of its drive no longer has."""
         self._delete(finding.drive.robot, finding.id)
 
+    def remove_drive(self, drive: DriveKey) -> None:
+        """Remove the row of an analysed drive."""
+        self._delete(drive.robot, f"{PARAMETERS_PREFIX}{drive}")
+
     def remove_note(self, robot: str, note_id: str) -> bool:
         """Remove a note; False if there is none of this id."""
         return self._delete(robot, f"{NOTE_PREFIX}{note_id}")

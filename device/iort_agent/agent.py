@@ -16,11 +16,12 @@ from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
 from iort_agent.lanes.attachment import make_attachments
 from iort_agent.lanes.clock_offset import OffsetEstimator
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes.config import IOT, RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import RecordLane
 from iort_agent.lanes.streams import Streams
+from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.run import SourceRun
@@ -48,6 +49,7 @@ class Agent:
             live_rate_hz=config.live.rate_hz,
             ping_rate_hz=config.ping.rate_hz,
             log_level=config.log_level,
+            live_when=config.live.when,
             motion_stopped=config.motion.stopped,
         )
         self.record = RecordLane(
@@ -62,6 +64,7 @@ class Agent:
         self.live = LiveLane(
             link, boot=self.boot, rate_hz=config.live.rate_hz, offset_us=self.offset.known_us
         )
+        self.viewers = Viewers(link, self.live, base, to_broker=config.live.transport == IOT)
         self.streams = Streams(
             boot=self.boot,
             batch_s=config.record.batch_s,
@@ -123,7 +126,7 @@ class Agent:
         if settings.log_level != self.streams.settings.log_level:
             set_level(settings.log_level)
         self.live.enabled = settings.live_enabled
-        self.live.set_rate(settings.live_rate_hz)
+        self.viewers.apply(settings)
         self.pings.set_rate(settings.ping_rate_hz)
         self.streams.apply(settings)
         if self.downlink is not None:

@@ -38,6 +38,8 @@ def make_status(agent: Agent) -> Status:
             live=LiveLane(
                 enabled=settings.live_enabled,
                 rate_hz=settings.live_rate_hz,
+                asked_hz=live.tempo.asked_hz,
+                viewers=agent.viewers.count(),
                 effective_hz=live.tempo.effective_hz,
                 slowed=live.tempo.slowed,
                 published=live.published,

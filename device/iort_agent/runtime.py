@@ -79,6 +79,7 @@ class Runtime:
         self._send_log()
         self.agent.streams.tick()
         self.agent.record.tick()
+        self.agent.viewers.tick()
         self.agent.live.tick()
         self.agent.pings.tick()
         self.agent.shadow.tick()

@@ -14,6 +14,8 @@ from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractErr
 from iort_contract.topics import check_stream
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
+# When the live lane sends at its full rate.
+WATCHED, ALWAYS = "watched", "always"
 FIELDS = "fields"
 MOTION_STOPPED = "motion.stopped"
 FIELD_LIST = "a list of field names; an empty one means all fields"
@@ -73,6 +75,7 @@ SETTINGS: Mapping[str, Flag | Number | Choice] = {
     "record.enabled": Flag(),
     "live.enabled": Flag(),
     "live.rate_hz": Number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, "Hz"),
+    "live.when": Choice((WATCHED, ALWAYS)),
     "ping.rate_hz": Number(0, 20, "Hz"),
     "log_level": Choice(LOG_LEVELS),
     # The emergency stop.

@@ -37,10 +37,13 @@ class RecordLane:
 
 @dataclass(frozen=True)
 class LiveLane:
-    """The live lane. ``effective_hz`` is the rate of a stream that the rate limiter slows down."""
+    """The live lane. ``asked_hz`` is the rate of a stream now, for so many viewers; ``effective_hz`` is that
+    of one that the rate limiter slows down."""
 
     enabled: bool
     rate_hz: float
+    asked_hz: float
+    viewers: int
     effective_hz: float
     slowed: bool
     published: int

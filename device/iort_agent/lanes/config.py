@@ -7,8 +7,11 @@ from typing import Any, Mapping
 
 from iort_agent.common.schema import allowed, choice, items, number, setting
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.settings import FIELDS, SETTINGS
+from iort_contract.messages.settings import ALWAYS, FIELDS, SETTINGS
 from iort_contract.topics import PING_PATHS
+
+# How live messages reach their viewers.
+PUBNUB, IOT = "pubnub", "iot"
 
 
 @dataclass(frozen=True)
@@ -21,10 +24,14 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """The live lane. ``rate_hz`` is the most messages a second of each stream."""
+    """The live lane. ``rate_hz`` is the most messages a second of each stream. While nobody
+    looks, one in ten seconds is sent, unless ``when`` is ``always``. Then ``transport`` says whether viewers
+    listen at PubNub or at AWS IoT; otherwise they say so themselves."""
 
     enabled: bool = setting(allowed(SETTINGS["live.enabled"]), default=True)
     rate_hz: float = setting(allowed(SETTINGS["live.rate_hz"]), LIVE_MAX_RATE_HZ)
+    when: str = setting(allowed(SETTINGS["live.when"]), default=ALWAYS)
+    transport: str = setting(choice(PUBNUB, IOT), PUBNUB)
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,7 @@ class RuntimeSettings:
     live_rate_hz: float
     ping_rate_hz: float
     log_level: str
+    live_when: str = ALWAYS
     motion_stopped: bool = False
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 

@@ -1,9 +1,9 @@
 """The live lane: the newest sample of each stream, at most so many a second, never a queue.
 
 The first sample of a burst is sent at once, in the thread that brought it. A later one replaces the sample
-that waits. It is sent with the first sample that is due, or half a period later if the stream falls silent.
-While a message is being written, or without a connection, nothing is sent, so that the next one is the
-newest.
+that waits. It is sent with the first sample that is due, or half a period later, a second at most, if the
+stream falls silent. While a message is being written, or without a connection, nothing is sent, so that the
+next one is the newest.
 
 The lane uses what the record lane leaves of the connection's `RateLimiter`. If that is too little, due
 streams wait in line, the one that was sent longest ago first. So all are sent equally often, and a slow
@@ -14,6 +14,8 @@ first message of a run, one with another fault code, and one every ten seconds g
 the rules that alert a human and for other subscribers. The live rule receives those, too, so the dashboard
 shows each message once. Another fault code waits for no slow rate and no line: it is sent at the fastest
 rate.
+
+Every message says when the stream's next one comes. So a change of the rate is told at once.
 """
 
 from __future__ import annotations
@@ -21,11 +23,12 @@ from __future__ import annotations
 import functools
 import heapq
 import logging
+import math
 import threading
 from typing import Callable, Mapping
 
 from iort_agent.errors import UplinkError
-from iort_agent.lanes.tempo import Slot, Tempo, TempoMeter, fault_of
+from iort_agent.lanes.tempo import Demand, Slot, Tempo, TempoMeter, fault_of
 from iort_agent.mqtt.rate_limiter import LIVE, URGENT
 from iort_agent.mqtt.uplink import Link
 from iort_contract import topics
@@ -34,6 +37,7 @@ from iort_contract.limits import (
     LIVE_MAX_AGE_MS,
     LIVE_MAX_RATE_HZ,
     MAX_MESSAGE_BYTES,
+    MAX_NEXT_MS,
     ContractError,
     Value,
 )
@@ -42,6 +46,7 @@ from iort_contract.topics import live_topic
 
 _log = logging.getLogger(__name__)
 _FASTEST_S = 1 / LIVE_MAX_RATE_HZ
+_PRESENT_S = LIVE_MAX_AGE_MS / 1000
 
 
 class LiveLane:
@@ -54,6 +59,7 @@ class LiveLane:
         self._boot = boot
         self.enabled = True
         self._period_s = 1 / rate_hz
+        self._to_broker = False
         self._offset_us = offset_us
         self._lock = threading.Lock()
         self._slots: dict[str, Slot] = {}
@@ -63,6 +69,11 @@ class LiveLane:
         self._marked = self._clock.monotonic()
         self._meter = TempoMeter(rate_hz)
         self.refused = 0
+
+    @property
+    def _patience_s(self) -> float:
+        """How late a message may be: half a period, and never so late that its sample is old."""
+        return min(self._period_s, _PRESENT_S) / 2
 
     @property
     def tempo(self) -> Tempo:
@@ -77,15 +88,20 @@ class LiveLane:
         """Messages a second of each stream, in the last seconds."""
         return {name: round(slot.hz, 2) for name, slot in list(self._slots.items())}
 
-    def set_rate(self, rate_hz: float) -> None:
-        """Use another rate from now on."""
+    def follow(self, demand: Demand, *, at_once: bool = False) -> None:
+        """Send as is asked from now on; with ``at_once``, the newest sample of each stream now."""
         with self._lock:
-            self._period_s = 1 / rate_hz
-            now = self._clock.monotonic()
-            for slot in self._slots.values():
-                # A message due late at a slow rate is due soon at a fast one.
-                slot.due = min(slot.due, now + self._period_s)
-            self._meter.set_rate(rate_hz)
+            now, was_s, self._period_s = self._clock.monotonic(), self._period_s, 1 / demand.rate_hz
+            self._to_broker = demand.to_broker
+            for slot in self._slots.values() if self.enabled else ():
+                # A message due late at a slow rate is due soon at a fast one. The next one tells viewers of a
+                # slow rate before they take the stream for silent.
+                soon = at_once or self._period_s > was_s
+                slot.due = min(slot.due, now + (0.0 if soon else self._period_s))
+                if at_once:
+                    self._show_again(slot, now)
+            self._serve(now)
+            self._meter.set_rate(demand.rate_hz)
 
     def offer(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take the newest sample of a stream; it replaces the one that waits."""
@@ -99,7 +115,7 @@ class LiveLane:
                 broker_topic = self._link.topic(topics.LIVE, stream)
                 slot = self._slots[stream] = Slot(basic_ingest, broker_topic, turn=self._turn)
                 self._turn += 1
-            slot.t_us, slot.values, slot.offered = t_us, values, now
+            slot.t_us, slot.values, slot.newest, slot.offered = t_us, values, values, now
             slot.offers += 1
             if now >= slot.due or slot.is_newfault_of(now):
                 self._take_turn(slot, now)
@@ -112,14 +128,20 @@ class LiveLane:
             for slot in self._slots.values():
                 if slot.values is None:
                     continue
-                if now - slot.offered > LIVE_MAX_AGE_MS / 1000:
+                if now - slot.offered > _PRESENT_S:
                     slot.values = None
-                elif now >= slot.due + self._period_s / 2 or slot.is_newfault_of(now):
+                elif now >= slot.due + self._patience_s or slot.is_newfault_of(now):
                     self._take_turn(slot, now)
             self._serve(now)
             if now - self._marked >= 1:
                 self._marked = now
                 self._meter.measure(self._slots.values(), now, connected=self._uplink.connected())
+
+    def _show_again(self, slot: Slot, now: float) -> None:
+        """Let the newest sample take its turn, even if it was sent before: who looks now did not see it."""
+        if slot.newest is not None and now - slot.offered <= _PRESENT_S:
+            slot.values = slot.newest
+            self._take_turn(slot, now)
 
     def _take_turn(self, slot: Slot, now: float) -> None:
         """Send another fault code at once; put any other sample in line."""
@@ -161,6 +183,7 @@ class LiveLane:
             sent_us=self._clock.now_us(),
             sample=values,
             offset_us=self._offset_us(),
+            next_ms=self._next_ms(),
         )
         try:
             payload = _encode(sample)
@@ -173,14 +196,22 @@ class LiveLane:
         slot.turn, self._turn = self._turn, self._turn + 1
         if now >= slot.due:
             # On a grid: a late sample does not lower the rate, and never doubles it.
-            slot.due = max(slot.due, now - self._period_s / 2) + self._period_s
+            slot.due = max(slot.due, now - self._patience_s) + self._period_s
         else:
             slot.due = max(slot.due, now + _FASTEST_S)
         slot.fault_due = now + _FASTEST_S
         slot.writing = True
         slot.payload_bytes = len(payload)
-        topic = _topic(slot, fault_of(values), now)
+        topic = slot.broker_topic if self._to_broker else slot.topic
+        if now >= slot.broker_due or fault_of(values) != slot.fault:
+            slot.broker_due, slot.fault = now + LIVE_BROKER_EVERY_S, fault_of(values)
+            topic = slot.broker_topic
         self._link.publish(topic, payload, qos=0, done=functools.partial(_written, slot))
+
+    def _next_ms(self) -> int:
+        """The time from a message of a stream to its next one."""
+        slowed_s = 1 / self.tempo.effective_hz if self.tempo.slowed and self.tempo.effective_hz else 0.0
+        return min(MAX_NEXT_MS, math.ceil(max(self._period_s, slowed_s) * 1000))
 
 
 def _written(slot: Slot, error: UplinkError | None) -> None:
@@ -192,14 +223,6 @@ def _written(slot: Slot, error: UplinkError | None) -> None:
         # The lost message may have been for the broker, with another fault code.
         slot.broker_due, slot.fault = 0.0, None
     slot.writing = False
-
-
-def _topic(slot: Slot, fault: Value, now: float) -> str:
-    """The topic for the next message of a stream."""
-    if now < slot.broker_due and fault == slot.fault:
-        return slot.topic
-    slot.broker_due, slot.fault = now + LIVE_BROKER_EVERY_S, fault
-    return slot.broker_topic
 
 
 def _encode(sample: LiveSample) -> bytes:

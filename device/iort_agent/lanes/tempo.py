@@ -23,6 +23,13 @@ def fault_of(values: Mapping[str, Value]) -> Value:
     return code if code == code else None  # noqa: PLR0124 - False for NaN alone
 
 
+class Demand(NamedTuple):
+    """What the lane shall send: the most messages a second of a stream, and whether all go to the broker."""
+
+    rate_hz: float
+    to_broker: bool = False
+
+
 class Tempo(NamedTuple):
     """The configured rate of a stream, and the mean rate of the streams that the rate limiter keeps
     waiting."""
@@ -58,6 +65,8 @@ class Slot:
     fault: Value = None
     t_us: int = 0
     values: Mapping[str, Value] | None = None
+    # The newest sample, sent or not.
+    newest: Mapping[str, Value] | None = None
     offered: float = 0.0
     offers: int = 0
     seq: int = 0
@@ -81,7 +90,9 @@ class TempoMeter:
 
     def set_rate(self, rate_hz: float) -> None:
         """Take another configured rate."""
-        self.tempo = Tempo(rate_hz, min(rate_hz, self.tempo.effective_hz), self.tempo.slowed)
+        slowed = self.tempo.slowed
+        effective_hz = min(rate_hz, self.tempo.effective_hz) if slowed else rate_hz
+        self.tempo = Tempo(rate_hz, effective_hz, slowed)
 
     def measure(self, slots: Iterable[Slot], now: float, *, connected: bool) -> None:
         """Update the rates; called once a second."""

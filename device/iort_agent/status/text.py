@@ -50,10 +50,12 @@ def _link(status: Status) -> Iterator[str]:
 
 def _lanes(status: Status) -> Iterator[str]:
     record, live, queue = status.lanes.record, status.lanes.live, status.spool
+    viewers = "nobody" if not live.viewers else f"{live.viewers} viewer{'' if live.viewers == 1 else 's'}"
     yield f"record    {_on(record)}, {_queue(queue)}"
     slowed = f", SLOWED to {live.effective_hz:g} Hz a stream by AWS' limit" if live.slowed else ""
     yield (
-        f"live      {_on(live)}, up to {live.rate_hz:g} Hz{slowed}, {live.published} sent, "
+        f"live      {_on(live)}, {live.asked_hz:g} of up to {live.rate_hz:g} Hz for {viewers}{slowed}, "
+        f"{live.published} sent, "
         f"{live.refused} refused"
     )
     for name, stream in status.streams.items():

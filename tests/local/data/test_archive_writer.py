@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime, timezone
 
 from iort_contract.archive import DUE_MS, HOUR, PENDING, ArchiveTable, archived_hour, parse_pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.local.conftest import run_agent, until
+from tests.local.conftest import fire, run_agent, until
 from tests.local.data.drives import RATE_HZ, counter_log
 
 SECONDS = 3
@@ -17,25 +16,6 @@ SECONDS = 3
 def rows(embedded, topic):
     table = ArchiveTable(embedded.cloud.client("dynamodb"), embedded.cloud.output("storage", "ArchiveTable"))
     return [item for page in table.pages(topic) for item in page.items]
-
-
-def fire(embedded, name):
-    """Let EventBridge Scheduler call what a schedule calls, once, now."""
-    client = embedded.cloud.client("scheduler")
-    (found,) = [
-        one["Name"]
-        for one in client.list_schedules()["Schedules"]
-        if one["Name"].startswith(f"{embedded.namespace}-archive-{name}-")
-    ]
-    schedule = client.get_schedule(Name=found)
-    assert schedule["State"] == "ENABLED"
-    client.create_schedule(
-        Name=f"{found}-now",
-        ScheduleExpression=f"at({datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S})",
-        FlexibleTimeWindow=schedule["FlexibleTimeWindow"],
-        Target=schedule["Target"],
-        ActionAfterCompletion="DELETE",
-    )
 
 
 def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundle, iort, tmp_path):
@@ -68,7 +48,7 @@ def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundl
         ExpressionAttributeNames={"#due": DUE_MS},
         ExpressionAttributeValues={":due": {"N": "0"}},
     )
-    fire(embedded, "Hourly")
+    fire(embedded, "archive-Hourly")
     until(lambda: [parse_pending(one).is_day for one in marked()] == [True])
     (shown,) = map(json.loads, iort("archive", "show", car.robot, "--json").stdout.splitlines())
     assert (shown["samples"], shown["hours"]) == (2 * SECONDS * RATE_HZ, 1)

@@ -339,7 +339,8 @@ def test_a_slowed_lane_is_logged_once_and_shown(caplog: pytest.LogCaptureFixture
     drive.uplink.connect()
     drive.run(15)
     status = make_status(drive.agent)
-    told = f"up to 10 Hz, SLOWED to {status.lanes.live.effective_hz:g} Hz a stream by AWS' limit"
+    effective = status.lanes.live.effective_hz
+    told = f"10 of up to 10 Hz for nobody, SLOWED to {effective:g} Hz a stream by AWS' limit"
     assert told in render(status)
     assert 1.5 < status.streams["topic007"].live_hz < 2.2
     drive.topics = topics(1, 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from iort_agent.lanes.live import LiveLane
+from iort_agent.lanes.tempo import Demand
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import LiveSample, decode_live
@@ -177,7 +178,7 @@ def test_only_written_messages_count_as_published() -> None:
 def test_the_rate_and_the_lane_itself_can_be_changed() -> None:
     rig = Rig(rate_hz=0.1)
     rig.offer(0)
-    rig.lane.set_rate(10)
+    rig.lane.follow(Demand(10))
     for i in range(1, 101):
         rig.clock.advance(0.02)
         rig.offer(i)
@@ -240,7 +241,7 @@ def test_a_fault_shorter_than_the_period_is_sent_and_the_rate_stays() -> None:
     topics = [_drive(rig, seconds, fault_code=code) for seconds, code in ((1, 0), (0.5, 5), (18.6, 0))]
     assert topics[:2] == [[BROKER], [BROKER]]
     assert [live.sample["fault_code"] for live in rig.sent()] == [0, 5, 0, 0, 0]
-    assert [round((live.sent_us - T0) / 1e6, 1) for live in rig.sent()] == [0, 1, 1.5, 5, 15]
+    assert [round((live.sent_us - T0) / 1e6, 1) for live in rig.sent()] == [0, 1, 1.5, 9, 19]
 
 
 def test_the_last_fault_of_a_silent_stream_is_sent() -> None:

@@ -24,7 +24,12 @@ from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
-from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, encode_planned
+from iort_contract.messages.analysis.run import (
+    AnalysedDrive,
+    PlannedDrive,
+    encode_analysed,
+    encode_planned,
+)
 from iort_contract.messages.batch import Batch
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
@@ -229,6 +234,10 @@ def test_no_state_of_a_recording_stops_the_others(cloud: Deployed) -> None:
             {"imu": Block(START_US + np.arange(100) * 20_000, {"speed": text})},
             {"vesc": "no stream has"},
         ),
+        "two": (
+            {"front": streams(20)["vesc"], "rear": streams(20)["vesc"]},
+            {"rear": "only the first is analysed, front"},
+        ),
     }
     for robot, (blocks, _) in troubles.items():
         cloud.register(robot, *blocks)
@@ -281,7 +290,8 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
-    evaluate.handler({"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1}, None)
+    run = {"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1, "again": False}
+    evaluate.handler(run, None)
     present.handler({"job": JOB}, None)
 
     (found,) = cloud.table.findings(CAR)
@@ -374,6 +384,73 @@ def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) 
     for end_us, left in ((START_US + 30 * S, [found]), (START_US + 60 * S, [])):
         cloud.run(end_us=end_us)
         assert list(cloud.table.findings(CAR)) == left
+
+
+def test_the_next_night_looks_for_the_drives_of_a_failed_plan(cloud: Deployed) -> None:
+    """Nights overlap by a day only, so what failed may begin before the next range."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    failed = {"robot": CAR, "start_us": START_US - S, "end_us": START_US + 600 * S}
+    present.handler({"failed": failed, "error": {"Cause": "no answer"}}, None)
+    next_night = {"start_us": START_US + 300 * S, "end_us": START_US + 900 * S}
+
+    # An operator's range stays as it is.
+    assert cloud.run(**next_night, again=True) == []
+    assert len(list(cloud.table.findings(CAR))) == 1
+    (drive,) = cloud.run(**next_night)
+
+    assert drive["start_us"] == START_US
+    assert list(cloud.table.findings(CAR)) == []
+
+
+def test_a_drive_whose_start_moves_is_one_drive(cloud: Deployed) -> None:
+    """Its first half minute arrives a day later; and what had failed under the old start is done, too."""
+    cloud.register(CAR, "vesc", "pose")
+    cloud.record(later(streams(90), 30), first_seq=30)
+    cloud.run()
+    (half,) = cloud.table.drives(CAR)
+    cloud.table.put_finding(replace(finding(), drive=half.drive))
+    failed = {**vars(half.drive), "start_us": START_US + 20 * S, "end_us": half.end_us}
+    present.handler({"failed": failed, "error": {}}, None)
+    # Another run of the agent at the same time is another drive.
+    cloud.record(later(streams(30), 40), run="00c0ffef")
+    cloud.record(streams(30))
+
+    cloud.run()
+
+    other, whole = cloud.table.drives(CAR)
+    assert (other.drive.run, whole.drive) == ("00c0ffef", DriveKey(CAR, START_US, RUN))
+    assert {one.drive for one in cloud.table.findings(CAR)} <= {whole.drive, other.drive}
+    kept = cloud.s3.list_objects_v2(Bucket=BUCKET, Prefix="analysis/robot=")["Contents"]
+    folders = {one["Key"].rpartition("/")[0] + "/" for one in kept}
+    assert folders == {drive_prefix(whole.drive), drive_prefix(other.drive)}
+
+
+def test_a_field_that_comes_later_tells_of_motion(cloud: Deployed) -> None:
+    """The driver published no speed at first, and another stream has one all the time."""
+    drive = streams(120)["vesc"]
+    without = {name: column for name, column in drive.columns.items() if name != "speed"}
+    half = len(drive.times_us) // 2
+    cloud.register(CAR, "vesc", "wheels")
+    cloud.record({"vesc": Block(drive.times_us, without).take(slice(half))})
+    cloud.record({"vesc": drive.take(slice(half, None))}, first_seq=60)
+    cloud.record({"wheels": Block(drive.times_us, {"speed": drive.columns["speed"]})})
+
+    (planned,) = cloud.run(end_us=START_US + 120 * S)
+
+    assert planned["motion"] == "vesc"
+
+
+def test_the_row_of_a_drive_with_thousands_of_null_fields_fits_in_an_item() -> None:
+    missing = {f"a_stream_{i // 100}.{'f' * 60}{i}": "the field is null in every sample" for i in range(5000)}
+    drive = DriveKey(CAR, START_US, RUN)
+    made = analyse.row(
+        DriveResult(drive, START_US, 1, {}, Mined(missing={**missing, "lap_mean_s": "too short"})), JOB
+    )
+
+    assert len(json.dumps(encode_analysed(made))) < 100_000
+    assert made.missing["lap_mean_s"] == "too short"
+    assert made.missing["others"] == "4,801 more are in the drive's result.json"
 
 
 @pytest.mark.parametrize(
