@@ -43,6 +43,7 @@ from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
 from local.pubnub.standin import PubNubStandIn
+from local.relay import Relay
 
 FOLDER = ROOT / EMBEDDED.parent
 
@@ -57,8 +58,8 @@ Progress = Callable[[str], None]
 class EmbeddedCloud:
     """One embedded cloud, from `__enter__` to `__exit__`.
 
-    ``ports`` may set ``gateway``, ``mqtt`` and ``pubnub``; the others are free ports. ``progress`` is called
-    with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
+    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub`` and ``relay``; the others are free ports. ``progress``
+    is called with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class EmbeddedCloud:
     def _start(self) -> None:
         self._take_folder()
         without_proxy(self.host)
-        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
+        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub", "relay")}
         certificate, key = Authority().write(self.folder, "gateway", self.host)
         self.cloud = Cloud(
             namespace=self.namespace,
@@ -111,6 +112,10 @@ class EmbeddedCloud:
         root_ca = self._get("/_ministack/iot/ca.pem").decode()
         # Robots also send files to the gateway, which has a certificate of its own.
         self.cloud = replace(self.cloud, root_ca_pem=root_ca + certificate.read_text())
+        gateway = self.cloud.endpoint_url or ""
+        relay = Relay(self.host, ports["relay"], gateway=gateway, authority=str(certificate))
+        self._exit.enter_context(relay)
+        self.cloud = replace(self.cloud, websocket=relay.url)
         self._progress("PubNub stand-in")
         publish_key, subscribe_key = (f"{kind}-c-{secrets.token_hex(8)}" for kind in ("pub", "sub"))
         self.pubnub = PubNubStandIn(

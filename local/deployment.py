@@ -27,7 +27,12 @@ def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
     cdk = CommandLine(cloud, folder, progress)
 
     def synthesize(output: Path) -> None:
-        settings = {"embedded": "true", "namespace": cloud.namespace, "layer": "build/layer/local"}
+        settings = {
+            "embedded": "true",
+            "namespace": cloud.namespace,
+            "layer": "build/layer/local",
+            "drivers": "true",
+        }
         context = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
         app = f"{shlex.quote(sys.executable)} app.py"
         cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *context)

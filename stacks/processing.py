@@ -25,8 +25,8 @@ from iort_contract.catalog.environments import (
     UploadEnvironment,
 )
 from iort_contract.catalog.questions import QUESTIONS
-from iort_contract.catalog.rules import RULES, Call
-from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
+from iort_contract.catalog.rules import Call
+from iort_contract.cloud import PUBNUB, RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS, TOPIC
@@ -60,7 +60,7 @@ class Processing(PlatformStack):
     ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
-        live = self._live()
+        live = {"live": self._live()} if settings.live_transport == PUBNUB else {}
         # The keys of waiting batches, whose robot is over its share of Lambda 2.
         put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
         self._summarize(put_off)
@@ -68,9 +68,9 @@ class Processing(PlatformStack):
         echo, upload = self._echo(), self._upload()
         self._query()
         self.alarms = self._alarms()
-        self.called = {**called, "live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        self.called = {**called, **live, "echo": echo, "upload": upload, "alert": self._alert()}
         self.called["answer"] = self._answer()
-        for rule in RULES.values():
+        for rule in settings.rules:
             if isinstance(rule.action, Call) and rule.action.function not in self.called:
                 self.called[rule.action.function] = self._plain(rule.action.function)
 
