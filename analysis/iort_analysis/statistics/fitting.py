@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.statistics.intervals import t95
+from iort_analysis.statistics.intervals import sides
 from iort_analysis.statistics.normal import between
 from iort_contract.messages.analysis.findings import Estimate
 
@@ -109,13 +109,13 @@ def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], un
 
 def estimate(value: float, deviation: float, unit: str, blocks: int = BLOCKS) -> Estimate:
     """The estimate with its interval."""
-    half = t95(blocks - 1) * deviation
+    half = sides(blocks - 1) * deviation
     return Estimate(value, value - half, value + half, unit)
 
 
 def deviation_of(found: Estimate) -> float:
     """The deviation behind an estimate's interval."""
-    return (found.high - found.low) / 2 / t95(BLOCKS - 1)
+    return (found.high - found.low) / 2 / sides(BLOCKS - 1)
 
 
 class _Problem(NamedTuple):
