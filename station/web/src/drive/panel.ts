@@ -76,6 +76,7 @@ export class DrivePanel {
   show(): void {
     const motion = this.robot === undefined ? undefined : this.stops.of(this.robot);
     this.node.hidden = !this.config.drivers || !may(this.config, "drive") || (!motion?.drive && !this.wheel);
+    this.name.placeholder = this.stops.user;
     if (!this.wheel) this.say("");
   }
 
