@@ -46,8 +46,8 @@ from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
-from iort_contract.topics import parse_topic
-from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message, record_of
+from iort_contract.topics import RECORD, build_topic, parse_topic
+from tests.fakes import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message, record_of
 from tests.unit.contract.contract_values import BOOT
 
 DAY_S = 86_400
@@ -65,21 +65,18 @@ class Killed(BaseException):
 
 
 @pytest.fixture
-def cloud(dynamodb, monkeypatch):
-    """An empty deployment; its queue's tasks are done by `Cloud.work`."""
-    boto3.client("s3").create_bucket(
-        Bucket="files", CreateBucketConfiguration={"LocationConstraint": "eu-west-1"}
-    )
+def cloud(dynamodb, s3, monkeypatch):
+    """An empty deployment."""
     url = boto3.client("sqs").create_queue(QueueName="tasks")["QueueUrl"]
-    given = ArchiveEnvironment("iort", TELEMETRY, "archive", ROBOTS, "files", url, RETENTION_S)
+    given = ArchiveEnvironment("iort", TELEMETRY, "archive", ROBOTS, FILES, url, RETENTION_S)
     for name, value in given.variables().items():
         monkeypatch.setenv(name, value)
-    return Cloud(dynamodb)
+    return Cloud(dynamodb, s3)
 
 
 class Cloud:
-    def __init__(self, dynamodb):
-        self.dynamodb, self.s3, self.sqs = dynamodb, boto3.client("s3"), boto3.client("sqs")
+    def __init__(self, dynamodb, s3):
+        self.dynamodb, self.s3, self.sqs = dynamodb, s3, boto3.client("sqs")
         self.archive = archive_of_environment()
         self.marks = self.archive.marks
 
@@ -103,13 +100,13 @@ class Cloud:
 
     def speeds(self, hour=HOUR_0):
         """What the row's object says."""
-        body = self.s3.get_object(Bucket="files", Key=self.row(hour).key)["Body"].read()
+        body = self.s3.get_object(Bucket=FILES, Key=self.row(hour).key)["Body"].read()
         assert hashlib.sha256(body).hexdigest() == self.row(hour).sha256
         assert len(body) == self.row(hour).size_bytes
         return values(join(list(in_order(ArchiveFile(body).pages(hour)))).columns["speed"])
 
     def keys(self):
-        return sorted(one["Key"] for one in self.s3.list_objects_v2(Bucket="files").get("Contents", ()))
+        return sorted(one["Key"] for one in self.s3.list_objects_v2(Bucket=FILES).get("Contents", ()))
 
     def pending(self):
         return [pending for pending, _ in self.marks.every()]
@@ -141,10 +138,10 @@ def test_an_hour_is_archived_once_and_nothing_changes_afterwards(cloud, capsys):
     # What is left to do is to join the day.
     assert cloud.pending() == [DAY]
     assert '"HoursArchived":1' in capsys.readouterr().out
-    before = cloud.s3.head_object(Bucket="files", Key=row.key)
+    before = cloud.s3.head_object(Bucket=FILES, Key=row.key)
     cloud.archived(now_ms=NOW_MS + 5)
     assert cloud.row() == row
-    assert cloud.s3.head_object(Bucket="files", Key=row.key)["LastModified"] == before["LastModified"]
+    assert cloud.s3.head_object(Bucket=FILES, Key=row.key)["LastModified"] == before["LastModified"]
     assert not capsys.readouterr().out
 
 
@@ -156,7 +153,7 @@ def test_a_late_batch_rewrites_its_hour_also_after_the_others_have_expired(cloud
     }
     cloud.dynamodb.put_item(TableName=TELEMETRY, Item=refused)
     cloud.archived()
-    assert cloud.s3.get_object(Bucket="files", Key=refused_key(CAR, HOUR_0))["Body"].read() == (
+    assert cloud.s3.get_object(Bucket=FILES, Key=refused_key(CAR, HOUR_0))["Body"].read() == (
         json.dumps(refused, separators=(",", ":")).encode() + b"\n"
     )
     assert cloud.row().refused == 1
@@ -594,3 +591,17 @@ def test_a_task_that_failed_for_good_is_in_quarantine_under_its_robot():
     body = json.dumps({TASK: ARCHIVE, TOPIC: TOPIC_OF_CAR, HOUR: str(HOUR_0)})
     (entry,) = entries(body, lambda _: [])
     assert (entry.robot, entry.reason) == ("car", f"the archive failed in five attempts: {ARCHIVE} {HOUR_0}")
+
+
+def test_the_marks_of_a_fleet_are_in_many_partitions_and_come_oldest_first(cloud):
+    """At a full hour all streams are marked within a second."""
+    topics = [build_topic(RECORD, f"car{number}", "vesc") for number in range(40)]
+    for number, topic in enumerate(topics):
+        cloud.marks.note(topic, [Hour(HOUR_0.number + number % 3).start_us], NOW_MS)
+
+    found = cloud.pending()
+
+    partitions = {pending.key[TOPIC]["S"] for pending in found}
+    assert len(partitions) == 8
+    assert {pending.topic for pending in found} == set(topics)
+    assert [pending.period for pending in found] == sorted(pending.period for pending in found)

@@ -9,6 +9,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.drives.motion import motion_field, moving
 from iort_analysis.results import Event, Mined
 from iort_analysis.samples.blocks import Block
+from iort_analysis.statistics.intervals import sides
 from iort_contract.messages.analysis.findings import Estimate
 
 KIND = "can_intermittent"
@@ -19,7 +20,6 @@ _REPEATED = 3
 # A link is intermittent with so many gaps, and with this share of the samples missing.
 _LEAST_GAPS, _LEAST_SHARE = 5, 0.005
 _LEAST_SAMPLES = 500
-_Z = 1.645
 
 
 def mine_gaps(drive: Drive) -> Mined:
@@ -39,7 +39,7 @@ def mine_gaps(drive: Drive) -> Mined:
     if len(places) < _LEAST_GAPS or share < _LEAST_SHARE:
         return Mined()
     longest = int(places[np.argmax(lost[places])])
-    error = _Z * float(np.sqrt((lost[places] ** 2).sum())) / len(times)
+    error = sides() * float(np.sqrt((lost[places] ** 2).sum())) / len(times)
     effect = Estimate(share, max(0.0, share - error), share + error, "1")
     text = (
         f"{share:.1%} of the controller's samples are missing ({effect.low:.1%} to {effect.high:.1%}), in "
