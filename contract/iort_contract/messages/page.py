@@ -187,6 +187,37 @@ class SettingsAnswer(TypedDict):
     online: bool
 
 
+class DriveLimitsEntry(TypedDict):
+    """What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`."""
+
+    command: str
+    speed: str
+    steering: str
+    max_speed_mps: float
+    max_steering_rad: float
+    lease_ms: int
+
+
+class MotionEntry(TypedDict):
+    """Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere,
+    ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it.
+    ``drive`` is null if a stick cannot drive it."""
+
+    asked: bool
+    stopped: bool | None
+    reason: str
+    drive: DriveLimitsEntry | None
+
+
+class MotionAnswer(TypedDict):
+    """Answers ``motion`` and ``stop``: each robot's. ``user`` is who drives if the viewer gives no name.
+    ``failed`` has the reason for each robot whose stop could not be changed."""
+
+    robots: dict[str, MotionEntry]
+    user: str
+    failed: dict[str, str]
+
+
 class SendAnswer(TypedDict):
     """Answers ``send``: null if the robot did not answer, or its reason if it rejected the command."""
 
@@ -353,6 +384,7 @@ Answer = Union[
     AlarmsAnswer,
     RejectedAnswer,
     RunsAnswer,
+    MotionAnswer,
     SendAnswer,
     SettingsAnswer,
 ]

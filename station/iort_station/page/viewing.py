@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 
 from iort_contract.messages.page import ViewAnswer
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, encode_lease, lease_topic
+from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
+from iort_station.fleet import viewing
 from iort_station.page.parameters import number, text, whole
 
 # The cards on a large screen, twice.
 _MOST_ROBOTS = 256
-_AT_ONCE = 8
 
 
 def view(cloud: Cloud, asked: Mapping[str, str]) -> ViewAnswer:
@@ -22,8 +21,4 @@ def view(cloud: Cloud, asked: Mapping[str, str]) -> ViewAnswer:
     if len(robots) > _MOST_ROBOTS:
         raise StationError(f"robots must be at most {_MOST_ROBOTS}, got {len(robots)}")
     lease = Lease(text(asked, "viewer"), number(asked, "rate_hz"), whole(asked, "lease_ms", 0, VIEW_LEASE_MS))
-    payload, data = encode_lease(lease), cloud.client("iot-data")
-    topics = [lease_topic(robot, cloud.namespace) for robot in robots]
-    with ThreadPoolExecutor(min(_AT_ONCE, len(topics))) as pool:
-        list(pool.map(lambda topic: data.publish(topic=topic, qos=0, payload=payload), topics))
-    return {"asked": len(topics)}
+    return {"asked": viewing.view(cloud, robots, lease)}

@@ -14,7 +14,7 @@ from rich.text import Text
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import FAULTS, hottest_degc
 from iort_contract.limits import GONE_S, STALE_S, ContractError
-from iort_contract.messages.live import decode_live_update
+from iort_contract.messages.live import decode_live_update, silent_s
 
 MAX_ROBOTS = 256
 _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
@@ -28,13 +28,15 @@ class Car:
     heard_us: int = 0
     taken_us: int = 0
     delay_ms: float = 0.0
+    # For so long it may send nothing.
+    silent_s: float = 0.0
     sample: dict[str, Any] = field(default_factory=dict)
 
     def state(self, now_us: int) -> str:
         """``online``, ``stale`` or ``gone``."""
-        if now_us - self.heard_us > GONE_S * 1e6:
+        if now_us - self.heard_us > (self.silent_s + GONE_S) * 1e6:
             return "gone"
-        return "stale" if now_us - self.taken_us > STALE_S * 1e6 else "online"
+        return "stale" if now_us - self.taken_us > (self.silent_s + STALE_S) * 1e6 else "online"
 
     def age_s(self, now_us: int) -> float:
         """The age of the newest value."""
@@ -72,7 +74,7 @@ class FleetWatch:
             if robot not in self._cars and len(self._cars) >= MAX_ROBOTS:
                 del self._cars[min(self._cars.values(), key=lambda car: car.heard_us).robot]
             car = self._cars.setdefault(robot, Car(robot))
-            car.heard_us = now_us
+            car.heard_us, car.silent_s = now_us, silent_s(live.next_ms)
             # A sample's age is its age on leaving, by the car's clock, and the delay since then.
             car.delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
             in_car_us = live.sent_us - live.t_us

@@ -645,6 +645,31 @@ export interface SettingsAnswer {
   readonly online: boolean;
 }
 
+/** What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`. */
+export interface DriveLimitsEntry {
+  readonly command: string;
+  readonly speed: string;
+  readonly steering: string;
+  readonly max_speed_mps: number;
+  readonly max_steering_rad: number;
+  readonly lease_ms: number;
+}
+
+/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it. ``drive`` is null if a stick cannot drive it. */
+export interface MotionEntry {
+  readonly asked: boolean;
+  readonly stopped: boolean | null;
+  readonly reason: string;
+  readonly drive: DriveLimitsEntry | null;
+}
+
+/** Answers ``motion`` and ``stop``: each robot's. ``user`` is who drives if the viewer gives no name. ``failed`` has the reason for each robot whose stop could not be changed. */
+export interface MotionAnswer {
+  readonly robots: Readonly<Record<string, MotionEntry>>;
+  readonly user: string;
+  readonly failed: Readonly<Record<string, string>>;
+}
+
 /** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */
 export interface SendAnswer {
   readonly accepted: boolean | null;

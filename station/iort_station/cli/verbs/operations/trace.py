@@ -19,6 +19,7 @@ from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+from iort_station.fleet.viewing import Viewer
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener
@@ -53,14 +54,15 @@ def trace_(
 
     pubnub = keys.load(cloud)
     listener = Listener(robot=robot, namespace=cloud.namespace, on_update=take, **pubnub.reading())
-    with listener, errors.status(f"listening to {robot}"):
+    viewer = Viewer(cloud, [robot])
+    with listener, viewer, errors.status(f"listening to {robot}"):
         with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
             here_to_pubnub = trace.clock_of(ask, lambda: time.time_ns() // 1000)
         enough.wait(seconds)
     if not found:
         raise StationError(
             f"no update of {robot}'s stream {stream} arrived in {seconds:g} s: "
-            "is it driving, and is its live lane on?"
+            f"is it driving, and is its live lane on? {viewer.problem}".rstrip()
         )
     result = trace.trace(
         found,

@@ -15,13 +15,13 @@ from rich.live import Live
 from rich.text import Text
 
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.limits import ContractError
+from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
 from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import out
 from iort_station.cli.options import Token
 from iort_station.cli.words import examples, say
-from iort_station.fleet import registry
+from iort_station.fleet import registry, viewing
 from iort_station.page import keys
 from iort_station.page.listener import Listener
 from iort_station.page.watch import FleetWatch
@@ -29,6 +29,8 @@ from iort_station.times import iso
 
 commands = typer.Typer()
 _REFRESH_S = 0.25
+# No more than the terminal shows.
+_RATE_HZ = 1 / _REFRESH_S
 
 
 @commands.command("watch", epilog=examples("watch", "watch --json --seconds 5"))
@@ -38,9 +40,15 @@ def watch(
     seconds: Annotated[
         float | None, typer.Option(min=0, help="Stop after this time. Default: never.")
     ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(
+            min=LIVE_MIN_RATE_HZ, max=LIVE_MAX_RATE_HZ, help="Updates a second to ask of each stream."
+        ),
+    ] = _RATE_HZ,
     token: Token = "",
 ) -> None:
-    """Show every car in the terminal, live, until Ctrl-C."""
+    """Show every car in the terminal, live, until Ctrl-C. The cars send at the rate asked for until then."""
     cloud = context.obj.cloud()
     vehicles = {robot: Vehicle(**car) for robot, car in registry.vehicles(cloud).items()}
     fleet, done = FleetWatch(vehicles), threading.Event()
@@ -51,13 +59,16 @@ def watch(
         token=token,
         **keys.load(cloud).reading(),
     )
+    viewer = viewing.Viewer(cloud, lambda: viewing.online(cloud), rate_hz=rate)
     try:
-        with listener:
+        with listener, viewer:
             if as_json:
                 say(f"listening to {cloud.namespace}.*")
+                if viewer.problem:
+                    say(viewer.problem)
                 done.wait(seconds)
             else:
-                _show(fleet, seconds, cloud.namespace)
+                _show(fleet, viewer, seconds, cloud.namespace)
     except KeyboardInterrupt:
         return
 
@@ -86,7 +97,7 @@ def _print_line(update: Any, now_us: int, done: threading.Event) -> None:
         done.set()
 
 
-def _show(fleet: FleetWatch, seconds: float | None, namespace: str) -> None:
+def _show(fleet: FleetWatch, viewer: viewing.Viewer, seconds: float | None, namespace: str) -> None:
     end = None if seconds is None else time.monotonic() + seconds
     tick = threading.Event()
     with Live(console=out, auto_refresh=False, transient=False) as live:
@@ -96,6 +107,8 @@ def _show(fleet: FleetWatch, seconds: float | None, namespace: str) -> None:
             words = cars if count else f"waiting for a car on {namespace}.* (Ctrl-C stops)"
             if fleet.refused:
                 words += f" {fleet.refused} malformed updates."
+            if viewer.problem:
+                words += f" {viewer.problem}"
             table = fleet.table(time.time_ns() // 1000, out.width)
             live.update(Group(table, Text(words, style="dim")), refresh=True)
             tick.wait(_REFRESH_S)
