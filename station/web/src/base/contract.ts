@@ -517,9 +517,22 @@ export interface TrackMap {
   readonly w_left_m: readonly number[];
 }
 
-/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
+/** The identity that everybody gets, of an Amazon Cognito identity ``pool``, from ``endpoint``. Its credentials sign ``socket``, the broker's address, for the service iotdevicegateway. Client ids begin with ``client_prefix``. It hears ``robots``, or all of them if there are none; it publishes nothing. */
+export interface Identity {
+  readonly pool: string;
+  readonly region: string;
+  readonly endpoint: string;
+  readonly socket: string;
+  readonly client_prefix: string;
+  readonly robots: readonly string[];
+}
+
+/** ``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers`` says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
+  readonly live: "pubnub" | "iot";
+  readonly identity: Identity | null;
+  readonly drivers: boolean;
   readonly subscribe_key: string;
   readonly origin: string;
   readonly tls: boolean;
@@ -529,6 +542,12 @@ export interface Config {
   readonly keyed: readonly string[];
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
   readonly track: TrackMap | null;
+}
+
+/** Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection to the broker, to be opened within 5 minutes, and the client id for it. */
+export interface SocketAnswer {
+  readonly url: string;
+  readonly client_id: string;
 }
 
 /** Answers ``key``, once for each token; or again for the key itself. */
