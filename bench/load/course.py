@@ -1,5 +1,7 @@
-"""A car to drive by hand from a browser: an embedded cloud, a ROS graph with the agent and a subscriber of its motion
-commands, the page's server, and a proxy between the browser and the broker."""
+"""A car to drive by hand from a browser: an embedded cloud, the page's server, and a ROS graph.
+
+The graph has the agent and a subscriber of its motion commands. A proxy is between browser and broker.
+"""
 
 from __future__ import annotations
 

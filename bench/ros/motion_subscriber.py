@@ -6,19 +6,21 @@ processes of a machine share; `CLOCK_REALTIME` follows it.
 
 from __future__ import annotations
 
+import struct
 import sys
 import time
 from typing import Any
 
 import rospy
-from geometry_msgs.msg import Twist
 
 
 def _heard(message: Any) -> None:
-    sys.stdout.write(f"{time.monotonic()} {time.time()} {message.linear.x}\n")
+    # Six doubles, of which linear.x is the first.
+    speed = struct.unpack_from("<d", message._buff)[0]  # noqa: SLF001 - as rospy documents AnyMsg
+    sys.stdout.write(f"{time.monotonic()} {time.time()} {speed}\n")
     sys.stdout.flush()
 
 
 rospy.init_node("motion_subscriber", disable_signals=True)
-rospy.Subscriber(sys.argv[1], Twist, _heard, tcp_nodelay=True)
+rospy.Subscriber(sys.argv[1], rospy.AnyMsg, _heard, tcp_nodelay=True)
 rospy.spin()
