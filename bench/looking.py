@@ -131,15 +131,13 @@ def _looked(options: argparse.Namespace, console: Console) -> list[Look]:
         server = stack.enter_context(_served(embedded.cloud))
         looking = _Looking(browser, server.url, counted, options.cars, options.pictures)
         _until(lambda: len(counted.over(1.0)) > 0, "a car", 60)
-        looks = [
+        return [
             looking.at("nobody looks", None),
             looking.at("the fleet", "#/"),
             *looking.one_car(),
             looking.killed(),
-            _far(browser, embedded.cloud, counted, console),
+            _far(browser, embedded.cloud),
         ]
-        console.print("done")
-        return looks
 
 
 class _Looking:
@@ -179,7 +177,7 @@ class _Looking:
 
     def killed(self) -> Look:
         """Kill the process of a page that looks at the car."""
-        with self._page(f"#/car/{_WATCHED}") as page:
+        with self._page(f"#/car/{_WATCHED}"):
             threading.Event().wait(2)
             session = self._browser.new_browser_cdp_session()
             processes = session.send("SystemInfo.getProcessInfo")["processInfo"]
@@ -189,7 +187,6 @@ class _Looking:
             began = time.monotonic()
             _sleeps(self._counted)
             slept_s = time.monotonic() - began
-            del page
         if slept_s > VIEW_LEASE_MS / 1000 + 2:
             raise BenchError(f"a killed page held its car awake for {slept_s:.1f} s")
         return self._count("its process is killed", None, f"idle after {slept_s:.1f} s")
@@ -217,7 +214,7 @@ class _Looking:
         return Look(what, watched / _COUNTED_S, others / _COUNTED_S, note)
 
 
-def _far(browser: Any, cloud: Cloud, counted: Counted, console: Console) -> Look:
+def _far(browser: Any, cloud: Cloud) -> Look:
     """Look at the car over a slow connection that drops, and note the longest time without a message."""
     relay = int(cloud.websocket_url.rpartition(":")[2].partition("/")[0])
     with Proxy("127.0.0.1", relay, latency_s=_LATENCY_S) as proxy:
@@ -234,8 +231,6 @@ def _far(browser: Any, cloud: Cloud, counted: Counted, console: Console) -> Look
             heard = (page.evaluate("iort.received") - began) / _FAR_S
             delay = page.evaluate(f"iort.robots.{_WATCHED}.delay_ms.median?.total")
             page.close()
-    console.print(f"{len(proxy.attempts)} connections in {_FAR_S:.0f} s")
-    del counted
     note = f"heard by the page, {len(proxy.attempts)} connections, longest silence {longest_s:.1f} s"
     return Look("200 ms and a drop every 20 s", heard, 0.0, f"{note}, median delay {delay:.0f} ms")
 

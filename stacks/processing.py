@@ -26,7 +26,7 @@ from iort_contract.catalog.environments import (
 )
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.rules import Call
-from iort_contract.cloud import PUBNUB, RESULTS_PREFIX, pubnub_parameter
+from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS, TOPIC
@@ -60,7 +60,7 @@ class Processing(PlatformStack):
     ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
-        live = {"live": self._live()} if settings.live_transport == PUBNUB else {}
+        live = {"live": self._live()} if settings.has_lambda_1 else {}
         # The keys of waiting batches, whose robot is over its share of Lambda 2.
         put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
         self._summarize(put_off)
@@ -102,6 +102,8 @@ class Processing(PlatformStack):
         invoked_by_rule(live, self._rejected)
         parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
         allow(live, ["ssm:GetParameter"], parameter)
+        # Its rule imports it only with PubNub, and CloudFormation removes no export before its import.
+        self.export_value(live.function_arn)
         return live
 
     def _summarize(self, put_off: sqs.Queue) -> None:

@@ -151,7 +151,7 @@ class Settings(BaseModel):
     live_transport: Annotated[str, _one_of(PUBNUB, IOT)] = Field(
         default=PUBNUB,
         description="how live messages reach the page: `pubnub` by Lambda 1 and PubNub, `iot` by AWS IoT's "
-        "own WebSockets, without Lambda 1 and its rule ([the difference](page.md#two-ways-to-the-page))",
+        "own WebSockets, so that Lambda 1 has nothing to do ([the difference](page.md#two-ways-to-the-page))",
     )
     drivers: Flag = Field(
         default=False,
@@ -257,8 +257,15 @@ class Settings(BaseModel):
         return self.live_concurrency
 
     @property
+    def has_lambda_1(self) -> bool:
+        """Whether Lambda 1 exists. On AWS it stays without its rule, which costs nothing, so that one
+        deployment is enough to change the way; the embedded cloud is always new."""
+        return self.live_transport == PUBNUB or not self.embedded
+
+    @property
     def rules(self) -> list[Rule]:
-        """The catalogue's rules; without Lambda 1 whoever looks at a car subscribes to its live messages."""
+        """The catalogue's rules. Without PubNub whoever looks at a car subscribes to its live messages, so no
+        rule sends them on."""
         return [
             rule for rule in RULES.values() if rule.action != Call("live") or self.live_transport == PUBNUB
         ]
@@ -303,7 +310,7 @@ class Settings(BaseModel):
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
             )
-        needed = [settings.layer] if settings.live_transport == PUBNUB else []
+        needed = [settings.layer] if settings.has_lambda_1 else []
         needed += [] if settings.embedded else [settings.analysis_layer]
         if missing := [folder for folder in needed if not folder.is_dir()]:
             raise SettingsError(f"layer {missing[0]} is missing: run `make layer`")

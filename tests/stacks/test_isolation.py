@@ -69,10 +69,13 @@ def test_everybody_hears_only_the_robots_of_the_site(deployment, reader):
         for logical_id, resource in template["Resources"].items()
         if logical_id.startswith("PublicRoleDefaultPolicy")
     )
-    statements = [{**s, "Resource": reader.texts(s["Resource"])} for s in policy["Statement"]]
+    statements = [
+        {**s, "Resource": [arn.replace(IOT, ACCOUNT) for arn in reader.texts(s["Resource"])]}
+        for s in policy["Statement"]
+    ]
     for robot, heard in ((A, True), (B, False), ("+", False), (f"{A}-2", False)):
-        assert allows(statements, "iot:Subscribe", f"{IOT}:topicfilter/live/iort/{robot}/+") == heard
-        assert allows(statements, "iot:Receive", f"{IOT}:topic/live/iort/{robot}/vesc") == heard
+        assert allows(statements, "iot:Subscribe", f"{ACCOUNT}:topicfilter/live/iort/{robot}/+") == heard
+        assert allows(statements, "iot:Receive", f"{ACCOUNT}:topic/live/iort/{robot}/vesc") == heard
 
 
 @pytest.mark.parametrize(

@@ -37,31 +37,34 @@ PEOPLE = (VIEWER, DRIVER, EVERYBODY)
 
 
 class Person(Role):
-    """A role as somebody has it; for everybody, the credentials of Amazon Cognito without a password."""
+    """A role, with a client id of the test's choice."""
 
-    def __init__(self, cloud: Any, who: str) -> None:
-        super().__init__(cloud, VIEWER if who == EVERYBODY else who)
-        self.as_client = ""
-        if who == EVERYBODY:
-            cognito = cloud._session.client(
-                "cognito-identity",
-                endpoint_url=cloud.endpoint_url,
-                verify=cloud.ca_bundle,
-                config=Config(signature_version=UNSIGNED),
-            )
-            identity = cognito.get_id(IdentityPoolId=socket.identity(cloud)["pool"])["IdentityId"]
-            got = cognito.get_credentials_for_identity(IdentityId=identity)["Credentials"]
-            self._assume = lambda: ReadOnlyCredentials(  # type: ignore[method-assign]
-                got["AccessKeyId"], got["SecretKey"], got["SessionToken"]
-            )
+    as_client = ""
 
     def client_id(self) -> str:
         return self.as_client or super().client_id()
 
 
+class Everybody(Person):
+    """The credentials that Amazon Cognito gives to anybody."""
+
+    def _assume(self) -> ReadOnlyCredentials:
+        cloud = self._cloud
+        cognito = cloud._session.client(
+            "cognito-identity",
+            endpoint_url=cloud.endpoint_url,
+            verify=cloud.ca_bundle,
+            config=Config(signature_version=UNSIGNED),
+        )
+        identity = cognito.get_id(IdentityPoolId=socket.identity(cloud)["pool"])["IdentityId"]
+        got = cognito.get_credentials_for_identity(IdentityId=identity)["Credentials"]
+        return ReadOnlyCredentials(got["AccessKeyId"], got["SecretKey"], got["SessionToken"])
+
+
 @pytest.fixture(scope="module")
 def people(embedded):
-    return {who: Person(embedded.cloud, who) for who in PEOPLE}
+    cloud = embedded.cloud
+    return {VIEWER: Person(cloud, VIEWER), DRIVER: Person(cloud, DRIVER), EVERYBODY: Everybody(cloud)}
 
 
 def may(cloud: Any, person: Person, row: Row) -> bool:

@@ -46,7 +46,7 @@ from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
-from iort_contract.topics import parse_topic
+from iort_contract.topics import RECORD, build_topic, parse_topic
 from tests.fakes import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of, item_of_message, record_of
 from tests.unit.contract.contract_values import BOOT
 
@@ -591,3 +591,17 @@ def test_a_task_that_failed_for_good_is_in_quarantine_under_its_robot():
     body = json.dumps({TASK: ARCHIVE, TOPIC: TOPIC_OF_CAR, HOUR: str(HOUR_0)})
     (entry,) = entries(body, lambda _: [])
     assert (entry.robot, entry.reason) == ("car", f"the archive failed in five attempts: {ARCHIVE} {HOUR_0}")
+
+
+def test_the_marks_of_a_fleet_are_in_many_partitions_and_come_oldest_first(cloud):
+    """At a full hour all streams are marked within a second."""
+    topics = [build_topic(RECORD, f"car{number}", "vesc") for number in range(40)]
+    for number, topic in enumerate(topics):
+        cloud.marks.note(topic, [Hour(HOUR_0.number + number % 3).start_us], NOW_MS)
+
+    found = cloud.pending()
+
+    partitions = {pending.key[TOPIC]["S"] for pending in found}
+    assert len(partitions) == 8
+    assert {pending.topic for pending in found} == set(topics)
+    assert [pending.period for pending in found] == sorted(pending.period for pending in found)
