@@ -62,8 +62,8 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "insights": lambda asked: insights.insights(cloud, asked),
         "analysis": lambda asked: insights.progress(cloud, asked),
         **laps.answers(cloud),
-        **notes.answers(cloud),
         **socket.answers(cloud),
+        **notes.answers(cloud),
         **motion.answers(cloud),
     }
 

@@ -32,8 +32,8 @@ def actions(cloud: Cloud) -> dict[str, Answer]:
         "settings": lambda asked: settings(cloud, asked),
         "set": lambda asked: change(cloud, asked),
         "analyse": lambda asked: insights.analyse(cloud, asked),
-        **notes.actions(cloud),
         **socket.actions(cloud),
+        **notes.actions(cloud),
         **motion.actions(cloud),
     }
 
