@@ -26,7 +26,8 @@ def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundl
     topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
 
     def marked():
-        return [one for one in rows(embedded, PENDING) if parse_pending(one).topic == topic]
+        found = (one for partition in PENDING for one in rows(embedded, partition))
+        return [one for one in found if parse_pending(one).topic == topic]
 
     # The operator need not wait until no batch may follow.
     (mark,) = until(marked)

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import boto3
 import numpy as np
@@ -32,20 +33,19 @@ from iort_contract.messages.analysis.run import (
 )
 from iort_contract.messages.batch import Batch
 from iort_contract.page import PAGE_URL
-from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
+from iort_contract.tables import ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.fakes import item_of
+from tests.fakes import ARCHIVE, FILES, FINDINGS, ROBOTS, TELEMETRY, item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
 S = 1_000_000
-CAR, BUCKET, RUN = "car", "files", "00c0ffee"
-TELEMETRY, ARCHIVE, ROBOTS, FINDINGS = "telemetry", "archive", "robots", "findings"
+CAR, RUN = "car", "00c0ffee"
 VARIABLES = {
     "TELEMETRY_TABLE": TELEMETRY,
     "ARCHIVE_TABLE": ARCHIVE,
     "ROBOTS_TABLE": ROBOTS,
     "FINDINGS_TABLE": FINDINGS,
-    "FILES_BUCKET": BUCKET,
+    "FILES_BUCKET": FILES,
     "PAGE_URL": PAGE_URL,
 }
 JOB = "night"
@@ -54,8 +54,8 @@ JOB = "night"
 class Deployed:
     """The tables and the bucket in moto, and the state machine's calls of the functions."""
 
-    def __init__(self, topic: str) -> None:
-        self.dynamodb, self.s3, self.topic = boto3.client("dynamodb"), boto3.client("s3"), topic
+    def __init__(self, dynamodb: Any, s3: Any, topic: str) -> None:
+        self.dynamodb, self.s3, self.topic = dynamodb, s3, topic
         self.table = FindingsTable(self.dynamodb, FINDINGS)
 
     def register(self, robot: str, *streams_of: str, **numbers: float) -> None:
@@ -92,35 +92,15 @@ class Deployed:
         return drives
 
     def json(self, key: str) -> object:
-        return json.loads(self.s3.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+        return json.loads(self.s3.get_object(Bucket=FILES, Key=key)["Body"].read())
 
 
 @pytest.fixture
-def cloud(aws: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
-    dynamodb = boto3.client("dynamodb")
-    tables = {
-        TELEMETRY: (TOPIC, "batch"),
-        ARCHIVE: (TOPIC, "hour"),
-        ROBOTS: (ROBOT,),
-        FINDINGS: (ROBOT, FINDING),
-    }
-    for table, keys in tables.items():
-        dynamodb.create_table(
-            TableName=table,
-            KeySchema=[
-                {"AttributeName": key, "KeyType": kind}
-                for key, kind in zip(keys, ("HASH", "RANGE"), strict=False)
-            ],
-            AttributeDefinitions=[{"AttributeName": key, "AttributeType": "S"} for key in keys],
-            BillingMode="PAY_PER_REQUEST",
-        )
-    boto3.client("s3").create_bucket(
-        Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"}
-    )
+def cloud(dynamodb: Any, s3: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
     topic = boto3.client("sns").create_topic(Name="alarms")["TopicArn"]
     for name, value in {**VARIABLES, "ALARM_TOPIC": topic}.items():
         monkeypatch.setenv(name, value)
-    return Deployed(topic)
+    return Deployed(dynamodb, s3, topic)
 
 
 def later(blocks: dict[str, Block], seconds: int) -> dict[str, Block]:
@@ -144,7 +124,7 @@ def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) 
     assert first.estimates["lap_mean_s"].unit == "s"
     result = cloud.json(f"{drive_prefix(first.drive)}result.json")
     assert result["estimates"].keys() == first.estimates.keys()
-    file = cloud.s3.get_object(Bucket=BUCKET, Key=f"{drive_prefix(first.drive)}laps.parquet")
+    file = cloud.s3.get_object(Bucket=FILES, Key=f"{drive_prefix(first.drive)}laps.parquet")
     laps = read_table(file["Body"].read())
     assert laps["time_s"][laps["best"]] == pytest.approx([first.estimates["lap_best_s"].value])
     assert set(laps["method"]) == {"gate"}
@@ -178,7 +158,7 @@ def test_hours_that_have_expired_are_read_from_the_archive(cloud: Deployed) -> N
         1,
         first_expires_s=1,
     )
-    cloud.s3.put_object(Bucket=BUCKET, Key=row.key, Body=file.getvalue())
+    cloud.s3.put_object(Bucket=FILES, Key=row.key, Body=file.getvalue())
     cloud.dynamodb.put_item(TableName=ARCHIVE, Item=row.item())
     for one in first[:-5]:
         key = {name: one[name] for name in (TOPIC, "batch")}
@@ -286,7 +266,7 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     cloud.table.put_drive(worn)
     result = DriveResult(worn.drive, worn.end_us, 3000, {}, Mined(estimates=worn.estimates))
     planned = PlannedDrive(worn.drive, worn.end_us, ("vesc",), "vesc")
-    kept = Kept(cloud.s3, BUCKET)
+    kept = Kept(cloud.s3, FILES)
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
@@ -334,6 +314,8 @@ def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Dep
         "&to=2023-11-14T22:13:40.000Z&fields=voltage_input,current_input\n"
     )
     assert link in text
+    share = replace(finding(), effect=Estimate(0.087, 0.005, 0.17, "1"))
+    assert "effect   0.087, 90 % sure" in present.mail(share, PAGE_URL)[1]
 
 
 def test_a_year_of_drives_with_one_fault_is_one_mail(cloud: Deployed) -> None:
@@ -421,7 +403,7 @@ def test_a_drive_whose_start_moves_is_one_drive(cloud: Deployed) -> None:
     other, whole = cloud.table.drives(CAR)
     assert (other.drive.run, whole.drive) == ("00c0ffef", DriveKey(CAR, START_US, RUN))
     assert {one.drive for one in cloud.table.findings(CAR)} <= {whole.drive, other.drive}
-    kept = cloud.s3.list_objects_v2(Bucket=BUCKET, Prefix="analysis/robot=")["Contents"]
+    kept = cloud.s3.list_objects_v2(Bucket=FILES, Prefix="analysis/robot=")["Contents"]
     folders = {one["Key"].rpartition("/")[0] + "/" for one in kept}
     assert folders == {drive_prefix(whole.drive), drive_prefix(other.drive)}
 

@@ -12,6 +12,7 @@ from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson
 from iort_station.cli.progress import bar
 from iort_station.cli.words import examples, say
+from iort_station.data.archive import Archive
 from iort_station.errors import StationError
 from iort_station.operations import archive
 
@@ -36,7 +37,7 @@ def show(
     cloud = context.obj.cloud()
     empty = True
     for topic in archive.topics(cloud, robot, stream):
-        rows = archive.rows(cloud, topic)
+        rows = list(Archive(cloud, topic).rows())
         if not rows:
             continue
         empty, name = False, parse_topic(topic)
