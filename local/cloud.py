@@ -30,6 +30,7 @@ from typing import Any
 
 from typing_extensions import Self
 
+from iort_contract.cloud import PUBNUB
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
@@ -43,6 +44,7 @@ from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
 from local.pubnub.standin import PubNubStandIn
+from local.relay import Relay
 
 FOLDER = ROOT / EMBEDDED.parent
 
@@ -57,8 +59,10 @@ Progress = Callable[[str], None]
 class EmbeddedCloud:
     """One embedded cloud, from `__enter__` to `__exit__`.
 
-    ``ports`` may set ``gateway``, ``mqtt`` and ``pubnub``; the others are free ports. ``progress`` is called
-    with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
+    With ``live="iot"`` it has nothing of PubNub: no stand-in, no Lambda 1, neither `pubnub` nor `keys`.
+
+    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub`` and ``relay``; the others are free ports. ``progress``
+    is called with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
     """
 
     def __init__(
@@ -66,11 +70,13 @@ class EmbeddedCloud:
         folder: Path = FOLDER,
         *,
         namespace: str = DEFAULT_NAMESPACE,
+        live: str = PUBNUB,
         host: str = "127.0.0.1",
         ports: dict[str, int] | None = None,
         progress: Progress = lambda _step: None,
     ) -> None:
         self.folder, self.namespace, self.host = folder, namespace, host
+        self.live = live
         self._ports, self._progress = ports or {}, progress
         self._exit = ExitStack()
         self.cloud: Cloud
@@ -94,7 +100,7 @@ class EmbeddedCloud:
     def _start(self) -> None:
         self._take_folder()
         without_proxy(self.host)
-        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
+        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub", "relay")}
         certificate, key = Authority().write(self.folder, "gateway", self.host)
         self.cloud = Cloud(
             namespace=self.namespace,
@@ -111,21 +117,28 @@ class EmbeddedCloud:
         root_ca = self._get("/_ministack/iot/ca.pem").decode()
         # Robots also send files to the gateway, which has a certificate of its own.
         self.cloud = replace(self.cloud, root_ca_pem=root_ca + certificate.read_text())
+        gateway = self.cloud.endpoint_url or ""
+        relay = Relay(self.host, ports["relay"], gateway=gateway, authority=str(certificate))
+        self._exit.enter_context(relay)
+        self.cloud = replace(self.cloud, websocket=relay.url)
+        if self.live == PUBNUB:
+            self._start_pubnub(ports["pubnub"])
+        deploy(self.cloud, self.folder, self._progress, live=self.live)
+        if self.live == PUBNUB:
+            keys.store(self.cloud, self.keys)
+        self._warm_up()
+        self.cloud.save(self.folder / EMBEDDED.name)
+        self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
+
+    def _start_pubnub(self, port: int) -> None:
         self._progress("PubNub stand-in")
         publish_key, subscribe_key = (f"{kind}-c-{secrets.token_hex(8)}" for kind in ("pub", "sub"))
-        self.pubnub = PubNubStandIn(
-            self.host, ports["pubnub"], publish_key=publish_key, subscribe_key=subscribe_key
-        )
+        self.pubnub = PubNubStandIn(self.host, port, publish_key=publish_key, subscribe_key=subscribe_key)
         self.pubnub.start()
         self._exit.callback(self.pubnub.stop)
         self.keys = PubNubKeys(
             publish_key=publish_key, subscribe_key=subscribe_key, origin=self.pubnub.origin, tls=False
         )
-        deploy(self.cloud, self.folder, self._progress)
-        keys.store(self.cloud, self.keys)
-        self._warm_up()
-        self.cloud.save(self.folder / EMBEDDED.name)
-        self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
 
     def _take_folder(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -233,6 +246,8 @@ class EmbeddedCloud:
             ("fleet", "Presence"): {},
             ("processing", "Query"): {},
         }
+        if self.live != PUBNUB:
+            del warm_up["processing", "Live"]
         client = self.cloud.client("lambda")
         for (stack, name), event in warm_up.items():
             function = self.cloud.output(stack, f"{name}Function")

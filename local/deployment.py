@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from iort_contract.cloud import PUBNUB
 from iort_station.cloud import Cloud
 from local.errors import LocalError
 from local.kept import kept
@@ -22,17 +23,28 @@ _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.tx
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract", "analysis/iort_analysis")
 
 
-def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
-    """Bootstrap and deploy every stack; logs go into ``folder``. Raises `LocalError` if that fails."""
+def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None], *, live: str = PUBNUB) -> None:
+    """Bootstrap and deploy every stack, with the way ``live`` to the page; logs go into ``folder``.
+
+    Raises `LocalError` if that fails.
+    """
     cdk = CommandLine(cloud, folder, progress)
+    settings = {
+        "embedded": "true",
+        "namespace": cloud.namespace,
+        "layer": "build/layer/local",
+        "live_transport": live,
+        # It is on loopback, as the page that drives is.
+        "drivers": "true",
+    }
+    context = [f"{key}={value}" for key, value in settings.items()]
 
     def synthesize(output: Path) -> None:
-        settings = {"embedded": "true", "namespace": cloud.namespace, "layer": "build/layer/local"}
-        context = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
         app = f"{shlex.quote(sys.executable)} app.py"
-        cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *context)
+        given = [part for one in context for part in ("-c", one)]
+        cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *given)
 
-    stacks = assembly(ROOT, ROOT / "build" / "assembly", namespace=cloud.namespace, synthesize=synthesize)
+    stacks = assembly(ROOT, ROOT / "build" / "assembly", settings=" ".join(context), synthesize=synthesize)
     cdk.put(stacks, account=_ACCOUNT)
 
 
@@ -85,9 +97,10 @@ class CommandLine:
         )
 
 
-def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:
-    """The synthesized stacks of the checkout: kept ones, or new ones from ``synthesize``."""
-    return kept(folder, namespace, sources(root), synthesize)
+def assembly(root: Path, folder: Path, *, settings: str, synthesize: Callable[[Path], None]) -> Path:
+    """The synthesized stacks of the checkout with these settings: kept ones, or new ones from
+    ``synthesize``."""
+    return kept(folder, settings, sources(root), synthesize)
 
 
 def sources(root: Path) -> list[Path]:

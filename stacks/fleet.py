@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from aws_cdk import App, Duration
+from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
@@ -12,7 +12,7 @@ from aws_cdk import aws_lambda as lambda_
 from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.tables import PRESENCE
-from stacks.parts import iot_core
+from stacks.parts import iot_core, viewers
 from stacks.parts.base import PlatformStack
 from stacks.parts.documents import claim_policy, provisioning_template, robot_policy
 from stacks.parts.function import allow, function, invoked_by_rule
@@ -23,7 +23,7 @@ from stacks.storage import Storage
 
 class Fleet(PlatformStack):
     """The resources to register robots. One policy serves all robots: its variables restrict each certificate
-    to the topics of its thing.
+    to the topics of its thing. Viewers and drivers have roles (`stacks.parts.viewers`).
 
     The function Admit decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
     """
@@ -72,6 +72,12 @@ class Fleet(PlatformStack):
         # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
+        viewers.viewer(self)
+        if settings.drivers:
+            viewers.driver(self)
+        if settings.public:
+            viewers.public_identity(self)
+        CfnOutput(self, "LiveTransport", value=settings.live_transport)
 
     def _admit(self, storage: Storage) -> lambda_.Function:
         # AWS IoT waits 5 s for the answer, cold start included. Lambda assigns CPU by memory: this is one

@@ -9,7 +9,7 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 
-from iort_contract.catalog.rules import RULES, Republish, Rule, Store
+from iort_contract.catalog.rules import Republish, Rule, Store
 from stacks.parts import iot_core
 from stacks.parts.base import PlatformStack
 from stacks.quarantine import Quarantine
@@ -36,7 +36,7 @@ class Ingest(PlatformStack):
         self._functions = functions
         self._tables = {"telemetry": storage.telemetry}
         self._queues = {"rejected": quarantine.rejected}
-        for rule in RULES.values():
+        for rule in settings.rules:
             self._rule(rule)
 
     def _rule(self, rule: Rule) -> None:

@@ -25,7 +25,7 @@ from iort_contract.catalog.environments import (
     UploadEnvironment,
 )
 from iort_contract.catalog.questions import QUESTIONS
-from iort_contract.catalog.rules import RULES, Call
+from iort_contract.catalog.rules import Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.ask import ASK_FOLDER
 from iort_contract.messages.files import FILES_PREFIX
@@ -60,7 +60,7 @@ class Processing(PlatformStack):
     ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
-        live = self._live()
+        live = {"live": self._live()} if settings.has_lambda_1 else {}
         # The keys of waiting batches, whose robot is over its share of Lambda 2.
         put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
         self._summarize(put_off)
@@ -68,9 +68,9 @@ class Processing(PlatformStack):
         echo, upload = self._echo(), self._upload()
         self._query()
         self.alarms = self._alarms()
-        self.called = {**called, "live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        self.called = {**called, **live, "echo": echo, "upload": upload, "alert": self._alert()}
         self.called["answer"] = self._answer()
-        for rule in RULES.values():
+        for rule in settings.rules:
             if isinstance(rule.action, Call) and rule.action.function not in self.called:
                 self.called[rule.action.function] = self._plain(rule.action.function)
 
@@ -102,6 +102,8 @@ class Processing(PlatformStack):
         invoked_by_rule(live, self._rejected)
         parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
         allow(live, ["ssm:GetParameter"], parameter)
+        # Its rule imports it only with PubNub, and CloudFormation removes no export before its import.
+        self.export_value(live.function_arn)
         return live
 
     def _summarize(self, put_off: sqs.Queue) -> None:

@@ -10,12 +10,13 @@ from typing import Annotated, Any, NoReturn
 from aws_cdk import App, RemovalPolicy
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V
+from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V, RULES, Call, Rule
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
+from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
-from iort_contract.topics import check_namespace
+from iort_contract.topics import check_namespace, check_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -75,6 +76,14 @@ def _email(value: Any) -> str | None:
     if not _EMAIL.fullmatch(str(value)):
         raise ValueError("must be one e-mail address")
     return str(value)
+
+
+def _robots(value: Any) -> list[str]:
+    """Parse robots: an array in cdk.json, ``car1,car2`` on the command line."""
+    names = value.split(",") if isinstance(value, str) else value
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError("must be robots as car1,car2")
+    return sorted({check_robot(name) for name in names})
 
 
 def _address(value: Any) -> str:
@@ -139,6 +148,16 @@ class Settings(BaseModel):
     upload_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
         default=50, description="a robot's daily upload limit, in 1e9 bytes"
     )
+    live_transport: Annotated[str, _one_of(PUBNUB, IOT)] = Field(
+        default=PUBNUB,
+        description="how live messages reach the page: `pubnub` by Lambda 1 and PubNub, `iot` by AWS IoT's "
+        "own WebSockets, so that Lambda 1 has nothing to do ([the difference](page.md#two-ways-to-the-page))",
+    )
+    drivers: Flag = Field(
+        default=False,
+        description="makes the role of [drivers](../explanation/security.md#viewers-and-drivers), who drive "
+        "from the page. `false`: nobody drives from a browser",
+    )
     live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
@@ -202,6 +221,11 @@ class Settings(BaseModel):
         default=PAGE_URL, description="where the page is, for the links in mails about findings"
     )
     site: Flag = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
+    site_robots: Annotated[list[str], BeforeValidator(_robots)] = Field(
+        default=[],
+        description="the robots that the page on the web shows with `live_transport=iot`, as `car1,car2`; "
+        "without a value all of them. With PubNub, its access token says which",
+    )
     embedded: Flag = Field(
         default=False, description="for the embedded cloud, with the caller's own credentials"
     )
@@ -231,6 +255,26 @@ class Settings(BaseModel):
         if self.live_concurrency is None:
             return _RESERVED_FOR_LIVE if self.protected else 0
         return self.live_concurrency
+
+    @property
+    def has_lambda_1(self) -> bool:
+        """Whether Lambda 1 exists. On AWS it stays without its rule, which costs nothing, so that one
+        deployment is enough to change the way; the embedded cloud is always new."""
+        return self.live_transport == PUBNUB or not self.embedded
+
+    @property
+    def rules(self) -> list[Rule]:
+        """The catalogue's rules. Without PubNub whoever looks at a car subscribes to its live messages, so no
+        rule sends them on."""
+        return [
+            rule for rule in RULES.values() if rule.action != Call("live") or self.live_transport == PUBNUB
+        ]
+
+    @property
+    def public(self) -> bool:
+        """Whether anybody may see live messages, by an identity of Amazon Cognito. The embedded cloud has it
+        for whoever builds such a page: it listens on loopback."""
+        return self.embedded or (self.site and self.live_transport == IOT)
 
     @property
     def retention_s(self) -> int:
@@ -266,7 +310,8 @@ class Settings(BaseModel):
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
             )
-        needed = [settings.layer] if settings.embedded else [settings.layer, settings.analysis_layer]
+        needed = [settings.layer] if settings.has_lambda_1 else []
+        needed += [] if settings.embedded else [settings.analysis_layer]
         if missing := [folder for folder in needed if not folder.is_dir()]:
             raise SettingsError(f"layer {missing[0]} is missing: run `make layer`")
         return settings

@@ -12,7 +12,8 @@ from aws_cdk import aws_cloudfront as cloudfront
 from aws_cdk import aws_cloudfront_origins as origins
 from aws_cdk import aws_s3 as s3
 
-from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.cloud import PUBNUB
+from iort_contract.page import HEADERS, pubnub_address, security_policy
 from stacks.parts.base import PlatformStack
 from stacks.settings import Settings
 
@@ -55,6 +56,14 @@ class Site(PlatformStack):
         CfnOutput(self, "PageDistribution", value=self.distribution.distribution_id)
         CfnOutput(self, "PageUrl", value=f"https://{self.distribution.distribution_domain_name}/")
 
+    def _addresses(self) -> list[str]:
+        """What the page connects to."""
+        if self.settings.live_transport == PUBNUB:
+            return [pubnub_address()]
+        aws = f"{self.region}.{self.url_suffix}"
+        # The account's own name before it is known after the deployment only.
+        return [f"https://cognito-identity.{aws}", f"wss://*.iot.{aws}"]
+
     def _headers(self) -> cloudfront.ResponseHeadersPolicy:
         """The headers of the page's own server, and HSTS."""
         custom = [
@@ -68,7 +77,7 @@ class Site(PlatformStack):
             custom_headers_behavior=cloudfront.ResponseCustomHeadersBehavior(custom_headers=custom),
             security_headers_behavior=cloudfront.ResponseSecurityHeadersBehavior(
                 content_security_policy=cloudfront.ResponseHeadersContentSecurityPolicy(
-                    content_security_policy=security_policy(origin=PUBNUB_ORIGIN, tls=True), override=True
+                    content_security_policy=security_policy(*self._addresses()), override=True
                 ),
                 content_type_options=cloudfront.ResponseHeadersContentTypeOptions(override=True),
                 frame_options=cloudfront.ResponseHeadersFrameOptions(

@@ -146,8 +146,8 @@ class Synthesized:
 
 @pytest.fixture(scope="session")
 def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """Build the app for stage dev, with the settings of the whole account."""
-    return _synthesize(tmp_path_factory, device_defender=True, iot_log_level="error")
+    """Build the app for stage dev, with drivers and the settings of the whole account."""
+    return _synthesize(tmp_path_factory, device_defender=True, iot_log_level="error", drivers=True)
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.messages.viewing import LEASE
+from iort_contract.messages.viewing import LEASE, lease_topic
 from iort_contract.topics import (
     ANSWER,
     ASK,
@@ -36,6 +36,8 @@ from iort_contract.topics import (
 # Robot A makes the attempts; B is its neighbour.
 A, B = "isolated-a", "isolated-b"
 ROBOT, CLAIM = "robot A", "claim"
+# IAM roles: of the operator's people, and of whoever opens the page on the web.
+VIEWER, DRIVER, EVERYBODY = "viewer", "driver", "everybody"
 CONNECT, PUBLISH, SUBSCRIBE, RECEIVE = "Connect", "Publish", "Subscribe", "Receive"
 
 
@@ -263,6 +265,55 @@ ROWS = [
         ),
     ),
 ]
+
+_LEASES = (lease_topic(A, "iort"), lease_topic(B, "iort"))
+_COMMANDS = (build_topic(CMD, A, "drive"), build_topic(CMD, B, "drive"))
+# What neither people nor everybody may send.
+_NOT_SENT = (
+    record_topic(A, "vesc"),
+    live_topic(A, "vesc"),
+    build_topic(LIVE, A, "vesc"),
+    build_topic(RECORD, A, "vesc"),
+    build_topic(FLEET, A, "pose"),
+    build_topic(PING, A, RULE),
+    build_topic(PONG, A, RULE),
+    build_topic(ASK, A, CALIBRATION.name),
+    build_topic(ANSWER, A, CALIBRATION.name),
+    build_topic(CMD, A, "drive", "lab2"),
+    lease_topic(A, "lab2"),
+    f"{_shadow(A)}/update",
+    f"{_shadow(A)}/get",
+    f"$aws/events/presence/connected/{A}",
+    _PROVISION,
+    "anything/else",
+)
+_HEARD = (f"{LIVE}/iort/+/+", f"{LIVE}/iort/{A}/+", f"{LIVE}/iort/{B}/vesc", f"{LIVE}/iort/#")
+_NOT_HEARD = (
+    *("#", "+/#", "+/iort/#", f"{LIVE}/#", f"{LIVE}/+/+/+", f"{LIVE}/lab2/+/+", "$aws/#"),
+    *(f"{lane}/iort/{A}/+" for lane in (CMD, VIEW, RECORD, FLEET, PING, PONG, ASK, ANSWER)),
+    f"{_shadow(A)}/update/accepted",
+    "$aws/events/presence/connected/+",
+    f"$share/group/{CMD}/iort/{A}/#",
+)
+for _who, _client, _sends in (
+    (VIEWER, VIEWER, _LEASES),
+    (DRIVER, DRIVER, (*_LEASES, *_COMMANDS)),
+    (EVERYBODY, VIEWER, ()),
+):
+    _others = (A, "iort", f"iort-{_client}", "iort-claim-1", f"lab2-{_client}-1", "anything")
+    _other = DRIVER if _client == VIEWER else VIEWER
+    _rest = tuple(topic for topic in (*_LEASES, *_COMMANDS) if topic not in _sends)
+    ROWS += [
+        *_rows(_who, CONNECT, may=(f"iort-{_client}-1",), may_not=(*_others, f"iort-{_other}-1")),
+        *_rows(_who, PUBLISH, may=_sends, may_not=(*_rest, *_NOT_SENT)),
+        *_rows(_who, SUBSCRIBE, may=_HEARD, may_not=_NOT_HEARD),
+        *_rows(
+            _who,
+            RECEIVE,
+            may=(build_topic(LIVE, A, "vesc"), build_topic(LIVE, B, "pose")),
+            may_not=(build_topic(CMD, A, "drive"), lease_topic(A, "iort"), build_topic(FLEET, A, "pose")),
+        ),
+    ]
 
 # Requests that every role of the stacks makes to every resource of a kind. Only the role that declares a
 # request may make it.

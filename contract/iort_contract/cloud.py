@@ -1,4 +1,4 @@
-"""The names of the cloud's parts: the fleet's, PubNub's, and of the files' bucket."""
+"""The names of the cloud's parts: the fleet's, PubNub's, of the files' bucket, and of those who watch."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ RESULTS_PREFIX = "results/"
 # What the analysis keeps there: the results of drives, and for a week the drives of each of its runs.
 ANALYSIS_PREFIX = "analysis/"
 PLANS_PREFIX = f"{ANALYSIS_PREFIX}plans/"
+# Ways of live messages to whoever looks: PubNub's servers, or AWS IoT's own WebSockets.
+PUBNUB, IOT = "pubnub", "iot"
+# Who else than robots connects to the broker, each as an IAM role.
+VIEWER, DRIVER = "viewer", "driver"
 
 
 def pubnub_parameter(namespace: str = DEFAULT_NAMESPACE) -> str:
@@ -27,6 +31,11 @@ def fleet_name(namespace: str = DEFAULT_NAMESPACE) -> str:
 def claim_name(namespace: str = DEFAULT_NAMESPACE) -> str:
     """The name of the claims' IoT policy, and the prefix of a claim's client id."""
     return f"{check_namespace(namespace)}-claim"
+
+
+def client_prefix(role: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """What a viewer's or driver's client id begins with; the rest is its own."""
+    return f"{check_namespace(namespace)}-{role}-"
 
 
 def channel(robot: str, namespace: str = DEFAULT_NAMESPACE) -> str:

@@ -24,9 +24,13 @@ HEADERS = {
 }
 
 
-def security_policy(*, origin: str, tls: bool) -> str:
-    """The page's Content-Security-Policy: its own files, PubNub at ``origin``, and nothing else."""
-    pubnub = f"{'https' if tls else 'http'}://{origin}"
+def pubnub_address(origin: str = PUBNUB_ORIGIN, *, tls: bool = True) -> str:
+    """The address of PubNub's servers."""
+    return f"{'https' if tls else 'http'}://{origin}"
+
+
+def security_policy(*addresses: str) -> str:
+    """The page's Content-Security-Policy: its own files, connections to these addresses, and nothing else."""
     return "; ".join(
         (
             "default-src 'none'",
@@ -34,7 +38,7 @@ def security_policy(*, origin: str, tls: bool) -> str:
             "worker-src 'self'",
             "style-src 'self'",
             "img-src 'self'",
-            f"connect-src 'self' {pubnub}",
+            " ".join(("connect-src 'self'", *addresses)),
             "base-uri 'none'",
             "form-action 'none'",
             "frame-ancestors 'none'",

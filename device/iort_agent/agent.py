@@ -9,8 +9,8 @@ from iort_agent.clock import Clock
 from iort_agent.common.logs import Troubles, set_level
 from iort_agent.common.version import agent_version
 from iort_agent.config import Config
-from iort_agent.control.commands import Operator
 from iort_agent.control.downlink import make_downlink
+from iort_agent.control.motion.commands import Operator
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
@@ -136,4 +136,4 @@ class Agent:
         """Takes the samples of who drove; a source with a stream of this name goes first."""
         if any(DRIVE_STREAM in source.streams() for source in config.sources):
             return lambda _: None
-        return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values)
+        return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values, urgent=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from iort_contract.cloud import IOT, PUBNUB
 from stacks.settings import ALL_LOGS, PROD
 
 # Parameters with two values each, to change and to change back; the base has every default. Settings that
@@ -18,6 +19,7 @@ FLIPS: dict[str, dict[str, Any]] = {
     "kept key": {"keep_customer_key": True},
     "account": {"device_defender": True, "iot_log_level": "error"},
     "site": {"site": True},
+    "without PubNub": {"live_transport": IOT, "drivers": True, "site": True, "site_robots": ["car1"]},
     "no nightly analysis": {"nightly_analysis": False},
     "old table": {"old_telemetry": True},
     "properties": {
@@ -41,7 +43,12 @@ KEY: dict[str, Any] = {"customer_key": True}
 NOT_FLIPPED = {"namespace", "embedded", "layer", "analysis_layer"}
 # The longest that the contract allows; resource names contain it.
 LONGEST_NAMESPACE = "n" * 16
-EVERYTHING: dict[str, Any] = {name: value for flip in FLIPS.values() for name, value in flip.items()} | KEY
+EVERYTHING: dict[str, Any] = {
+    **{name: value for flip in FLIPS.values() for name, value in flip.items()},
+    **KEY,
+    # Lambda 1 is one of the resources.
+    "live_transport": PUBNUB,
+}
 # `keep_customer_key` has no effect beside `customer_key`.
 VARIATIONS: dict[str, dict[str, Any]] = {
     "default": {},

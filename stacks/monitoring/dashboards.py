@@ -20,12 +20,11 @@ from iort_contract.catalog.metrics import (
     SERVICE_CHARTS,
     Chart,
 )
-from iort_contract.catalog.rules import RULES
 from stacks.monitoring import metrics
 from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
 
-# The functions and tables that every sample passes.
+# The functions and tables that every sample passes; without PubNub there is no Live.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
 # Nobody waits for these, and fifty metrics are free.
 _IN_THE_BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present"}
@@ -43,7 +42,7 @@ class Dashboards(Construct):
         alarms: Sequence[cloudwatch.IAlarm],
     ) -> None:
         super().__init__(scope, "Dashboards")
-        self._namespace = settings.namespace
+        self._namespace, self._rules = settings.namespace, settings.rules
         platform = self._dashboard("Platform")
         platform.add_widgets(
             cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
@@ -88,7 +87,7 @@ class Dashboards(Construct):
         refused = [metrics.broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
         matched = [
             metrics.rule("TopicMatch", rule.physical_name(self._namespace), label=rule.name)
-            for rule in RULES.values()
+            for rule in self._rules
         ]
         return [
             _graph(
@@ -141,7 +140,9 @@ def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
         if label not in _IN_THE_BACKGROUND
     ]
     concurrency = [
-        metrics.function(running, watched.functions[name], label=name) for name in _FUNCTIONS_OF_SAMPLES
+        metrics.function(running, watched.functions[name], label=name)
+        for name in _FUNCTIONS_OF_SAMPLES
+        if name in watched.functions
     ]
     return [
         _graph("Functions: duration p95, ms", durations),

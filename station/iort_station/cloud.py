@@ -64,6 +64,8 @@ class Cloud:
     mqtt_host: str | None = None
     mqtt_port: int = 8883
     root_ca_pem: str | None = None
+    # A browser does not trust the embedded cloud's authority; this address has no TLS, and is on loopback.
+    websocket: str | None = None
 
     @classmethod
     def load(cls, path: Path) -> Cloud:
@@ -166,11 +168,27 @@ class Cloud:
         answer = self.client("iot").describe_endpoint(endpointType="iot:Data-ATS")
         return str(answer["endpointAddress"])
 
+    @property
+    def websocket_url(self) -> str:
+        """Where a browser connects to the broker: MQTT over WebSocket."""
+        return self.websocket or f"wss://{self.mqtt_endpoint}/mqtt"
+
+    def find_output(self, noun: str, name: str) -> str | None:
+        """An output of a stack that not every deployment has; None without it. Raises `StationError`."""
+        return self._stack_outputs(noun).get(name)
+
     def output(self, noun: str, name: str) -> str:
         """An output of a stack, such as ``("storage", "TelemetryTable")``; raises `StationError`."""
+        outputs = self._stack_outputs(noun)
+        if name not in outputs:
+            stack = f"{self.namespace}-{noun}"
+            raise StationError(f"stack {stack} has no output {name}; deploy the current stacks")
+        return outputs[name]
+
+    def _stack_outputs(self, noun: str) -> dict[str, str]:
         stack = f"{self.namespace}-{noun}"
         try:
-            outputs = _outputs(self.client("cloudformation"), stack)
+            return _outputs(self.client("cloudformation"), stack)
         except ClientError as error:
             if error.response["Error"]["Code"] != "ValidationError":
                 raise StationError(f"stack {stack} cannot be read: {error}") from error
@@ -180,9 +198,6 @@ class Cloud:
             ) from error
         except BotoCoreError as error:
             raise StationError(f"stack {stack} cannot be read: {error}") from error
-        if name not in outputs:
-            raise StationError(f"stack {stack} has no output {name}; deploy the current stacks")
-        return outputs[name]
 
 
 @cache

@@ -56,6 +56,7 @@ class Process:
             stderr=subprocess.PIPE,
             start_new_session=True,
         )
+        self.pid = self._process.pid
         self.lines: list[str] = []
         self.errors: list[str] = []
         self._news = threading.Condition()
@@ -121,6 +122,10 @@ class Process:
         """End it as Ctrl-C does."""
         self._process.send_signal(signal.SIGINT)
         self.wait()
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
 
     def kill(self) -> None:
         """End it at once."""

@@ -1,8 +1,9 @@
 """The downlinks of one or two robots, in one ROS graph and over a broker in memory.
 
-Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``. Each line of input is a command:
-``send MILLISECONDS JSON`` (a lease and a message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for
-subscribers, then prints ``heard``), ``cut``, ``quit``.
+Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``, and ``--guard`` for the process that
+stops the robot if this one dies. Each line of input is a command: ``send MILLISECONDS JSON`` (a lease and a
+message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for subscribers, then prints ``heard``), ``guard``
+(waits for the guard, then prints ``guarded``), ``cut``, ``quit``.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
+from iort_agent.control.motion.commands import Operator
+from iort_agent.control.motion.guard import Guard
 from iort_agent.control.questions import Questions
 from iort_agent.files.http import downloader
 from iort_agent.files.upload import make_uploader
@@ -55,14 +58,17 @@ questions = None
 if "ask" in settings.get("downlink", {}):
     uploader = make_uploader(link, root_ca=None, rate_kb_s=0)
     questions = Questions(link, uploader, download=downloader(None), offset=lambda: None)
+config = load(DownlinkConfig, settings.get("downlink", {}), where)
+guard = Guard(f"{graph.base}_guard", config.motions(), clock) if "--guard" in sys.argv else None
 downlink = Downlink(
-    load(DownlinkConfig, settings.get("downlink", {}), where),
+    config,
     share_rule()(settings["share"], where) if "share" in settings else (),
     link=link,
     graph=graph,
     boot="0badcafe",
     offset=lambda: ClockOffset(0.0, 0.0),
-    answer=lambda *_: None,
+    operator=Operator(lambda *_: None, lambda _: None, lambda: True),
+    guard=guard,
     questions=questions,
 )
 uplink.start()
@@ -75,6 +81,10 @@ for seq, line in zip(itertools.count(), sys.stdin):
         break
     if verb == "cut":
         uplink.cut()
+    elif verb == "guard":
+        while not downlink.report()["guard"]:
+            time.sleep(0.01)  # as above
+        say("guarded")
     elif verb == "await":
         # A subscriber knows of a connection before its publisher does, and rospy has no event for it.
         topic, _, count = rest.partition(" ")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
+import os
+import signal
+import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -93,6 +97,46 @@ def test_a_lost_connection_or_the_agents_end_stops_the_car(driven: tuple[Process
     assert speeds(listener)[1:] == [0] * 5
     after = [when for when, _ in heard(listener)]
     assert after[1] - after[0] < 10, "the car must stop before the lease ends"
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_killed_and_a_frozen_agent_are_stopped_by_the_guard(graph: Graph, end: signal.Signals) -> None:
+    downlink = start(graph, "--guard")
+    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    # From the agent's node and the guard's.
+    connected(downlink)
+    downlink.say("guard")
+    downlink.until(lambda: "guarded" in downlink.lines, "guard")
+    drive(downlink, 1.5, 2_000)
+    listener.until(lambda: speeds(listener) == [1.5], "command")
+    downlink.signal(end)
+    ended = time.time()
+    listener.until(lambda: len(speeds(listener)) == 6, "five stops of the guard")
+    assert speeds(listener)[1:] == [0] * 5
+    (began, _), (stopped, _), *_ = heard(listener)
+    if end == signal.SIGKILL:
+        assert stopped - ended < 0.5, "it does not wait for the lease's end"
+    else:
+        assert stopped - began < 2.05
+    downlink.signal(signal.SIGCONT)
+
+
+def test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile(graph: Graph) -> None:
+    downlink = start(graph, "--guard")
+    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink)
+    downlink.say("guard")
+    downlink.until(lambda: "guarded" in downlink.lines, "guard")
+    (child,) = Path(f"/proc/{downlink.pid}/task/{downlink.pid}/children").read_text().split()
+    os.kill(int(child), signal.SIGKILL)
+    downlink.until_said("the guard died: motion is refused until it runs again")
+    drive(downlink, 0.5)
+    downlink.until_said("rejected: guard not ready")
+    downlink.say("guard")
+    downlink.until(lambda: downlink.lines.count("guarded") == 2, "guard")
+    drive(downlink, 1.5)
+    listener.until(functools.partial(has, listener, 1.5), "command")
+    assert not has(listener, 0.5)
 
 
 def test_an_invalid_message_is_rejected(driven: tuple[Process, Process]) -> None:

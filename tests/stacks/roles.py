@@ -89,7 +89,33 @@ READS_DRIVES = {
     ("dynamodb:GetItem", "Robots.Arn"),
 }
 # For every role: each action on each resource, and who may assume it.
+# People of the account, if their own policy lets them assume the role.
+PEOPLE = "arn:${AWS::Partition}:iam::${AWS::AccountId}:root"
+
+
+def listens(robots: str = "") -> set[tuple[str, str]]:
+    """The permissions to hear robots' live messages."""
+    return {
+        ("iot:Subscribe", f"{IOT}:topicfilter/live/iort/{robots}*"),
+        ("iot:Receive", f"{IOT}:topic/live/iort/{robots}*"),
+    }
+
+
+def publishes(*lanes: str) -> set[tuple[str, str]]:
+    """The permission to send messages to every robot."""
+    return {("iot:Publish", f"{IOT}:topic/{lane}/iort/*") for lane in lanes}
+
+
+def connects(name: str) -> set[tuple[str, str]]:
+    """The permission to connect under this name."""
+    return {("iot:Connect", f"{IOT}:client/iort-{name}-*")}
+
+
+# What everybody gets from the page on the web.
+PUBLIC = connects("viewer") | listens()
 ROLES = {
+    "Viewer": (PEOPLE, connects("viewer") | listens() | publishes("view")),
+    "Driver": (PEOPLE, connects("driver") | listens() | publishes("view", "cmd")),
     "LiveRole": (
         "lambda.amazonaws.com",
         {(action, "LiveLog.Arn") for action in LOG}

@@ -10,11 +10,12 @@ import pytest
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import FLEET
 from tests import isolation
-from tests.isolation import CLAIM, CONNECT, ROWS, SUBSCRIBE, A, Row
+from tests.isolation import CLAIM, CONNECT, DRIVER, EVERYBODY, ROWS, SUBSCRIBE, VIEWER, A, B, Row
 from tests.policy import allows
 from tests.stacks.roles import IOT, ROLES
 from tests.stacks.templates import qualified
 
+PEOPLE = {VIEWER, DRIVER, EVERYBODY}
 ACCOUNT = "arn:aws:iot:eu-west-1:123456789012"
 
 
@@ -35,7 +36,51 @@ def test_the_isolation_table_is_large_and_has_no_duplicates():
     assert {row.who for row in ROWS if row.allowed} == {row.who for row in ROWS if not row.allowed}
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.who}-{row.does}-{row.what}")
+@pytest.fixture(scope="module")
+def roles(deployment: Any, reader: Any) -> dict[str, list[dict[str, Any]]]:
+    """The statements of the roles of whoever watches or drives, with ARNs of one account."""
+    template = deployment(live_transport="iot", drivers=True, site=True).templates["iort-fleet"]
+    policies = [r["Properties"] for r in template["Resources"].values() if r["Type"] == "AWS::IAM::Policy"]
+    names = {"Viewer": VIEWER, "Driver": DRIVER, "PublicRole": EVERYBODY}
+    return {
+        names[role]: [
+            {**s, "Resource": [arn.replace(IOT, ACCOUNT) for arn in reader.texts(s["Resource"])]}
+            for s in policy["PolicyDocument"]["Statement"]
+        ]
+        for policy in policies
+        if (role := reader.text(policy["Roles"][0])) in names
+    }
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS if row.who in PEOPLE], ids=lambda row: f"{row.who}-{row.does}-{row.what}"
+)
+def test_the_roles_agree_with_the_isolation_table(roles, row):
+    kind = {CONNECT: "client", SUBSCRIBE: "topicfilter"}.get(row.does, "topic")
+    arn = f"{ACCOUNT}:{kind}/{row.what}"
+    assert allows(roles[row.who], f"iot:{row.does}", arn) == row.allowed
+    assert not allows(roles[row.who], f"iot:{row.does}", arn.replace("eu-west-1", "eu-west-2"))
+
+
+def test_everybody_hears_only_the_robots_of_the_site(deployment, reader):
+    template = deployment(live_transport="iot", site=True, site_robots=[A]).templates["iort-fleet"]
+    (policy,) = (
+        resource["Properties"]["PolicyDocument"]
+        for logical_id, resource in template["Resources"].items()
+        if logical_id.startswith("PublicRoleDefaultPolicy")
+    )
+    statements = [
+        {**s, "Resource": [arn.replace(IOT, ACCOUNT) for arn in reader.texts(s["Resource"])]}
+        for s in policy["Statement"]
+    ]
+    for robot, heard in ((A, True), (B, False), ("+", False), (f"{A}-2", False)):
+        assert allows(statements, "iot:Subscribe", f"{ACCOUNT}:topicfilter/live/iort/{robot}/+") == heard
+        assert allows(statements, "iot:Receive", f"{ACCOUNT}:topic/live/iort/{robot}/vesc") == heard
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS if row.who not in PEOPLE], ids=lambda row: f"{row.who}-{row.does}-{row.what}"
+)
 def test_the_policies_agree_with_the_isolation_table(policies, row):
     kind = {CONNECT: "client", SUBSCRIBE: "topicfilter"}.get(row.does, "topic")
     variables = {}

@@ -18,6 +18,7 @@ from tests.stacks.roles import (
     IOT,
     KEEPS,
     NOT_REGISTERED,
+    PEOPLE,
     PROVISIONING,
     ROLES,
     THINGS,
@@ -103,22 +104,25 @@ def test_each_function_changes_exactly_its_allowed_attributes():
     assert all(fnmatch.fnmatchcase(name, "alert_*") for name in alert.attributes - {"robot"})
 
 
-def test_every_role_can_be_assumed_by_one_service_of_this_account(synthesized, reader):
+def test_every_role_can_be_assumed_by_this_account_or_one_service_for_it(synthesized, reader):
     for role, _, _, properties in qualified(synthesized, "AWS::IAM::Role"):
         (statement,) = properties["AssumeRolePolicyDocument"]["Statement"]
         service, _ = ROLES[role]
         assert (statement["Effect"], statement["Action"]) == ("Allow", "sts:AssumeRole")
+        assert properties.keys() <= {"AssumeRolePolicyDocument", "Tags"}, "no managed or inline policies"
+        if service == PEOPLE:
+            assert reader.text(statement["Principal"]["AWS"]) == PEOPLE
+            continue
         assert statement["Principal"] == {"Service": service}
         if service != "lambda.amazonaws.com":
             # The service acts for every account; only for ours may it take our role.
             condition = statement["Condition"]
             assert condition == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
-        assert properties.keys() <= {"AssumeRolePolicyDocument", "Tags"}, "no managed or inline policies"
 
 
 def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
     wild = set()
-    for role, (_, actions) in ROLES.items():
+    for role, (service, actions) in ROLES.items():
         for action, resource in actions:
             assert "*" not in action
             if resource == "*":
@@ -135,7 +139,9 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
                 of_the_hook = (role, action, named) == ("AdmitRole", "iot:DescribeCertificate", CERTIFICATES)
-                assert "*" not in named or of_provisioning or of_the_hook
+                # Whoever watches or drives may watch or drive every robot, under any name of its own kind.
+                of_people = service == PEOPLE and re.search(r"/(live|view|cmd)/iort/\*$|/iort-\w+-\*$", named)
+                assert "*" not in named or of_provisioning or of_the_hook or of_people
     assert wild == EVERY_RESOURCE
     # Only roles' and robots' policies grant; no managed policy does.
     kinds = {r["Type"] for t in synthesized.templates.values() for r in t["Resources"].values()}

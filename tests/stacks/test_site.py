@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.page import HEADERS, pubnub_address, security_policy
 from stacks.settings import Settings
 
 
@@ -58,7 +58,7 @@ def test_the_site_uses_tls_and_the_headers_of_the_pages_own_server(site):
     (headers,) = of(site, "AWS::CloudFront::ResponseHeadersPolicy")
     security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
     policy = security["ContentSecurityPolicy"]["ContentSecurityPolicy"]
-    assert policy == security_policy(origin=PUBNUB_ORIGIN, tls=True)
+    assert policy == security_policy(pubnub_address())
     assert security["ReferrerPolicy"]["ReferrerPolicy"] == HEADERS["Referrer-Policy"]
     assert security["ContentTypeOptions"]["Override"] is True
     assert security["StrictTransportSecurity"]["AccessControlMaxAgeSec"] == 365 * 86_400

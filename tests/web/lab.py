@@ -85,6 +85,9 @@ class Lab:
     def __init__(self) -> None:
         self.asked: list[dict[str, str]] = []
         self.refuses = False
+        # Whether each car is told to stop, and whether it stands.
+        self.cars = {"car-1": [False, False], "car-9": [False, False]}
+        self.confirms = True
         self.notes: list[dict[str, Any]] = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
@@ -123,6 +126,22 @@ class Lab:
         self.notes = [one for one in self.notes if one["id"] != asked["id"]]
         return {"notes": self.notes}
 
+    def motion(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        cars = {
+            name: {"asked": told, "stopped": stands, "reason": "", "drive": None}
+            for name, (told, stands) in self.cars.items()
+            if asked.get("robot", name) == name
+        }
+        return {"robots": cars, "user": "operator@lab", "failed": {}}
+
+    def stop(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.asked.append(dict(asked))
+        told = asked["stopped"] == "true"
+        for name, car in self.cars.items():
+            if asked.get("robot", name) == name:
+                car[:] = [told, told if self.confirms else car[1]]
+        return self.motion(asked)
+
     def server(self, pubnub: PubNubStandIn) -> PageServer:
         return PageServer(
             namespace="iort",
@@ -137,6 +156,7 @@ class Lab:
                 "analyse": lambda _: {"run": "iort-1"},
                 "note": self.write,
                 "delete_note": self.delete,
+                "stop": self.stop,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
             },
         )
@@ -152,6 +172,7 @@ class Lab:
             "history": history,
             "insights": insights,
             "notes": self.answer_notes,
+            "motion": self.motion,
             "laps": laps,
             "delta": delta,
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},

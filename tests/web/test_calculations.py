@@ -2,43 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from local.deployment import ROOT
-
-# Bundles a module of the page for node, calls one of its functions, and prints the result.
-PROGRAM = """
-// Some modules ask the browser at once, for what no calculation needs.
-const anything = new Proxy(() => anything, { get: () => anything });
-Object.assign(globalThis, { window: anything, document: anything });
-const { module: path, name, given } = JSON.parse(require("fs").readFileSync(0));
-const { outputFiles } = require("esbuild").buildSync({
-  entryPoints: [`station/web/src/${path}`], bundle: true, format: "cjs", write: false,
-});
-const bundled = { exports: {} };
-new Function("module", "exports", outputFiles[0].text)(bundled, bundled.exports);
-console.log(JSON.stringify(bundled.exports[name](...given)));
-"""
-
-
-def call(module: str, name: str, *given: Any) -> Any:
-    """The result of a function of the page."""
-    done = subprocess.run(
-        [Path(sys.executable).with_name("node"), "-e", PROGRAM],
-        check=True,
-        cwd=ROOT,
-        input=json.dumps({"module": module, "name": name, "given": given}),
-        capture_output=True,
-        text=True,
-    )
-    return json.loads(done.stdout)
+from tests.web.node import call
 
 
 def test_the_noise_of_positions_is_no_way() -> None:

@@ -168,6 +168,36 @@ def test_a_note_is_written_marked_in_the_history_and_deleted(
         assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
 
 
+def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    lab.confirms = False
+    with lab.server(pubnub) as server:
+        page = open_page(server.invitation())
+        words = page.locator(".stop-words")
+        # No car has been heard: it can be stopped all the same.
+        page.goto(f"{server.url}#/car/car-1")
+        page.get_by_role("button", name="Stop car-1").click()
+        until(lambda: words.inner_text() == "Not confirmed by car-1.", "the stop to be asked for")
+        lab.cars["car-1"][1] = lab.confirms = True
+        until(lambda: words.inner_text() == "Emergency stop: car-1 stands.", "the car's confirmation")
+        # On every view, and in a browser that comes later and may only look.
+        page.goto(f"{server.url}#/alarms")
+        assert words.inner_text() == "Emergency stop: car-1 stands."
+        onlooker = open_page(f"{server.url}#/insights")
+        onlooker.get_by_text("Emergency stop: car-1 stands.").wait_for()
+        assert onlooker.locator(".stop-press, .stop-release:visible").count() == 0
+        page.goto(f"{server.url}#/")
+        page.get_by_role("button", name="Stop all").click()
+        until(lambda: words.inner_text() == "Emergency stop: car-1, car-9 stand.", "the fleet to stand")
+        page.get_by_role("button", name="Release all").click()
+        assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
+        page.get_by_role("button", name="Really release all").click()
+        until(lambda: not words.is_visible(), "the release")
+    assert lab.asked[-1] == {"stopped": "false"}
+
+
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
     show(page, car.send())
     assert page.get_by_role("heading", name="Commands").count() == 0

@@ -325,6 +325,7 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
     nothing: dict[str, Any] = {"actions": [], "keyed": [], "track": None}
+    nothing |= {"live": "pubnub", "drivers": False, "identity": None}
     assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, **nothing}
 
 

@@ -28,14 +28,34 @@ class TrackMap(TypedDict):
     w_left_m: list[float]
 
 
+class Identity(TypedDict):
+    """The identity that everybody gets, of an Amazon Cognito identity ``pool``, from ``endpoint``.
+
+    Its credentials sign ``socket``, the broker's address, for the service iotdevicegateway. Client ids begin
+    with ``client_prefix``. It hears ``robots``, or all of them if there are none; it publishes nothing.
+    """
+
+    pool: str
+    region: str
+    endpoint: str
+    socket: str
+    client_prefix: str
+    robots: list[str]
+
+
 class Config(TypedDict):
-    """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
-    whether the server answers questions about the past; a static site does not. ``actions`` names what the
-    server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see
-    `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars
-    drive on, if it is known."""
+    """``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or
+    ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers``
+    says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access
+    token, or empty. ``answers`` says whether the server answers questions about the past; a static site does
+    not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is
+    a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters.
+    ``track`` is the track that the cars drive on, if it is known."""
 
     namespace: str
+    live: Literal["pubnub", "iot"]
+    identity: Identity | None
+    drivers: bool
     subscribe_key: str
     origin: str
     tls: bool
@@ -45,6 +65,14 @@ class Config(TypedDict):
     keyed: list[str]
     vehicles: dict[str, dict[str, float]]
     track: TrackMap | None
+
+
+class SocketAnswer(TypedDict):
+    """Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection
+    to the broker, to be opened within 5 minutes, and the client id for it."""
+
+    url: str
+    client_id: str
 
 
 class Admitted(TypedDict):
@@ -157,6 +185,37 @@ class SettingsAnswer(TypedDict):
 
     settings: list[SettingEntry]
     online: bool
+
+
+class DriveLimitsEntry(TypedDict):
+    """What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`."""
+
+    command: str
+    speed: str
+    steering: str
+    max_speed_mps: float
+    max_steering_rad: float
+    lease_ms: int
+
+
+class MotionEntry(TypedDict):
+    """Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere,
+    ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it.
+    ``drive`` is null if a stick cannot drive it."""
+
+    asked: bool
+    stopped: bool | None
+    reason: str
+    drive: DriveLimitsEntry | None
+
+
+class MotionAnswer(TypedDict):
+    """Answers ``motion`` and ``stop``: each robot's. ``user`` is who drives if the viewer gives no name.
+    ``failed`` has the reason for each robot whose stop could not be changed."""
+
+    robots: dict[str, MotionEntry]
+    user: str
+    failed: dict[str, str]
 
 
 class SendAnswer(TypedDict):
@@ -314,6 +373,7 @@ Answer = Union[
     DeltaAnswer,
     NotesAnswer,
     RobotsAnswer,
+    SocketAnswer,
     TagsAnswer,
     VehiclesAnswer,
     StreamsAnswer,
@@ -324,6 +384,7 @@ Answer = Union[
     AlarmsAnswer,
     RejectedAnswer,
     RunsAnswer,
+    MotionAnswer,
     SendAnswer,
     SettingsAnswer,
 ]

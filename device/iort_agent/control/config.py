@@ -177,7 +177,15 @@ class DownlinkConfig:
 
     def moves(self) -> bool:
         """Whether a command moves the robot."""
-        return any(command.motion is not None for _, command in self.cmd)
+        return bool(self.motions())
+
+    def motions(self) -> dict[str, dict[str, Any]]:
+        """The commands that move the robot, by name: topic and type, and the message that stops it."""
+        return {
+            name: {"topic": one.topic, "type": one.type, "stop": one.motion.stop}
+            for name, one in self.cmd
+            if one.motion is not None
+        }
 
     def drive_limits(self) -> DriveLimits | None:
         """What a stick drives; None if nothing. Raises `ContractError` if the command is no motion."""

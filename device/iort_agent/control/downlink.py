@@ -11,8 +11,9 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.control.asks import Asks
 from iort_agent.control.bridge import Bridge
-from iort_agent.control.commands import Commands, Operator
 from iort_agent.control.config import DownlinkConfig, ShareConfig
+from iort_agent.control.motion.commands import Commands, Operator
+from iort_agent.control.motion.guard import Guard
 from iort_agent.control.peers import Peers
 from iort_agent.control.questions import Questions
 from iort_agent.control.shares import Shares
@@ -20,7 +21,7 @@ from iort_agent.files.http import downloader
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros1.graph import Graph
-from iort_agent.ros1.node import DEFAULT_NODE, shared
+from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
 from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)
@@ -45,14 +46,15 @@ class Downlink:
         graph: Graph,
         offset: Callable[[], ClockOffset | None],
         operator: Operator,
+        guard: Guard | None = None,
         questions: Questions | None = None,
     ) -> None:
-        self._clock, self._graph = link.clock, graph
+        self._clock, self._graph, self._guard = link.clock, graph, guard
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="downlink", daemon=True)
         self._rejections = ThrottledLog(_log, link.clock)
         bridge = Bridge(link, graph, offset, self._rejections)
-        self._commands = Commands(config, bridge, operator=operator, wake=self._wake.set)
+        self._commands = Commands(config, bridge, operator=operator, guard=guard, wake=self._wake.set)
         self._peers = Peers(config, bridge)
         self._shares = Shares(share, bridge, boot=boot, wake=self._wake.set)
         self._asks = Asks(config.ask, bridge, questions) if questions is not None else None
@@ -60,6 +62,8 @@ class Downlink:
     def start(self) -> None:
         """Join the ROS graph and begin."""
         self._graph.start()
+        if self._guard is not None:
+            self._guard.start()
         self._thread.start()
         if self._asks is not None:
             self._asks.start()
@@ -86,6 +90,8 @@ class Downlink:
             self._asks.close()
         while (due := self._commands.tick()) is not None:
             self._clock.wait(threading.Event(), max(0.0, due - self._clock.monotonic()))
+        if self._guard is not None:
+            self._guard.close()
         self._graph.close()
 
     def tick(self) -> float:
@@ -100,6 +106,7 @@ class Downlink:
             "commands": self._commands.report(),
             "fleet": self._peers.report(),
             "shared": self._shares.report(),
+            **({"guard": guarded} if (guarded := self._commands.guarded()) is not None else {}),
             **({"asked": self._asks.report()} if self._asks is not None else {}),
             "refused": self._rejections.counts(),
             "waits": self.waits(),
@@ -140,6 +147,9 @@ def make_downlink(
     node = next((source.node for source in sources if isinstance(source, Ros1Config)), None)
     if graph is None or node is not None:
         graph = shared(node or DEFAULT_NODE, link.clock)
+    guard = None
+    if isinstance(graph, Node) and config.moves():
+        guard = Guard(f"{graph.base}_guard", config.motions(), link.clock)
     questions = None
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)
@@ -151,5 +161,6 @@ def make_downlink(
         graph=graph,
         offset=offset,
         operator=operator,
+        guard=guard,
         questions=questions,
     )

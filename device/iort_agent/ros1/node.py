@@ -93,11 +93,11 @@ class Node:
         self._losses = 0
         # The address of another node of our name.
         self._holder: str | None = None
-        # The command line's remappings, as every ROS node reads them.
+        # The command line's remappings, as every ROS node reads them; `base` is the name without namespace.
         names = importlib.import_module("rosgraph.names")
         mappings = names.load_mappings(sys.argv)
-        self._base: str = mappings.get("__name", name)
-        self._me: str = names.ns_join(names.get_ros_namespace(), self._base)
+        self.base: str = mappings.get("__name", name)
+        self._me: str = names.ns_join(names.get_ros_namespace(), self.base)
         self._remapped: dict[str, str] = {
             names.resolve_name(topic, self._me): names.resolve_name(other, self._me)
             for topic, other in mappings.items()
@@ -317,7 +317,7 @@ class Node:
         rospy.core.add_preshutdown_hook(self._on_shutdown)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
-            self._base, argv=[self._base], disable_signals=True, disable_rosout=True, disable_rostime=True
+            self.base, argv=[self.base], disable_signals=True, disable_rosout=True, disable_rostime=True
         )
         self._absent = False
         _log.info("ROS node %s at %s", rospy.get_name(), self._uri)

@@ -77,7 +77,7 @@ class Shadow:
 
     def read(self) -> State:
         """The shadow's current state."""
-        return _read(self.data, self.robot)
+        return read(self.data, self.robot)
 
     def desire(self, wanted: Mapping[str, Any]) -> None:
         """Set desired settings by dotted name; None returns to the file's value."""
@@ -95,10 +95,11 @@ class Shadow:
 
 def over_share(cloud: Cloud, robot: str) -> OverShare | None:
     """Lambda 2's last report on a robot over its share; None if it has none."""
-    return _read(cloud.client("iot-data"), robot).desired.over_share
+    return read(cloud.client("iot-data"), robot).desired.over_share
 
 
-def _read(data: IoTDataPlaneClient, robot: str) -> State:
+def read(data: IoTDataPlaneClient, robot: str) -> State:
+    """The shadow's current state."""
     try:
         answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
     except data.exceptions.ResourceNotFoundException:

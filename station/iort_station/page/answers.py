@@ -24,7 +24,7 @@ from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.fleet import registry, tags
 from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
-from iort_station.page import insights, laps, notes, viewing
+from iort_station.page import insights, laps, motion, notes, socket, viewing
 from iort_station.page.parameters import text, whole
 
 # No chart is wider, in points.
@@ -62,7 +62,9 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "insights": lambda asked: insights.insights(cloud, asked),
         "analysis": lambda asked: insights.progress(cloud, asked),
         **laps.answers(cloud),
+        **socket.answers(cloud),
         **notes.answers(cloud),
+        **motion.answers(cloud),
     }
 
 

@@ -17,7 +17,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import commands, registry
 from iort_station.fleet import settings as fleet_settings
 from iort_station.fleet.shadow import Shadow, State
-from iort_station.page import insights, notes
+from iort_station.page import insights, motion, notes, socket
 from iort_station.page.parameters import text, whole
 from iort_station.page.server import Answer
 
@@ -32,7 +32,9 @@ def actions(cloud: Cloud) -> dict[str, Answer]:
         "settings": lambda asked: settings(cloud, asked),
         "set": lambda asked: change(cloud, asked),
         "analyse": lambda asked: insights.analyse(cloud, asked),
+        **socket.actions(cloud),
         **notes.actions(cloud),
+        **motion.actions(cloud),
     }
 
 

@@ -10,10 +10,11 @@ import math
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
+from iort_contract.cloud import PUBNUB
 from iort_contract.limits import ContractError
-from iort_contract.messages.page import Config, TrackMap
+from iort_contract.messages.page import Config, Identity, TrackMap
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_contract.topics import check_namespace, check_robot
 from iort_contract.track import Track, parse_track
@@ -33,6 +34,8 @@ TYPES = {
     ".txt": "text/plain; charset=utf-8",
 }
 
+# The action that gives a driver's address.
+DRIVE = "drive"
 _KEY = re.compile(r"[A-Za-z0-9_-]{1,128}")
 _TOKEN = re.compile(r"[A-Za-z0-9_=-]{1,4096}")
 _ORIGIN = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:]{2,45}\])(:[0-9]{1,5})?")
@@ -53,7 +56,9 @@ def built_files(built: Path = BUILT) -> dict[str, bytes]:
 def config(
     *,
     namespace: str,
-    subscribe_key: str,
+    live: Literal["pubnub", "iot"] = "pubnub",
+    identity: Identity | None = None,
+    subscribe_key: str = "",
     origin: str = PUBNUB_ORIGIN,
     tls: bool = True,
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
@@ -67,13 +72,14 @@ def config(
 
     ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page shows
     the speed in m/s instead of the motor's erpm. ``token`` is an access token of PubNub that may only read.
+    A page with ``live="iot"`` has nothing of PubNub.
     """
     try:
         check_namespace(namespace)
         known = {check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
     except ContractError as error:
         raise StationError(f"the page's configuration: {error}") from error
-    if not _KEY.fullmatch(subscribe_key):
+    if live == PUBNUB and not _KEY.fullmatch(subscribe_key):
         raise StationError("the page's subscribe_key must be 1 to 128 of A-Z a-z 0-9 _ -")
     if subscribe_key.startswith(("pub-c-", "sec-c-")):
         raise StationError("the page's subscribe_key must not be a publish or secret key")
@@ -90,6 +96,9 @@ def config(
             raise StationError(f"speed_to_erpm_offset of {robot} must be a number, got {offset}")
     return {
         "namespace": namespace,
+        "live": live,
+        "identity": identity,
+        "drivers": DRIVE in actions,
         "subscribe_key": subscribe_key,
         "origin": origin,
         "tls": tls,

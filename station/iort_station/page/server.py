@@ -20,16 +20,24 @@ from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
+from iort_contract.cloud import PUBNUB
 from iort_contract.limits import ContractError
-from iort_contract.messages.page import Admitted
-from iort_contract.page import HEADERS, INVITATION, KEY_HEADER, PUBNUB_ORIGIN, security_policy
+from iort_contract.messages.page import Admitted, Identity
+from iort_contract.page import (
+    HEADERS,
+    INVITATION,
+    KEY_HEADER,
+    PUBNUB_ORIGIN,
+    pubnub_address,
+    security_policy,
+)
 from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
@@ -60,7 +68,8 @@ class PageServer(BackgroundServer):
     from the parameters of the request. ``open_actions`` change something that everybody who reaches the page
     may change; they need a POST with the page's own origin. ``actions`` need the server's key, too: a browser
     gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``downloads`` maps
-    a name to the function that writes the file ``/<name>``. The server accepts a Host that is localhost, an
+    a name to the function that writes the file ``/<name>``. ``broker`` is the broker's
+    address for WebSockets, without a path. The server accepts a Host that is localhost, an
     address or one of ``names``, and no other. Raises `StationError` if the page is not built, if the port is
     in use, and for a configuration that it must not serve.
     """
@@ -69,7 +78,10 @@ class PageServer(BackgroundServer):
         self,
         *,
         namespace: str,
-        subscribe_key: str,
+        live: Literal["pubnub", "iot"] = "pubnub",
+        broker: str = "",
+        identity: Identity | None = None,
+        subscribe_key: str = "",
         origin: str = PUBNUB_ORIGIN,
         tls: bool = True,
         vehicles: Mapping[str, Mapping[str, float]] | None = None,
@@ -100,6 +112,8 @@ class PageServer(BackgroundServer):
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
             namespace=namespace,
+            live=live,
+            identity=identity,
             subscribe_key=subscribe_key,
             origin=origin,
             tls=tls,
@@ -110,6 +124,10 @@ class PageServer(BackgroundServer):
             keyed=keyed,
             track=track,
         )
+        pubnub = [pubnub_address(origin, tls=tls)] if live == PUBNUB else []
+        elsewhere = [broker] if broker else []
+        if identity:
+            elsewhere.append(identity["endpoint"])
         # Only these can be requested: no path reaches the file system.
         self._files = {
             f"/{name}": packed(TYPES[Path(name).suffix], content)
@@ -120,7 +138,7 @@ class PageServer(BackgroundServer):
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
-            "Content-Security-Policy": security_policy(origin=origin, tls=tls),
+            "Content-Security-Policy": security_policy(*pubnub, *elsewhere),
             "Server": "iort",
             "Vary": "Accept-Encoding",
         }

@@ -15,6 +15,7 @@ import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
+import { StopControl } from "./drive/stop_control";
 import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
 import { CompareView } from "./views/compare";
@@ -44,6 +45,7 @@ class Page {
   private readonly compareView: CompareView;
   private readonly cloudWatchView: CloudWatchView;
   private readonly alarmsView: AlarmsView;
+  private readonly stops: StopControl;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
   private route: Route = { view: "fleet" };
@@ -63,6 +65,7 @@ class Page {
     this.registry = new Registry(config);
     this.viewing = new Viewing(config);
     this.waiting = new Waiting(config, this.registry);
+    this.stops = new StopControl(config, byId("top"));
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
@@ -102,6 +105,7 @@ class Page {
     if (this.route.view === "insights") this.insightsView.show(this.route.robot, this.route.query);
     else this.insightsView.leave();
     this.cloudWatchView.show(view === "cloudwatch");
+    this.stops.of(view === "car" ? robot : undefined);
     this.viewing.look(this.looks());
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});

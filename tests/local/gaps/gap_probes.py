@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import MagicMock, Mock, patch
 
+from ministack import app as ministack_app
 from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
 from ministack.services import cloudwatch_logs, iot, iot_data, lambda_svc, sqs
@@ -244,3 +245,36 @@ def log_records() -> bool:
         lambda_svc._emit_lambda_logs({"config": {}}, "id", text, True, 0)
     # Beside the lines of Lambda itself: START, END and REPORT.
     return len(written) != 4
+
+
+# An upgrade to MQTT over WebSocket, unsigned.
+HANDSHAKE: dict[str, Any] = {
+    "type": "websocket",
+    "path": "/mqtt",
+    "query_string": b"",
+    "headers": [(b"host", b"127.0.0.1:4566"), (b"sec-websocket-protocol", b"mqtt")],
+}
+
+
+def websocket_host() -> bool:
+    """Ask for the gateway's own host, and see whether the broker takes the connection."""
+    taken = []
+
+    async def take(*_: Any) -> None:
+        taken.append(True)
+
+    async def closed() -> dict[str, str]:
+        return {"type": "websocket.connect"}
+
+    async def send(_message: dict[str, Any]) -> None:
+        pass
+
+    with patch.object(iot, "handle_websocket", take):
+        asyncio.run(ministack_app.app(HANDSHAKE, closed, send))
+    return not taken
+
+
+def unsigned_websocket() -> bool:
+    """Ask whether an unsigned upgrade is refused where requests are checked."""
+    with patch.object(ministack_app, "AUTH", True):
+        return iot._ws_handshake_check(HANDSHAKE) is None

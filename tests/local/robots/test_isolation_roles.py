@@ -18,10 +18,13 @@ from botocore.exceptions import ClientError
 
 from iort_contract.cloud import pubnub_parameter
 from tests import isolation
-from tests.stacks.roles import IOT, ROLES
+from tests.stacks.roles import IOT, PUBLIC
+from tests.stacks.roles import ROLES as OF_AWS
 from tests.stacks.templates import name
 
 ACCOUNT = "000000000000"
+# The embedded cloud has everybody's identity, too.
+ROLES = {**OF_AWS, "PublicRole": ("cognito-identity.amazonaws.com", PUBLIC)}
 DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "UnauthorizedOperation", "403"}
 SERVICES = ("dynamodb", "sqs", "s3", "ssm", "lambda", "logs", "iot-data", "iam", "sts", "iot")
 

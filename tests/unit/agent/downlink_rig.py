@@ -11,9 +11,9 @@ from typing import Any
 
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
-from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
+from iort_agent.control.motion.commands import Operator
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.trigger import OnTrigger

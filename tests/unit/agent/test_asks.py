@@ -17,6 +17,7 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.downlink import Downlink
+from iort_agent.control.motion.commands import Operator
 from iort_agent.control.questions import Questions
 from iort_agent.errors import ConfigError, UploadError
 from iort_agent.files.upload import Uploader
@@ -85,7 +86,7 @@ class Rig:
             boot="0badcafe",
             graph=graph,
             offset=offset,
-            answer=lambda *_: None,
+            operator=Operator(lambda *_: None, lambda _: None, lambda: True),
             questions=Questions(
                 link, cast("Uploader", self.bucket), download=self.bucket.download, offset=offset
             ),

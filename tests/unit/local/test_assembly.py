@@ -28,7 +28,7 @@ def assembly(checkout):
         made.append(output)
 
     def get(namespace="iort"):
-        folder = deployment.assembly(checkout, checkout / "build", namespace=namespace, synthesize=synthesize)
+        folder = deployment.assembly(checkout, checkout / "build", settings=namespace, synthesize=synthesize)
         assert (folder / "manifest.json").exists()
         return len(made)
 
@@ -62,7 +62,7 @@ def test_a_failed_synthesis_is_not_kept(checkout):
 
     for _ in range(2):
         with pytest.raises(RuntimeError):
-            deployment.assembly(checkout, checkout / "build", namespace="iort", synthesize=fail)
+            deployment.assembly(checkout, checkout / "build", settings="iort", synthesize=fail)
 
 
 def test_old_assemblies_are_removed(assembly, checkout):

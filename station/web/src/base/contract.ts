@@ -517,9 +517,22 @@ export interface TrackMap {
   readonly w_left_m: readonly number[];
 }
 
-/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
+/** The identity that everybody gets, of an Amazon Cognito identity ``pool``, from ``endpoint``. Its credentials sign ``socket``, the broker's address, for the service iotdevicegateway. Client ids begin with ``client_prefix``. It hears ``robots``, or all of them if there are none; it publishes nothing. */
+export interface Identity {
+  readonly pool: string;
+  readonly region: string;
+  readonly endpoint: string;
+  readonly socket: string;
+  readonly client_prefix: string;
+  readonly robots: readonly string[];
+}
+
+/** ``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers`` says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
+  readonly live: "pubnub" | "iot";
+  readonly identity: Identity | null;
+  readonly drivers: boolean;
   readonly subscribe_key: string;
   readonly origin: string;
   readonly tls: boolean;
@@ -529,6 +542,12 @@ export interface Config {
   readonly keyed: readonly string[];
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
   readonly track: TrackMap | null;
+}
+
+/** Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection to the broker, to be opened within 5 minutes, and the client id for it. */
+export interface SocketAnswer {
+  readonly url: string;
+  readonly client_id: string;
 }
 
 /** Answers ``key``, once for each token; or again for the key itself. */
@@ -624,6 +643,31 @@ export interface SettingEntry {
 export interface SettingsAnswer {
   readonly settings: readonly SettingEntry[];
   readonly online: boolean;
+}
+
+/** What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`. */
+export interface DriveLimitsEntry {
+  readonly command: string;
+  readonly speed: string;
+  readonly steering: string;
+  readonly max_speed_mps: number;
+  readonly max_steering_rad: number;
+  readonly lease_ms: number;
+}
+
+/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it. ``drive`` is null if a stick cannot drive it. */
+export interface MotionEntry {
+  readonly asked: boolean;
+  readonly stopped: boolean | null;
+  readonly reason: string;
+  readonly drive: DriveLimitsEntry | null;
+}
+
+/** Answers ``motion`` and ``stop``: each robot's. ``user`` is who drives if the viewer gives no name. ``failed`` has the reason for each robot whose stop could not be changed. */
+export interface MotionAnswer {
+  readonly robots: Readonly<Record<string, MotionEntry>>;
+  readonly user: string;
+  readonly failed: Readonly<Record<string, string>>;
 }
 
 /** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */

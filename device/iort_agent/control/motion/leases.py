@@ -1,14 +1,12 @@
-"""Decides which commands may pass, and when the robot must be stopped. Knows neither clock nor ROS.
+"""Decides which commands may pass and when the robot must be stopped. Knows neither clock nor ROS.
 
 A motion command is valid for a lease, counted from when it was sent. A command that was long on its way, or
 that waited in a frozen robot, has less of its lease left, or nothing. When the lease ends without a newer
-command, a stop is due. It is repeated a few times, because a single message may miss a node that is just
-starting. Then it ends, so that another driver (a joystick, a planner on board) is not blocked for ever.
+command, a stop is due (`iort_agent.control.motion.stops`).
 
 One session drives at a time: while its lease holds, another one is refused unless it takes over. A session
 that was refused so, or that an emergency stop ended, stays refused: a stick that is still held must not move
-the robot at the moment when the other driver lets go, or when the stop is released. An emergency stop is
-repeated for as long as it holds, so that it keeps its place before other drivers of the topic.
+the robot at the moment when the other driver lets go, or when the stop is released.
 
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
 within the uncertainty of its measured offset (`iort_agent.lanes.clock_offset`), and counts a command as old
@@ -17,10 +15,10 @@ as it may be. Without a known offset, no motion command passes. Leases run on th
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import NamedTuple
 
+from iort_agent.control.motion.stops import Stops
 from iort_contract.messages.commands import Command
 from iort_contract.messages.driving import (
     BEGIN_AGAIN,
@@ -36,11 +34,6 @@ from iort_contract.messages.driving import (
     SUPERSEDED,
 )
 
-# Repetitions of a stop after the first one.
-STOP_REPEATS = 4
-STOP_REPEAT_S = 0.25
-# Between the stops of an emergency stop. A multiplexer that ranks drivers forgets one after some 200 ms.
-STOP_HOLD_S = 0.1
 # Refused sessions to remember.
 _MAX_REFUSED = 64
 
@@ -53,19 +46,16 @@ class Limits(NamedTuple):
     lease_s: float | None = None
 
 
-class Leases:
+class Leases(Stops):
     """The commands of one name. Not safe to use from several threads at once."""
 
     def __init__(self, limits: Limits) -> None:
+        super().__init__()
         self._limits = limits
         # The newest command that passed.
         self.last: Command | None = None
         self._refused: deque[str] = deque(maxlen=_MAX_REFUSED)
-        self._closed = self._held = False
-        # The end of the current lease, and the stops still to publish: infinitely many in an emergency stop.
-        self._ends: float | None = None
-        self._stops = 0.0
-        self._next_stop = 0.0
+        self._closed = False
 
     def offer(self, command: Command, *, now_us: int, uncertainty_us: int | None, now: float) -> str | None:
         """None if the command may pass, and it counts as passed; otherwise the reason.
@@ -81,20 +71,8 @@ class Leases:
             return reason
         self.last = command
         if lease_s is not None:
-            self._ends = now + lease_s
-            self._stops = 0
+            self.move(now + lease_s)
         return None
-
-    def stop_due(self, now: float) -> bool:
-        """Whether the caller must publish a stop now."""
-        if self._ends is not None and now >= self._ends:
-            self._ends = None
-            self._stops, self._next_stop = STOP_REPEATS + 1, now
-        if not self._stops or now < self._next_stop:
-            return False
-        self._stops -= 1
-        self._next_stop = now + (STOP_HOLD_S if self._held else STOP_REPEAT_S)
-        return True
 
     def why_stopped(self) -> str:
         """Why a stop begins, for a person."""
@@ -108,38 +86,21 @@ class Leases:
 
     def left_s(self, now: float) -> float:
         """How long the lease still holds."""
-        return max(0.0, self._ends - now) if self._ends is not None else 0.0
+        return max(0.0, self.ends - now) if self.ends is not None else 0.0
 
     def hold(self, now: float) -> None:
-        """The emergency stop: end the lease, and repeat the stop until `free`."""
-        if self._held or self._closed:
+        """The emergency stop: end the lease and its session, and repeat the stop until `free`."""
+        if self._closed:
             return
         if self.last is not None:
             self._refuse(self.last.session)
-        self._held, self._ends = True, None
-        self._stops, self._next_stop = math.inf, now
-
-    def free(self) -> None:
-        """Release the emergency stop. The car stands until a session begins that was not refused."""
-        if self._held:
-            self._held, self._stops = False, min(self._stops, STOP_REPEATS)
-
-    def cut(self, now: float) -> None:
-        """End the lease now: its sender cannot be heard any more."""
-        if self._ends is not None:
-            self._ends = now
+        super().hold(now)
 
     def close(self, now: float) -> None:
         """End the lease now, and let no further command pass."""
         self.free()
         self._closed = True
         self.cut(now)
-
-    def next_due(self) -> float | None:
-        """When to call `stop_due` next; None while nothing moves."""
-        if self._ends is not None:
-            return self._ends
-        return self._next_stop if self._stops else None
 
     def _refuse(self, session: str) -> None:
         if session not in self._refused:

@@ -1,4 +1,4 @@
-"""Commands from the broker to ROS topics. `iort_agent.control.leases` decides which may pass."""
+"""Commands from the broker to ROS topics. `iort_agent.control.motion.leases` decides which may pass."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any, Callable, Mapping
 
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import CommandConfig, DownlinkConfig
-from iort_agent.control.driving import drive_sample, limited
-from iort_agent.control.leases import Leases, Limits
+from iort_agent.control.motion.driving import drive_sample, limited
+from iort_agent.control.motion.guard import Guard
+from iort_agent.control.motion.leases import Leases, Limits
 from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.commands import Command, decode_command
-from iort_contract.messages.driving import NO_ROS, SETTINGS_UNKNOWN, STOPPED, DriveLimits
+from iort_contract.messages.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED, DriveLimits
 from iort_contract.ros1.definition import Definition
 from iort_contract.topics import ACCEPTED, CMD
 
@@ -56,6 +57,8 @@ class _Command:
         self.leases = Leases(Limits(config.max_age_s, skew_s, motion.lease_s if motion is not None else None))
         self.passed = self.stops = self.limited = 0
         self.stopping = False
+        # The end of the lease that the guard knows.
+        self.guarded: float | None = None
         # When the next refused motion becomes a sample.
         self.refused_due = 0.0
 
@@ -92,17 +95,23 @@ class _Command:
 
 class Commands:
     """Publishes commands that may pass, and stops when a lease ends. ``wake`` is called when a stop may be
-    due earlier.
+    due earlier. The ``guard`` knows the end of each lease before a command passes.
 
     Raises `SourceError` for a ROS type that is not installed, `ConfigError` for a stop that does not fit its
     type.
     """
 
     def __init__(
-        self, config: DownlinkConfig, bridge: Bridge, *, operator: Operator, wake: Callable[[], None]
+        self,
+        config: DownlinkConfig,
+        bridge: Bridge,
+        *,
+        operator: Operator,
+        guard: Guard | None,
+        wake: Callable[[], None],
     ) -> None:
         self._bridge, self._graph, self._clock = bridge, bridge.graph, bridge.link.clock
-        self._operator, self._wake = operator, wake
+        self._operator, self._guard, self._wake = operator, guard, wake
         self._lock = threading.Lock()
         self._commands: dict[str, _Command] = {}
         stick = config.drive_limits()
@@ -144,6 +153,8 @@ class Commands:
         stopped: list[Mapping[str, Value]] = []
         with self._lock:
             now = self._clock.monotonic()
+            if self._guard is not None:
+                self._guard.tick()
             for command in self._commands.values():
                 if command.leases.stop_due(now):
                     if not command.stopping:
@@ -153,6 +164,7 @@ class Commands:
                 elif command.stopping and command.leases.next_due() is None:
                     command.stopping = False
                     ended.add(command.config.topic)
+                self._tell_guard(command)
             due = [
                 (at, command.config.topic)
                 for command in self._commands.values()
@@ -169,12 +181,31 @@ class Commands:
         """The passed and the limited commands and the published stops, by name."""
         return {one.name: one.report() for one in self._commands.values()}
 
+    def guarded(self) -> bool | None:
+        """Whether the guard would stop the robot; None if it needs none."""
+        with self._lock:
+            return None if self._guard is None else self._guard.ready()
+
+    def _tell_guard(self, command: _Command) -> bool:
+        """Tell the guard the end of the command's lease, if it is another; whether that was possible."""
+        ends = command.leases.ends
+        if self._guard is None or ends == command.guarded:
+            return True
+        command.guarded = ends
+        return self._guard.tell(command.name, ends)
+
     def _begin_stop(self, command: _Command, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""
         command.stopping = True
         last = command.leases.last
         _log.warning("command %s: %s, stopping", command.name, command.leases.why_stopped())
         return [] if last is None else [command.sample(last, STOPPED, now)]
+
+    def _unready(self) -> str | None:
+        """Why no motion may pass yet."""
+        if not self._operator.settings_known():
+            return SETTINGS_UNKNOWN
+        return NO_GUARD if self._guard is not None and not self._guard.ready() else None
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - as the uplink calls it
         if connected:
@@ -223,9 +254,13 @@ class Commands:
         moves = command.config.motion is not None
         with self._lock:
             now = self._clock.monotonic()
-            reason: str | None = SETTINGS_UNKNOWN
-            if not moves or self._operator.settings_known():
+            reason = self._unready() if moves else None
+            if reason is None:
                 reason = command.leases.offer(offered, now_us=now_us, uncertainty_us=uncertainty_us, now=now)
+            # Before the robot moves.
+            if reason is None and not self._tell_guard(command):
+                command.leases.cut(now)
+                reason = NO_GUARD
             if reason is None and not self._graph.publish(command.config.topic, data):
                 reason = NO_ROS
             command.passed += reason is None

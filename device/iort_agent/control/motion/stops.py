@@ -1,0 +1,66 @@
+"""When a robot must be stopped. Knows neither clock nor ROS.
+
+A motion holds until the end of its lease. Then a stop is due. It is repeated a few times, because a single
+message may miss a node that is just starting. Then it ends, so that another driver (a joystick, a planner on
+board) is not blocked for ever. An emergency stop is repeated for as long as it holds, so that it keeps its
+place before other drivers of the topic.
+"""
+
+from __future__ import annotations
+
+import math
+
+# Repetitions of a stop after the first one.
+STOP_REPEATS = 4
+STOP_REPEAT_S = 0.25
+# Between the stops of an emergency stop. A multiplexer that ranks drivers forgets one after some 200 ms.
+STOP_HOLD_S = 0.1
+
+
+class Stops:
+    """The stops of one motion. Times are of the monotonic clock. Not for several threads at once."""
+
+    def __init__(self) -> None:
+        # The end of the current lease.
+        self.ends: float | None = None
+        self._held = False
+        # The stops still to publish: infinitely many in an emergency stop.
+        self._stops = 0.0
+        self._next_stop = 0.0
+
+    def move(self, until: float) -> None:
+        """Begin a lease, or renew it; no stop is due before its end."""
+        self.ends, self._stops = until, 0
+
+    def stop_due(self, now: float) -> bool:
+        """Whether the caller must publish a stop now."""
+        if self.ends is not None and now >= self.ends:
+            self.ends = None
+            self._stops, self._next_stop = STOP_REPEATS + 1, now
+        if not self._stops or now < self._next_stop:
+            return False
+        self._stops -= 1
+        self._next_stop = now + (STOP_HOLD_S if self._held else STOP_REPEAT_S)
+        return True
+
+    def next_due(self) -> float | None:
+        """When to call `stop_due` next; None while nothing moves."""
+        if self.ends is not None:
+            return self.ends
+        return self._next_stop if self._stops else None
+
+    def cut(self, now: float) -> None:
+        """End the lease now: its sender cannot be heard any more."""
+        if self.ends is not None:
+            self.ends = now
+
+    def hold(self, now: float) -> None:
+        """End the lease, and repeat the stop until `free`."""
+        if not self._held:
+            self._held, self.ends = True, None
+            self._stops, self._next_stop = math.inf, now
+
+    def free(self) -> None:
+        """Repeat the stop a few times more."""
+        if self._held:
+            self._held, self._stops = False, STOP_REPEATS

@@ -1,0 +1,96 @@
+"""The broker's WebSockets and Amazon Cognito for a browser, which does not trust the gateway's authority.
+
+It listens on loopback without TLS, and passes on what a page needs, as it is: MQTT over WebSocket at /mqtt,
+and the two calls by which anybody gets an identity. Their signatures and policies are the gateway's affair.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+
+from aiohttp import (
+    ClientError,
+    ClientSession,
+    ClientWebSocketResponse,
+    TCPConnector,
+    WSMsgType,
+    WSServerHandshakeError,
+    web,
+)
+from yarl import URL
+
+from iort_station.page.background import BackgroundServer
+
+# "Amazon Cognito Federated Identities": these two are not signed.
+_TARGETS = {f"AWSCognitoIdentityService.{call}" for call in ("GetId", "GetCredentialsForIdentity")}
+_CORS = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Allow-Headers": "content-type, x-amz-target, x-amz-user-agent",
+    "Access-Control-Allow-Methods": "POST",
+}
+
+_Side = web.WebSocketResponse | ClientWebSocketResponse
+
+
+class Relay(BackgroundServer):
+    """Passes on to ``gateway``, an address such as https://127.0.0.1:4566, in a thread of its own."""
+
+    def __init__(self, host: str, port: int, *, gateway: str, authority: str) -> None:
+        super().__init__(host, port)
+        self._gateway = gateway
+        self._trusts = ssl.create_default_context(cafile=authority)
+
+    @property
+    def url(self) -> str:
+        """Where a browser connects to the broker."""
+        return f"ws://{self.host}:{self.port}/mqtt"
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Pass on one call, or one connection until either side ends it."""
+        if request.method == "OPTIONS":
+            return web.Response(status=204, headers=_CORS)
+        async with ClientSession(connector=TCPConnector(ssl=self._trusts), auto_decompress=False) as session:
+            try:
+                if request.path == "/mqtt":
+                    return await self._socket(request, session)
+                if request.method == "POST" and request.headers.get("X-Amz-Target") in _TARGETS:
+                    return await self._call(request, session)
+            except WSServerHandshakeError as refused:
+                return web.Response(status=refused.status)
+            except ClientError as error:
+                return web.Response(status=502, text=f"the embedded cloud does not answer: {error}\n")
+        return web.Response(status=404)
+
+    async def _socket(self, request: web.BaseRequest, session: ClientSession) -> web.StreamResponse:
+        # The signature covers the Host that the browser sent, and the query as it is.
+        address = URL(f"{self._gateway}{request.raw_path}", encoded=True)
+        asked = [one.strip() for one in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+        headers = {"Host": request.headers["Host"]}
+        async with session.ws_connect(address, protocols=asked, headers=headers, max_msg_size=0) as there:
+            here = web.WebSocketResponse(protocols=asked, max_msg_size=0)
+            await here.prepare(request)
+            ways = [asyncio.create_task(_pass_on(*way)) for way in ((here, there), (there, here))]
+            try:
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for way in ways:
+                    way.cancel()
+                await here.close()
+            return here
+
+    async def _call(self, request: web.BaseRequest, session: ClientSession) -> web.StreamResponse:
+        kept = {name: request.headers[name] for name in ("Content-Type", "X-Amz-Target")}
+        async with session.post(f"{self._gateway}/", data=await request.read(), headers=kept) as answer:
+            return web.Response(
+                status=answer.status,
+                body=await answer.read(),
+                headers={**_CORS, "Content-Type": answer.headers.get("Content-Type", "")},
+            )
+
+
+async def _pass_on(source: _Side, target: _Side) -> None:
+    async for message in source:
+        if message.type is not WSMsgType.BINARY:
+            return
+        await target.send_bytes(message.data)

@@ -1,0 +1,76 @@
+"""How the page reaches the broker: addresses signed for a viewer or a driver, and everybody's identity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from iort_contract.cloud import DRIVER, IOT, PUBNUB, VIEWER, client_prefix
+from iort_contract.messages.page import Identity, SocketAnswer
+from iort_station.cloud import Cloud
+from iort_station.fleet.roles import Role, has_drivers, transport
+from iort_station.page import keys
+from iort_station.page.page import DRIVE
+from iort_station.page.server import Answer
+
+
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], SocketAnswer]]:
+    """The answer ``socket``: a viewer's address."""
+    return {"socket": _addresses(cloud, VIEWER)}
+
+
+def actions(cloud: Cloud) -> dict[str, Answer]:
+    """The action ``drive``: a driver's address, if the deployment has drivers."""
+    return {DRIVE: _addresses(cloud, DRIVER)} if has_drivers(cloud) else {}
+
+
+def reaching(cloud: Cloud, live: str = "") -> dict[str, Any]:
+    """Keyword arguments for a page's server: its way to live messages, the deployment's own if ``live`` is
+    empty.
+
+    Raises `StationError` if that way cannot be used.
+    """
+    live = live or transport(cloud)
+    pubnub = keys.load(cloud).reading() if live == PUBNUB else {}
+    # A driver's commands go to the broker, whichever way the page listens.
+    broker = {"broker": _origin(cloud)} if live == IOT or has_drivers(cloud) else {}
+    return {"live": live, **broker, **pubnub}
+
+
+def everybody(cloud: Cloud) -> dict[str, Any]:
+    """Keyword arguments for the configuration of a page without a server."""
+    if transport(cloud) == PUBNUB:
+        return keys.load(cloud).reading()
+    return {"live": IOT, "identity": identity(cloud)}
+
+
+def identity(cloud: Cloud) -> Identity:
+    """The identity that everybody gets; raises `StationError` if the deployment has none."""
+    robots = cloud.output("fleet", "PublicRobots")
+    endpoint = cloud.client("cognito-identity").meta.endpoint_url
+    if cloud.websocket:
+        endpoint = f"http://{urlsplit(cloud.websocket).netloc}"
+    return {
+        "pool": cloud.output("fleet", "PublicPoolId"),
+        "region": cloud.region_name or "",
+        "endpoint": endpoint,
+        "socket": cloud.websocket_url,
+        "client_prefix": client_prefix(VIEWER, cloud.namespace),
+        "robots": [] if robots == "*" else robots.split(","),
+    }
+
+
+def _origin(cloud: Cloud) -> str:
+    address = urlsplit(cloud.websocket_url)
+    return f"{address.scheme}://{address.netloc}"
+
+
+def _addresses(cloud: Cloud, name: str) -> Callable[[Mapping[str, str]], SocketAnswer]:
+    role = Role(cloud, name)
+
+    def answer(_asked: Mapping[str, str]) -> SocketAnswer:
+        signed = role.signed()
+        return {"url": signed.url, "client_id": signed.client_id}
+
+    return answer

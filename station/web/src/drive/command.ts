@@ -1,0 +1,54 @@
+// The commands of one hold of the stick, as `iort_contract.messages.commands` writes them.
+
+import { DRIVE_LEASE_MS, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
+import type { Motion } from "./stick";
+
+export interface Command {
+  readonly v: number;
+  readonly session: string;
+  readonly started_us: number;
+  readonly seq: number;
+  readonly sent_us: number;
+  readonly valid_ms: number;
+  readonly lease_ms: number;
+  readonly message: Readonly<Record<string, unknown>>;
+  readonly by: string;
+  readonly takeover?: true;
+}
+
+/** One hold of the stick. */
+export interface Session {
+  readonly name: string;
+  readonly started_us: number;
+  readonly by: string;
+}
+
+export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean }): Command {
+  const lease_ms = Math.min(DRIVE_LEASE_MS, limits.lease_ms);
+  return {
+    v: SCHEMA_VERSION,
+    session: session.name,
+    started_us: session.started_us,
+    seq,
+    // The clock may have been set back by a little since the session began.
+    sent_us: Math.max(sent_us, session.started_us),
+    valid_ms: lease_ms,
+    lease_ms,
+    message: messageOf(limits, motion),
+    by: session.by,
+    ...(takeover ? { takeover } : {}),
+  };
+}
+
+/** The ROS message with the two fields that the stick drives. */
+function messageOf({ speed, steering }: DriveLimitsEntry, { speed_mps, steering_rad }: Motion): Record<string, unknown> {
+  const message: Record<string, unknown> = {};
+  for (const [path, value] of [[speed, speed_mps], [steering, steering_rad]] as const) {
+    const names = path.split(".");
+    const last = names.pop()!;
+    let inner = message;
+    for (const name of names) inner = (inner[name] ??= {}) as Record<string, unknown>;
+    inner[last] = value;
+  }
+  return message;
+}

@@ -1,0 +1,210 @@
+// A driver's hold of the stick, without the page: when the car may move, which commands go out, and why it is over.
+//
+// A hold begins at a standstill. It may move once the car has answered a command, within the limits of the round trip
+// and of the newest sample's age. Whatever ends it, the viewer must let go before the next one: a car must not
+// move because an obstacle to driving has gone away.
+
+import { DRIVE_LEASE_MS, DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, LIVE_MAX_RATE_HZ, type DriveLimitsEntry } from "../base/contract";
+import { CloudClock } from "./cloud_clock";
+import { commandOf, type Command, type Session } from "./command";
+import type { Driven, LiveMessage } from "./live_message";
+import { CENTRE, meant, type Motion, type Stick } from "./stick";
+import { inWords, TOO_LATE } from "./outcomes";
+
+export type Phase = "free" | "starting" | "driving" | "over";
+
+// A car that has not answered by then does not hear us.
+const ANSWER_MS = 2_000;
+// A stop is sent this often: a message may be lost.
+const STOPS = 3;
+// A wrong clock is known after one answer, and corrected with a new session.
+const CORRECTIONS = 2;
+const STANDING: Motion = { speed_mps: 0, steering_rad: 0 };
+
+export class Driver {
+  phase: Phase = "free";
+  /** Why the hold is over, or why none can begin; for the viewer. */
+  reason = "";
+  rtt_ms: number | undefined;
+  /** Whether the last hold ended because another drives, so that taking over may be offered. */
+  other = false;
+  /** The viewer's own top speed. */
+  top_mps: number;
+  stick: Stick = CENTRE;
+  private readonly clock = new CloudClock();
+  private held = false;
+  private session: Session | undefined;
+  private seq = 0;
+  private began_ms = 0;
+  private corrections = 0;
+  private stops = 0;
+  private takeover = false;
+  private obstacle = "";
+  private taken_ms = -Infinity;
+  private next_ms = 1000 / LIVE_MAX_RATE_HZ;
+  private clockless = false;
+  private newest: { readonly driven: Driven; readonly until_ms: number } | undefined;
+  /** When each command left that the car has not answered, the oldest first. */
+  private waiting: { readonly seq: number; readonly left_ms: number }[] = [];
+
+  constructor(
+    private readonly limits: DriveLimitsEntry,
+    private readonly by: string,
+    private readonly newName: () => string,
+  ) {
+    this.top_mps = limits.max_speed_mps;
+  }
+
+  /** The age of the car's newest sample; undefined before the first one. */
+  age_ms(now_ms: number): number | undefined {
+    const cloud = this.cloud_ms(now_ms);
+    return cloud === undefined || this.taken_ms === -Infinity ? undefined : Math.max(0, cloud - this.taken_ms);
+  }
+
+  /** Who drives now, by the car's own word: the name, and whether it is this hold. */
+  driving(now_ms: number): { readonly by: string; readonly mine: boolean } | undefined {
+    if (!this.newest || this.newest.driven.driver === "" || now_ms > this.newest.until_ms) return undefined;
+    const { driver, driverBy } = this.newest.driven;
+    return { by: driverBy || "somebody", mine: driver === this.session?.name };
+  }
+
+  /** What stands against driving, apart from what the car's messages say; an empty text if nothing does. */
+  block(obstacle: string): void {
+    this.obstacle = obstacle;
+    if (obstacle !== "") this.end(obstacle);
+  }
+
+  /** The viewer holds the dead-man button, or not. */
+  hold(held: boolean, now_ms: number): void {
+    if (held === this.held) return;
+    this.held = held;
+    if (!held) {
+      this.finish();
+      [this.phase, this.reason] = ["free", ""];
+      return;
+    }
+    [this.other, this.corrections] = [false, 0];
+    const against = this.against(now_ms);
+    if (against === "") this.begin(now_ms);
+    else [this.phase, this.reason] = ["over", against];
+  }
+
+  /** The next hold takes over from whoever drives. */
+  askTakeover(): void {
+    this.takeover = true;
+  }
+
+  hear(message: LiveMessage, now_ms: number): void {
+    this.clockless = message.taken_ms === undefined;
+    if (message.taken_ms !== undefined) {
+      this.clock.heard(message.sent_ms!, now_ms);
+      this.taken_ms = Math.max(this.taken_ms, message.taken_ms);
+    }
+    if (message.driven) this.answer(message.driven, message, now_ms);
+  }
+
+  /** The command to send now, if any. */
+  tick(now_ms: number): Command | undefined {
+    if (this.phase === "starting" || this.phase === "driving") {
+      const against = this.against(now_ms) || this.unanswered(now_ms);
+      if (against !== "") this.end(against);
+    }
+    if (this.phase === "starting") return this.command(STANDING, now_ms);
+    if (this.phase === "driving") return this.command(meant(this.stick, { top_mps: this.top_mps, ...this.limits }), now_ms);
+    if (this.stops === 0) return undefined;
+    this.stops -= 1;
+    return this.command(STANDING, now_ms);
+  }
+
+  private begin(now_ms: number): void {
+    this.session = { name: this.newName(), started_us: this.cloud_us(now_ms), by: this.by };
+    [this.seq, this.waiting, this.stops, this.rtt_ms] = [0, [], 0, undefined];
+    [this.phase, this.reason, this.began_ms] = ["starting", "", now_ms];
+  }
+
+  /** End the hold with a reason; the viewer must let go. */
+  private end(reason: string): void {
+    if (this.phase === "over" || this.phase === "free") return;
+    this.finish();
+    [this.phase, this.reason] = ["over", reason];
+  }
+
+  /** Have the car stop, if this hold may have moved it. */
+  private finish(): void {
+    if (this.phase === "starting" || this.phase === "driving") this.stops = STOPS;
+    this.takeover = false;
+  }
+
+  /** Why the car must not be driven now. */
+  private against(now_ms: number): string {
+    if (this.obstacle !== "") return this.obstacle;
+    if (this.clockless) return inWords("clock_offset_unknown");
+    const age = this.age_ms(now_ms);
+    if (age === undefined) return "Nothing has been heard of the car yet";
+    return age > DRIVE_MAX_AGE_MS ? `The newest sample is ${Math.round(age)} ms old, at most ${DRIVE_MAX_AGE_MS} ms is allowed` : "";
+  }
+
+  private unanswered(now_ms: number): string {
+    if (this.phase === "starting") return now_ms - this.began_ms > ANSWER_MS ? "The car does not answer" : "";
+    const oldest = this.waiting[0]?.left_ms ?? now_ms;
+    return now_ms - oldest > DRIVE_MAX_RTT_MS + this.next_ms ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
+  }
+
+  private answer(driven: Driven, message: LiveMessage, now_ms: number): void {
+    this.newest = { driven, until_ms: now_ms + driven.leaseLeft_ms };
+    if (driven.session !== this.session?.name) {
+      // Another's command has passed, so ours no longer do.
+      if (this.phase === "driving" && driven.driver !== "" && driven.driver !== this.session?.name) this.lose(driven);
+      return;
+    }
+    const sent = this.waiting.find(({ seq }) => seq === driven.seq);
+    this.waiting = this.waiting.filter(({ seq }) => seq > driven.seq);
+    if (message.next_ms !== undefined) this.next_ms = message.next_ms;
+    if (sent) {
+      this.rtt_ms = Math.max(0, now_ms - sent.left_ms - message.lay_ms);
+      if (message.taken_ms !== undefined) this.clock.answered(sent.left_ms, message.taken_ms);
+    }
+    if (this.phase !== "starting" && this.phase !== "driving") return;
+    if (driven.outcome !== "accepted") this.refused(driven, now_ms);
+    else if (this.rtt_ms !== undefined && this.rtt_ms > DRIVE_MAX_RTT_MS) this.end(slow(this.rtt_ms));
+    else if (this.phase === "starting") [this.phase, this.takeover] = ["driving", false];
+  }
+
+  private refused(driven: Driven, now_ms: number): void {
+    if (driven.outcome === "driven_by_another") {
+      this.lose(driven);
+    } else if (this.phase === "starting" && TOO_LATE.has(driven.outcome) && this.corrections < CORRECTIONS) {
+      this.corrections += 1;
+      const { began_ms } = this;
+      this.begin(now_ms);
+      this.began_ms = began_ms;
+    } else {
+      this.end(inWords(driven.outcome));
+    }
+  }
+
+  private lose(driven: Driven): void {
+    const was = this.phase;
+    this.end(`${driven.driverBy || "Somebody"} ${was === "driving" ? "has taken over" : "drives this car"}`);
+    this.other = true;
+  }
+
+  private command(motion: Motion, now_ms: number): Command | undefined {
+    if (!this.session) return undefined;
+    const { seq } = this;
+    this.seq += 1;
+    this.waiting.push({ seq, left_ms: now_ms });
+    this.waiting = this.waiting.filter(({ left_ms }) => now_ms - left_ms < ANSWER_MS + DRIVE_LEASE_MS);
+    return commandOf(this.session, this.limits, { seq, sent_us: this.cloud_us(now_ms), motion, takeover: this.takeover });
+  }
+
+  private cloud_ms(now_ms: number): number | undefined {
+    return this.clock.offset_ms === undefined ? undefined : now_ms + this.clock.offset_ms;
+  }
+
+  private cloud_us(now_ms: number): number {
+    return Math.round((this.cloud_ms(now_ms) ?? now_ms) * 1e3);
+  }
+}
+
+const slow = (rtt_ms: number): string => `The round trip takes ${Math.round(rtt_ms)} ms, at most ${DRIVE_MAX_RTT_MS} ms is allowed`;

@@ -1,0 +1,74 @@
+// The emergency stop above every view: of the car that is shown, and else of the fleet. A press stops; only a release
+// asks whether it is meant.
+
+import type { Config } from "../base/contract";
+import { el, setAttribute, Text } from "../base/dom";
+import { Stops } from "./stops";
+
+// A longer list of names says nothing more.
+const NAMED = 6;
+
+export class StopControl {
+  readonly stops: Stops;
+  private readonly press = el("button", { type: "button", class: "stop-press" });
+  private readonly words = new Text("stop-words", "p", { role: "status" });
+  private readonly release = el("button", { type: "button", class: "tool stop-release" });
+  private readonly strip: HTMLElement;
+  private robot: string | undefined;
+  private sure = false;
+
+  constructor(config: Config, header: HTMLElement) {
+    this.stops = new Stops(config, () => this.show());
+    this.strip = el("div", { class: "stop-strip", hidden: "" }, this.words.node, this.release);
+    header.after(this.strip);
+    this.press.hidden = this.release.hidden = !this.stops.able;
+    if (this.stops.able) header.querySelector("#link")!.before(this.press);
+    this.press.addEventListener("click", () => void this.stops.set(this.robot, true));
+    this.release.addEventListener("click", () => {
+      if (this.sure) void this.stops.set(this.robot, false);
+      this.ask(!this.sure);
+    });
+    this.release.addEventListener("blur", () => this.ask(false));
+    this.of(undefined);
+  }
+
+  /** The buttons are about this car from now on; about the fleet if undefined. */
+  of(robot: string | undefined): void {
+    this.robot = robot;
+    this.press.textContent = robot === undefined ? "Stop all" : `Stop ${robot}`;
+    setAttribute(this.press, "aria-label", `${this.press.textContent}: emergency stop`);
+    this.ask(false);
+    this.show();
+  }
+
+  private ask(sure: boolean): void {
+    this.sure = sure;
+    const whom = this.robot ?? "all";
+    this.release.textContent = sure ? `Really release ${whom}: it may move` : `Release ${whom}`;
+    setAttribute(this.release, "data-sure", String(sure));
+  }
+
+  private show(): void {
+    // While it is made, nothing is known yet.
+    if (!this.strip) return;
+    const { stand, pending } = this.stops.stopped;
+    const refused = this.robot === undefined ? "" : (this.stops.of(this.robot)?.reason ?? "");
+    const texts = [
+      ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
+      ...(pending.length > 0 ? [`Not confirmed by ${listed(pending)}.`] : []),
+      ...(refused && this.stops.of(this.robot!)!.asked ? [`${this.robot} rejects the stop: ${refused}.`] : []),
+      ...(this.stops.error ? [`${this.stops.error}.`] : []),
+    ];
+    this.words.set(texts.join(" "));
+    this.strip.hidden = texts.length === 0;
+    setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== ""));
+    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
+    const any = this.robot === undefined ? stand.length + pending.length > 0 : one !== undefined && (one.asked || one.stopped === true);
+    this.release.hidden = !this.stops.able || !any;
+  }
+}
+
+function listed(names: readonly string[]): string {
+  const more = names.length - NAMED;
+  return names.slice(0, NAMED).join(", ") + (more > 0 ? ` and ${more} more` : "");
+}

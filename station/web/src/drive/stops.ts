@@ -1,0 +1,83 @@
+// The emergency stops of the fleet, as the page's server reads them from the cars' shadows.
+
+import type { Config, MotionAnswer, MotionEntry } from "../base/contract";
+import { may } from "../server/admission";
+import { act, ask, AnswerError } from "../server/answers";
+
+const POLL_MS = 10_000;
+// While a car has not confirmed what was asked for here.
+const SOON_MS = 1_000;
+const SOON_FOR_MS = 20_000;
+
+export class Stops {
+  /** Why the newest request failed, for the viewer. */
+  error = "";
+  /** Whether this browser may stop cars, and release them. */
+  readonly able: boolean;
+  private robots: Readonly<Record<string, MotionEntry>> = {};
+  private timer: number | undefined;
+  private soonUntil_ms = 0;
+
+  constructor(
+    config: Config,
+    private readonly changed: () => void,
+  ) {
+    this.able = may(config, "stop");
+    if (!config.answers) return;
+    document.addEventListener("visibilitychange", () => void this.poll());
+    void this.poll();
+  }
+
+  of(robot: string): MotionEntry | undefined {
+    return Object.hasOwn(this.robots, robot) ? this.robots[robot] : undefined;
+  }
+
+  /** The cars that stand until they are released, and those that have not confirmed a stop or a release. */
+  get stopped(): { readonly stand: string[]; readonly pending: string[] } {
+    const names = Object.keys(this.robots);
+    const pending = names.filter((name) => waits(this.robots[name]!));
+    return { stand: names.filter((name) => this.robots[name]!.stopped === true && !pending.includes(name)), pending };
+  }
+
+  /** Stop a car, or every one; or release it. */
+  async set(robot: string | undefined, stopped: boolean): Promise<void> {
+    this.error = "";
+    try {
+      const answer = await act<MotionAnswer>("stop", { stopped: String(stopped), ...(robot === undefined ? {} : { robot }) });
+      this.take(answer.robots);
+      const failed = Object.entries(answer.failed).map(([name, reason]) => `${name}: ${reason}`);
+      if (failed.length > 0) this.error = `Not ${stopped ? "stopped" : "released"}: ${failed.join("; ")}`;
+    } catch (error) {
+      if (!(error instanceof AnswerError)) throw error;
+      this.error = `Not ${stopped ? "stopped" : "released"}: ${error.message}`;
+    }
+    this.soonUntil_ms = performance.now() + SOON_FOR_MS;
+    this.changed();
+    this.later(SOON_MS);
+  }
+
+  private async poll(): Promise<void> {
+    window.clearTimeout(this.timer);
+    if (document.hidden) return;
+    try {
+      this.take((await ask<MotionAnswer>("motion", {})).robots);
+      this.changed();
+    } catch (error) {
+      // What was known stays; an older server does not answer at all.
+      if (!(error instanceof AnswerError)) throw error;
+    }
+    this.later(this.stopped.pending.length > 0 && performance.now() < this.soonUntil_ms ? SOON_MS : POLL_MS);
+  }
+
+  private later(wait_ms: number): void {
+    window.clearTimeout(this.timer);
+    this.timer = window.setTimeout(() => void this.poll(), wait_ms);
+  }
+
+  private take(robots: Readonly<Record<string, MotionEntry>>): void {
+    this.robots = { ...this.robots, ...robots };
+  }
+}
+
+/** Whether a car has not done yet what was asked for; one that cannot move has nothing to do. */
+const waits = ({ asked, stopped, reason }: MotionEntry): boolean => reason === "" && asked !== (stopped ?? false);

@@ -1,0 +1,78 @@
+"""The emergency stop of one robot and of a fleet: asked for at once, and told as the robots confirm it."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from iort_contract.messages.driving import DriveLimits, encode_limits
+from iort_station.errors import StationError
+from iort_station.fleet import stopping
+from iort_station.page import motion
+
+LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
+
+
+class Shadows:
+    """The shadows of two robots. ``broken`` is one whose shadow cannot be changed."""
+
+    class exceptions:
+        class ResourceNotFoundException(Exception):
+            """There is no shadow."""
+
+    def __init__(self) -> None:
+        self.states: dict[str, Any] = {"car7": {"reported": {"drive": encode_limits(LIMITS)}}}
+        self.broken = ""
+
+    def client(self, _service: str) -> Shadows:
+        return self
+
+    def get_thing_shadow(self, *, thingName: str, shadowName: str) -> dict[str, Any]:
+        if thingName not in self.states:
+            raise self.exceptions.ResourceNotFoundException
+        return {"payload": io.BytesIO(json.dumps({"state": self.states[thingName]}).encode())}
+
+    def update_thing_shadow(self, *, thingName: str, shadowName: str, payload: str) -> None:
+        if thingName == self.broken:
+            raise ClientError({"Error": {"Code": "ThrottlingException"}}, "UpdateThingShadow")
+        self.states.setdefault(thingName, {}).update(json.loads(payload)["state"])
+
+    def confirm(self, robot: str, *, stopped: bool) -> None:
+        self.states[robot].setdefault("reported", {})["motion"] = {"stopped": stopped}
+
+
+@pytest.fixture
+def cloud(monkeypatch):
+    monkeypatch.setattr(stopping.registry, "listed", lambda _cloud: [{"robot": "car7"}, {"robot": "car8"}])
+    monkeypatch.setattr(motion.registry, "presence", lambda _cloud: {"car7": {}, "car8": {}})
+    return Shadows()
+
+
+def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
+    told = motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "true"})["robots"]
+    assert (told["car7"]["asked"], told["car7"]["stopped"]) == (True, None)
+    cloud.confirm("car7", stopped=True)
+    told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
+    assert (told["asked"], told["stopped"]) == (True, True)
+    assert told["drive"] == vars(LIMITS)
+    told = motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "false"})["robots"]["car7"]
+    assert (told["asked"], told["stopped"]) == (False, True)
+
+
+def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):
+    cloud.broken = "car7"
+    told = motion.actions(cloud)["stop"]({"stopped": "true"})
+    assert "Throttling" in told["failed"]["car7"]
+    assert told["robots"]["car8"]["asked"]
+
+
+def test_a_stranger_or_an_unclear_wish_changes_nothing(cloud):
+    with pytest.raises(StationError, match="not registered: car9; nothing is changed"):
+        motion.actions(cloud)["stop"]({"robot": "car9", "stopped": "true"})
+    with pytest.raises(StationError, match="stopped must be true or false"):
+        motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "yes"})
+    assert "desired" not in cloud.states["car7"]
