@@ -1,5 +1,5 @@
-"""The live lane on demand: what a car sends while nobody looks, how soon it is awake, and both ways to a viewer
-side by side."""
+"""The live lane on demand: what a car sends while nobody looks, how soon it is awake, and both ways to a
+viewer side by side."""
 
 from __future__ import annotations
 

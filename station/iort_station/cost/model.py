@@ -11,6 +11,7 @@ from math import ceil
 from typing import Any
 
 from iort_contract.catalog.questions import QUESTIONS
+from iort_contract.cloud import IOT, PUBNUB
 from iort_station.cost import analysing, archiving
 from iort_station.cost.line_items import (
     METER,
@@ -26,7 +27,7 @@ from iort_station.cost.line_items import (
 )
 from iort_station.cost.prices import PRICES, PUBNUB_MAU_PLANS, Price
 from iort_station.cost.sizes import OWN_ITEM_BYTES, Sizes, sizes_of
-from iort_station.cost.usage import IOT, PUBNUB, Usage
+from iort_station.cost.usage import Usage
 
 # A shard of a stream is a partition of the table. Lambda 2 is invoked once a window, or once these records
 # are there; a test compares both with the stack. The thesis had no window: Lambda polls a shard 4 times a

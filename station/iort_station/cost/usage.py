@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
 from iort_contract.messages.viewing import VIEW_RENEW_S
@@ -12,7 +13,6 @@ from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import UsageError
 
-PUBNUB, IOT = "pubnub", "iot"
 TRANSPORTS = (PUBNUB, IOT)
 # A car without round-trip pings still pings for its clock offset; a test compares this with the agent.
 CLOCK_PING_S = 30.0

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_contract.cloud import PUBNUB
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
@@ -21,7 +22,7 @@ from iort_station.cost.deployed import as_deployed
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
 from iort_station.cost.prices import AS_OF, PRICES, REGION
-from iort_station.cost.usage import PUBNUB, TRANSPORTS, Usage
+from iort_station.cost.usage import TRANSPORTS, Usage
 
 commands = typer.Typer()
 _DEFAULT = Usage()
