@@ -40,23 +40,25 @@ class Prior(NamedTuple):
 class Fit(NamedTuple):
     """The coefficients of a linear model with their covariance; and the residuals, NaN where none is known.
 
-    ``sigma`` is the deviation of a single value from the model, without outliers.
+    ``sigma`` is the deviation of a single value from the model, without outliers. ``blocks`` is how many
+    blocks' spread the covariance is of.
     """
 
     coefficients: Array
     covariance: Array
     residuals: Array
     sigma: float
+    blocks: int = BLOCKS
 
     def estimate(self, weights: Array, unit: str) -> Estimate:
         """A weighted sum of the coefficients."""
         deviation = float(np.sqrt(weights @ self.covariance @ weights))
-        return estimate(float(weights @ self.coefficients), deviation, unit)
+        return estimate(float(weights @ self.coefficients), deviation, unit, self.blocks)
 
     def of(self, index: int, unit: str) -> Estimate:
         """One coefficient."""
         deviation = float(np.sqrt(self.covariance[index, index]))
-        return estimate(float(self.coefficients[index]), deviation, unit)
+        return estimate(float(self.coefficients[index]), deviation, unit, self.blocks)
 
 
 def fit(
@@ -90,7 +92,7 @@ def fit(
     coefficients, covariance, sigma = solved
     residuals = np.full(len(wanted), np.nan)
     residuals[known] = y - coefficients @ design
-    return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma)
+    return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma, blocks)
 
 
 def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], unit: str) -> Estimate:
