@@ -157,7 +157,7 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
 
     def rolling(c: Array) -> float:
         """The wheels' speed for the car's, over the drive: tyres carry friction and drag."""
-        return 1 + _slipped(c[2:]) * (c[-1] + _dragged(c[2:], speed2))
+        return 1 + _slipped(c[2:]) * (float(c[-1]) + _dragged(c[2:], speed2))
 
     def mass_kg(c: Array) -> Any:
         # The accelerations were found with the gain, too. Both are of wheels that slip.
