@@ -34,6 +34,7 @@ def made() -> dict[str, Any]:
 def write(path: Path | None, figures: Any) -> None:
     """Write the figures, if there is a file for them."""
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(figures, indent=2) + "\n")
 
 

@@ -86,12 +86,12 @@ def own_item_bytes() -> int:
     return stored_bytes(encode_batch(Batch(_BOOT, 100_000, [_T_US], columns)))
 
 
-def archived_share(seconds: int = 3600) -> float:
+def archived_share() -> float:
     """The bytes in the archive for each byte of a drive's items in the table, over a whole hour."""
-    samples = simulated_drive(seconds * 50, after_s=_WARM_S)
+    samples = simulated_drive(3600 * 50, after_s=_WARM_S)
     items, stored, into, serialize = [], 0, BytesIO(), TypeSerializer().serialize
     start_us = hour_of(_T_US).start_us
-    for second in range(seconds):
+    for second in range(3600):
         batch = batch_of(samples[second * 50 : (second + 1) * 50], 50)
         times_us = [t_us - _T_US + start_us + second * 1_000_000 for t_us in batch.times_us]
         made = replace(batch, seq=100_000 + second, times_us=times_us)

@@ -33,11 +33,11 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from iort_station.data.runs import runs
 from iort_station.fleet import robots
 from iort_station.page import control

@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from functions.shared import clients, recordings
+from functions.shared import clients
+from functions.shared.analysis import recordings
+from functions.shared.analysis.kept import Kept
+from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
-from functions.shared.recordings import Recordings
 from iort_analysis.archive.tables import write_table
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
@@ -22,7 +23,10 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import drive_prefix
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, decode_planned
+from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned
+
+# An item of the table holds 400 KB; 50 streams of 100 null fields would be more.
+_MOST_REASONS, _LONGEST_REASON = 200, 300
 
 
 def analysed(planned: PlannedDrive, recordings: Recordings) -> DriveResult:
@@ -49,9 +53,18 @@ def row(result: DriveResult, job: str) -> AnalysedDrive:
         job=job,
         samples=result.samples,
         estimates=mined.estimates,
-        missing=mined.missing,
+        missing=_in_a_row(mined.missing),
         repairs=result.repairs,
     )
+
+
+def _in_a_row(missing: Mapping[str, str]) -> dict[str, str]:
+    """As many reasons as an item of the table holds; those about single fields are left out first."""
+    names = sorted(missing, key=lambda name: "." in name)
+    kept = {name: missing[name][:_LONGEST_REASON] for name in names[:_MOST_REASONS]}
+    if len(names) > _MOST_REASONS:
+        kept["others"] = f"{len(names) - _MOST_REASONS:,} more are in the drive's result.json"
+    return kept
 
 
 def handler(event: Mapping[str, Any], _context: object) -> None:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from functions.shared import clients
-from functions.shared.bodies import Bodies, check_size
 from functions.shared.dead_letter import DeadLetterQueue, refused_event
 from functions.shared.environment import variables
 from functions.shared.metrics import emit
+from functions.shared.questions.bodies import Bodies, check_size
+from functions.shared.questions.work import RefusedError, Work, work_of
 from functions.shared.quota import HOUR, Quota
-from functions.shared.work import RefusedError, Work, work_of
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
 from iort_contract.limits import ContractError

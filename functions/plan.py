@@ -9,15 +9,18 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from functions.shared import clients, recordings
+from functions.shared import clients
+from functions.shared.analysis import recordings
+from functions.shared.analysis.failures import failed_plans
+from functions.shared.analysis.kept import Kept
+from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
-from functions.shared.kept import Kept
-from functions.shared.recordings import Recordings
 from iort_analysis.drives.finding import STAND_US, Heard, find
 from iort_analysis.drives.motion import motion_field, motion_stream, moving
 from iort_analysis.samples.batches import RefusedItems, blocks
@@ -26,7 +29,8 @@ from iort_contract.cloud import plan_key
 from iort_contract.dynamodb import Item
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.analysis import (
+from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis.run import (
     AnalysisRequest,
     PlannedDrive,
     decode_request,
@@ -34,7 +38,6 @@ from iort_contract.messages.analysis import (
     encode_request,
 )
 from iort_contract.messages.batch import batch_id
-from iort_contract.messages.findings import DriveKey
 from iort_contract.tables import BATCH
 
 _END_US = 2**53
@@ -126,9 +129,12 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     if "robot" not in event:
         return selected(decode_request(event["input"], now_us), recordings.deployed(), event["job"])
     given, request = variables(PlanEnvironment), decode_request(event, now_us)
-    drives = planned(event["robot"], request, recordings.deployed())
+    robot, table = event["robot"], FindingsTable(clients.dynamodb(), given.findings_table)
+    failed = failed_plans(table, robot, request.start_us, request.end_us, again=request.again)
+    start_us = min([request.start_us, *(one.from_us for one in failed)])
+    drives = planned(robot, replace(request, start_us=start_us), recordings.deployed())
     if not request.again:
-        drives = unknown_to(FindingsTable(clients.dynamodb(), given.findings_table), drives)
+        drives = unknown_to(table, drives)
     kept = Kept(clients.s3(), given.files_bucket)
-    kept.put_json(plan_key(event["job"], event["robot"]), [encode_planned(one) for one in drives])
+    kept.put_json(plan_key(event["job"], robot), [encode_planned(one) for one in drives])
     return {"drives": len(drives)}

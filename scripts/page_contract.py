@@ -10,14 +10,16 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 
 from iort_contract import checks, limits, topics
 from iort_contract import page as served
-from iort_contract.catalog import findings, kinds, vesc
+from iort_contract.catalog import vesc
+from iort_contract.catalog.analysis import kinds, parameters
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, insights, page
+from iort_contract.messages import commands, page
+from iort_contract.messages.analysis import insights
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -71,7 +73,7 @@ def _constants() -> Iterator[str]:
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
         kinds: ("ANALYSIS_FAILED",),
-        findings: ("STYLE_GROUP",),
+        parameters: ("STYLE_GROUP",),
         commands: ("MAX_LEASE_MS",),
         served: ("KEY_HEADER",),
     }.items():

@@ -27,8 +27,9 @@ from stacks.storage import Storage
 
 # Lambda gives a whole core at 1769 MB, and these functions compute. A robot-hour takes two seconds.
 _CORE_MB = 1769
-# A child of the map is an express workflow, which AWS ends after five minutes: three attempts must fit.
-_ANALYSE_S, _PLAN_S, _EVALUATE_S = 90, 900, 900
+# A child of the map is an express workflow, which AWS ends after five minutes, without a finding: three
+# attempts, all pauses between them and the finding must fit.
+_ANALYSE_S, _PLAN_S, _EVALUATE_S = 70, 900, 900
 # Robots that are planned at once, and drives that are analysed at once. The embedded cloud's functions share
 # this machine's cores; and a new account on AWS has ten environments for all functions, also for those that
 # take the robots' samples: drives that are refused there must find a place within the retries of a minute.
@@ -121,6 +122,9 @@ class Analysis(PlatformStack):
         present = function(self, "Present", environment, timeout_s=_EVALUATE_S)
         self._storage.findings.grant(present, "dynamodb:Query", "dynamodb:PutItem", "dynamodb:DeleteItem")
         allow(present, ["s3:GetObject"], self._objects(PLANS_PREFIX))
+        # The results of a drive that others replace.
+        allow(present, ["s3:ListBucket"], self._storage.files.bucket_arn)
+        allow(present, ["s3:DeleteObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
         allow(present, ["sns:Publish"], self._alarms.topic_arn)
         return present
 

@@ -23,6 +23,7 @@ from iort_contract.topics import RECORD, build_topic
 serialize = TypeSerializer().serialize
 
 TELEMETRY, SUMMARY, ROBOTS, QUARANTINE, ARCHIVE = "telemetry", "summary", "robots", "quarantine", "archive"
+FINDINGS, FILES = "findings", "files"
 # The arguments of Tables, as Lambda 2 gets them.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
 KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,), ARCHIVE: (TOPIC, HOUR)}

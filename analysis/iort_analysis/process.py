@@ -14,11 +14,12 @@ import numpy as np
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
+from iort_analysis.drives.motion import vescs_of
 from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
 
 Miner = Callable[[Drive], Mined]
 # By the name that a result gives as missing if the miner fails.
@@ -106,6 +107,8 @@ def _unusable(drive: Drive) -> dict[str, str]:
         missing["samples"] = "the drive has no samples"
     elif drive.vesc is None:
         missing["vesc"] = "no stream has speed, voltage_input and current_motor"
+    for other in vescs_of({name: block.columns for name, block in drive.streams.items()})[1:]:
+        missing[other] = f"of several motor controllers only the first is analysed, {drive.vesc}"
     for stream, block in drive.raw.items():
         clean = drive.streams[stream].columns
         for name, column in block.columns.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import zlib
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any, Iterable, Iterator, Mapping, NamedTuple
@@ -21,10 +22,10 @@ from iort_contract.topics import Topic
 ARCHIVE_PREFIX = "archive/"
 # The manifest's sort key: the hour, such as 2026-11-22T07.
 HOUR = "hour"
-# The manifest's partition of what is to be done: an hour to archive, or a day whose hours are to be joined.
+# The manifest's partitions of what is to be done: an hour to archive, or a day whose hours are to be joined.
 # The sort key is the hour or the date, `#` and the topic. It stands for all batches that Lambda 2 saw before
-# ``due_ms``.
-PENDING, DUE_MS = "pending", "due_ms"
+# ``due_ms``. At a full hour every stream of the fleet is marked, and a partition takes 1,000 writes a second.
+PENDING, DUE_MS = tuple(f"pending{part}" for part in range(8)), "due_ms"
 # In a pending row: when it was due at first. Late batches move ``due_ms``, and this stays.
 FIRST_DUE_MS = "first_due_ms"
 # In a pending row: until then no item of the hour expires, since its expiry was put off.
@@ -201,7 +202,8 @@ class Pending(NamedTuple):
     @property
     def key(self) -> Item:
         """Its key in the manifest."""
-        return {TOPIC: {"S": PENDING}, HOUR: {"S": f"{self.period}#{self.topic}"}}
+        partition = PENDING[zlib.crc32(self.topic.encode()) % len(PENDING)]
+        return {TOPIC: {"S": partition}, HOUR: {"S": f"{self.period}#{self.topic}"}}
 
     @property
     def is_day(self) -> bool:

@@ -12,8 +12,8 @@ from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive, decode_analysed, encode_analysed
-from iort_contract.messages.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding, encode_finding
+from iort_contract.messages.analysis.run import AnalysedDrive, decode_analysed, encode_analysed
 from iort_contract.tables import CONTENT, FINDING, PARAMETERS_PREFIX, ROBOT
 
 T = TypeVar("T")
@@ -63,8 +63,14 @@ class FindingsTable:
 
     def remove(self, finding: Finding) -> None:
         """Remove a finding that a later analysis of its drive no longer has."""
-        key = {ROBOT: {"S": finding.drive.robot}, FINDING: {"S": finding.id}}
-        self._client.delete_item(TableName=self._name, Key=key)
+        self._remove(finding.drive.robot, finding.id)
+
+    def remove_drive(self, drive: DriveKey) -> None:
+        """Remove the row of an analysed drive."""
+        self._remove(drive.robot, f"{PARAMETERS_PREFIX}{drive}")
+
+    def _remove(self, robot: str, key: str) -> None:
+        self._client.delete_item(TableName=self._name, Key={ROBOT: {"S": robot}, FINDING: {"S": key}})
 
     def _put(self, robot: str, key: str, content: Mapping[str, Any]) -> None:
         text = json.dumps(content, separators=(",", ":"), allow_nan=False)

@@ -149,7 +149,10 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{files}/analysis/*"): "it compares all drives of a robot",
             **a_run,
         },
-        "analysis/PresentRole/DefaultPolicy": {**a_run},
+        "analysis/PresentRole/DefaultPolicy": {
+            wide(f"{files}/analysis/robot=*"): "it removes the results of drives that others replace",
+            **a_run,
+        },
         "analysis/MachineRole/DefaultPolicy": {**a_run},
         "analysis/Machine": {
             "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role "

@@ -100,7 +100,7 @@ def states(
             },
             "Evaluate": call(
                 "Evaluate",
-                {f"{name}.$": f"$.{name}" for name in ("job", "robots", "start_us", "end_us")},
+                {f"{name}.$": f"$.{name}" for name in ("job", "robots", "start_us", "end_us", "again")},
                 ResultPath=None,
                 Next="Present",
             ),

@@ -10,6 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,23 @@ def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
         assert time.monotonic() < deadline, f"not true within {seconds} s"
         time.sleep(0.05)
     return value
+
+
+def fire(embedded: EmbeddedCloud, name: str) -> None:
+    """Let EventBridge Scheduler call what a deployed schedule calls, once, now: `fire(embedded,
+    "archive-Hourly")`. It looks every ten seconds."""
+    client = embedded.cloud.client("scheduler")
+    names = [one["Name"] for one in client.list_schedules()["Schedules"]]
+    (found,) = [one for one in names if one.startswith(f"{embedded.namespace}-{name}-")]
+    schedule = client.get_schedule(Name=found)
+    assert schedule["State"] == "ENABLED"
+    client.create_schedule(
+        Name=f"{found}-now",
+        ScheduleExpression=f"at({datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S})",
+        FlexibleTimeWindow=schedule["FlexibleTimeWindow"],
+        Target=schedule["Target"],
+        ActionAfterCompletion="DELETE",
+    )
 
 
 def recorded(embedded: EmbeddedCloud, robot: str, stream: str) -> data.Result:

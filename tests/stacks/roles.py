@@ -240,7 +240,8 @@ ROLES = {
         "lambda.amazonaws.com",
         {(action, "PresentLog.Arn") for action in LOG}
         | {(f"dynamodb:{action}", "Findings.Arn") for action in ("Query", "PutItem", "DeleteItem")}
-        | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")},
+        | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")}
+        | {("s3:ListBucket", "Files.Arn"), ("s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")},
     ),
     "MachineRole": (
         "states.amazonaws.com",

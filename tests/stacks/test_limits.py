@@ -12,12 +12,16 @@ import pytest
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_namespace
 from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
+from stacks.parts.states import states
 from tests.stacks.cloudformation import has_schema, names, schema
+from tests.stacks.templates import name
 
 # "CloudFormation quotas". The CDK passes every template through S3; a request may hold only 51,200 bytes.
 TEMPLATE_BYTES = 1_000_000
 SECTIONS = {"Resources": 500, "Outputs": 200, "Parameters": 200, "Mappings": 200}
 LOGICAL_ID, EXPORT_NAME, STACK_NAME = 255, 255, r"[A-Za-z][A-Za-z0-9-]{0,127}"
+# "Choosing workflow type in Step Functions": how long an express workflow lasts at most.
+EXPRESS_S = 300
 # "IAM and AWS STS quotas": the policies within a role, white space not counted.
 ROLE_POLICIES_CHARACTERS = 10_240
 
@@ -180,3 +184,20 @@ def test_an_invalid_name_is_found(template, found):
 )
 def test_a_stack_over_a_limit_is_found(stack, template, found):
     assert len(list(too_much(stack, template))) == found
+
+
+def test_a_drive_that_fails_as_slowly_as_it_can_is_still_a_finding(synthesized) -> None:
+    """Express workflows end in silence after five minutes."""
+    functions = synthesized.resources("AWS::Lambda::Function", "analysis").items()
+    (timeout_s,) = [one["Timeout"] for key, one in functions if name(key) == "Analyse"]
+    arns = dict.fromkeys(("Plan", "Analyse", "Evaluate", "Present"), "arn")
+    machine = states("aws", arns, bucket="files", at_once=(1, 1))
+    retries = machine["States"]["Drives"]["ItemProcessor"]["States"]["Analyse"]["Retry"]
+    (failing,) = [one for one in retries if one["ErrorEquals"] == ["States.ALL"]]
+    pauses_s = sum(
+        one["IntervalSeconds"] * one["BackoffRate"] ** number
+        for one in retries
+        for number in range(one["MaxAttempts"])
+    )
+    # The finding takes a cold start and a write.
+    assert timeout_s * (1 + failing["MaxAttempts"]) + pauses_s + 20 <= EXPRESS_S

@@ -107,6 +107,19 @@ def dynamodb(aws, tables):
 
 
 @pytest.fixture
+def s3(aws):
+    """moto's S3 with the files' bucket; its addresses are the region's own, as the functions sign them."""
+    import boto3
+    from botocore.config import Config
+
+    from tests.fakes import FILES
+
+    client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
+    client.create_bucket(Bucket=FILES, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
+    return client
+
+
+@pytest.fixture
 def stream():
     """An empty telemetry table and the stream that Lambda 2 reads."""
     from tests.unit.functions.summarizing import Stream

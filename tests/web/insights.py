@@ -6,13 +6,14 @@ import math
 import time
 from typing import TYPE_CHECKING
 
-from iort_contract.catalog.findings import GROUPS, KINDS, PARAMETERS, STYLE_GROUP
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.catalog.analysis.parameters import GROUPS, PARAMETERS, STYLE_GROUP
 from iort_contract.catalog.vesc import VESC_STREAM
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.insights import (
+    from iort_contract.messages.analysis.insights import (
         DeltaAnswer,
         DriveEntry,
         EstimateEntry,

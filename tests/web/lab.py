@@ -16,7 +16,7 @@ from tests.web.insights import delta, insights, laps
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.insights import Extent
+    from iort_contract.messages.analysis.insights import Extent
     from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 

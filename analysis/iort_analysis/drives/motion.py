@@ -36,9 +36,14 @@ def moving(columns: Mapping[str, Column]) -> NDArray[np.bool_] | None:
         return np.abs(columns[name]) > MOTION[name]
 
 
+def vescs_of(streams: Mapping[str, Collection[str]]) -> list[str]:
+    """The streams with a motor controller's fields, by name."""
+    return sorted(name for name, fields in streams.items() if frozenset(fields) >= _VESC)
+
+
 def vesc_of(streams: Mapping[str, Collection[str]]) -> str | None:
-    """The stream with a motor controller's fields; the first one by name if there are several."""
-    return min((name for name, fields in streams.items() if frozenset(fields) >= _VESC), default=None)
+    """The stream of the motor controller that is analysed: the first one by name if there are several."""
+    return next(iter(vescs_of(streams)), None)
 
 
 def motion_stream(streams: Mapping[str, Collection[str]]) -> str | None:

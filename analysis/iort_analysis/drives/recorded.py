@@ -11,8 +11,8 @@ import numpy as np
 from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_analysis.samples.blocks import EMPTY, Block, join
 from iort_contract.limits import ContractError
+from iort_contract.messages.analysis.findings import DriveKey
 from iort_contract.messages.batch import BatchId, batch_id
-from iort_contract.messages.findings import DriveKey
 from iort_contract.tables import BATCH
 
 # A clock is corrected all the time by less than this.

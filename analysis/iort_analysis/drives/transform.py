@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from iort_analysis.drives.cleaning import pause_us
@@ -28,20 +26,6 @@ def with_derived(samples: Block, vesc: str, vehicle: Vehicle | None) -> Block:
         made["acceleration_mps2"] = _slope(samples, speed)
         made["distance_m"] = _sum(samples, np.abs(speed))
     return Block(samples.times_us, {**samples.columns, **{prefix + name: c for name, c in made.items()}})
-
-
-def windows(samples: Block, length_s: float, step_s: float | None = None) -> Iterator[slice]:
-    """The windows of a drive, each whole and without a pause; side by side without ``step_s``."""
-    times = samples.times_us
-    if len(times) < 2:
-        return
-    length, step = round(length_s * 1e6), round((step_s or length_s) * 1e6)
-    paused = np.append(0, np.cumsum(np.diff(times) > pause_us(times)))
-    starts = np.arange(int(times[0]), int(times[-1]) - length + 1, step)
-    firsts, lasts = np.searchsorted(times, starts), np.searchsorted(times, starts + length)
-    for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
-        if last - first > 1 and paused[first] == paused[last - 1]:
-            yield slice(first, last)
 
 
 def _slope(samples: Block, values: Column) -> Column:

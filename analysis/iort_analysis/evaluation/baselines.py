@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile, tail
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.intervals import sides
+from iort_analysis.statistics.student import tail
+from iort_contract.messages.analysis.findings import Estimate
 
-# An estimate's interval is so many standard errors to either side.
-_SIDES = quantile((1 + INTERVAL) / 2, math.inf)
 # How many drives the catalogue's word on a healthy car's spread is worth.
 _PRIOR_DRIVES = 4
 # A drive further out than this many standard deviations counts as being there.
@@ -37,16 +36,16 @@ class Baseline(NamedTuple):
         """The estimate's difference from the baseline with its interval, and the chances of a difference at
         least as far up, and as far down, in a drive that is like the others."""
         above = found.value >= self.value
-        own = (found.value - found.low if above else found.high - found.value) / _SIDES
+        own = (found.value - found.low if above else found.high - found.value) / sides()
         scatter = math.sqrt(self.error**2 + self.spread**2 + own**2)
         off = found.value - self.value
-        reach = quantile((1 + INTERVAL) / 2, self.freedom) * math.hypot(self.error, own)
+        reach = sides(self.freedom) * math.hypot(self.error, own)
         up = tail(off / scatter, self.freedom)
         return Estimate(off, off - reach, off + reach, found.unit), up, 1 - up
 
     def interval(self, unit: str) -> Estimate:
         """What another healthy drive would give, itself measured without error."""
-        reach = quantile((1 + INTERVAL) / 2, self.freedom) * math.hypot(self.error, self.spread)
+        reach = sides(self.freedom) * math.hypot(self.error, self.spread)
         return Estimate(self.value, self.value - reach, self.value + reach, unit)
 
 
@@ -59,7 +58,7 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
     among the earlier ones moves little.
     """
     values = np.array([estimate.value for estimate in estimates])
-    errors = np.array([max(e.high - e.low, 0.0) / 2 / _SIDES for e in estimates])
+    errors = np.array([max(e.high - e.low, 0.0) / 2 / sides() for e in estimates])
     errors = np.maximum(errors, max(1e-3 * expected_spread, 1e-12))
     middle = float(np.median(values))
     scale = max(_MAD * float(np.median(np.abs(values - middle))), expected_spread)
@@ -88,7 +87,8 @@ def fleet_baseline(robots: Sequence[Sequence[Estimate]], expected_spread: float)
     """The baseline of a robot without earlier drives, from the drives of at least one other robot."""
     own = [baseline(drives, expected_spread) for drives in robots]
     means = [
-        Estimate(one.value, one.value - _SIDES * one.error, one.value + _SIDES * one.error, "") for one in own
+        Estimate(one.value, one.value - sides() * one.error, one.value + sides() * one.error, "")
+        for one in own
     ]
     between = baseline(means, 2 * expected_spread)
     within = math.sqrt(sum(one.spread**2 for one in own) / len(own))

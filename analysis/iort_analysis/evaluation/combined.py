@@ -7,10 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile
-from iort_contract.messages.findings import INTERVAL, Estimate
-
-_SIDES = quantile((1 + INTERVAL) / 2, math.inf)
+from iort_analysis.statistics.intervals import sides
+from iort_contract.messages.analysis.findings import Estimate
 
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:
@@ -22,7 +20,7 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     if len(estimates) == 1:
         return estimates[0]
     values = np.array([one.value for one in estimates])
-    errors = np.array([(one.high - one.low) / 2 / _SIDES for one in estimates])
+    errors = np.array([(one.high - one.low) / 2 / sides() for one in estimates])
     errors = np.maximum(errors, 1e-9 * max(float(np.abs(values).max()), 1e-12))
     weights, among = errors**-2.0, len(values) - 1
     surplus = float((weights * (values - np.average(values, weights=weights)) ** 2).sum()) - among
@@ -33,6 +31,6 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     mean = float(np.average(values, weights=weights))
     scatter = float((weights * (values - mean) ** 2).sum()) / among
     # Drives that agree by chance are no reason for less than their own errors give.
-    known = _SIDES / math.sqrt(float(weights.sum()))
-    reach = max(known, quantile((1 + INTERVAL) / 2, among) * math.sqrt(scatter / float(weights.sum())))
+    known = sides() / math.sqrt(float(weights.sum()))
+    reach = max(known, sides(among) * math.sqrt(scatter / float(weights.sum())))
     return Estimate(mean, mean - reach, mean + reach, estimates[0].unit)

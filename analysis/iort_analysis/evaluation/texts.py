@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from iort_analysis.evaluation.baselines import Baseline
-from iort_contract.catalog.findings import KINDS, Parameter
-from iort_contract.messages.findings import Estimate, Finding
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.catalog.analysis.parameter import Parameter
+from iort_contract.messages.analysis.findings import Estimate, Finding
 
 
 def changed(parameter: Parameter, found: Estimate, expected: Baseline, whose: str) -> str:

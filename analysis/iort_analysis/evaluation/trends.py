@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_analysis.evaluation.student import quantile, tail
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.intervals import sides
+from iort_analysis.statistics.student import tail
+from iort_contract.messages.analysis.findings import Estimate
 
 US_PER_DAY = 86_400_000_000
 # The slopes between pairs take memory of the square of this.
@@ -39,8 +40,9 @@ def trend(times_us: Sequence[int], values: Sequence[float], unit: str) -> Trend:
     ties = np.unique(found, return_counts=True)[1]
     variance = (n * (n - 1) * (2 * n + 5) - float((ties * (ties - 1) * (2 * ties + 5)).sum())) / 18
     deviation = math.sqrt(max(variance, 0.0)) or math.inf
-    half = quantile((1 + INTERVAL) / 2, math.inf) * deviation if math.isfinite(deviation) else 0.0
-    low, high = int((pairs - half) / 2), math.ceil((pairs + half) / 2)
+    half = sides() * deviation if math.isfinite(deviation) else 0.0
+    # Sen's ends, outwards from where they fall between two slopes.
+    low, high = math.floor((pairs - half) / 2) - 1, math.ceil((pairs + half) / 2)
     per_day = Estimate(
         float(np.median(slopes)), float(slopes[max(low, 0)]), float(slopes[min(high, pairs - 1)]), f"{unit}/d"
     )

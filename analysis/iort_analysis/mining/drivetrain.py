@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.fitting import Fit, fit, propagated
 from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
 from iort_analysis.results import Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.fitting import Fit, fit, propagated
+from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.fitting import Fit, fit
+from iort_analysis.statistics.fitting import Fit, fit
 
 Array = NDArray[np.float64]
 

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.fitting import Fit, Prior, fit, propagated
-from iort_analysis.mining.signals import averaged, binned, bridged, lagged
 from iort_analysis.results import Mined
+from iort_analysis.statistics.fitting import Fit, Prior, fit, propagated
+from iort_analysis.statistics.signals import averaged, binned, bridged, lagged
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
-from iort_contract.messages.findings import Estimate
+from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.clusters import cluster, scaled
-from iort_analysis.mining.intervals import share_of
 from iort_analysis.results import Mined, Table
 from iort_analysis.samples.blocks import Column
-from iort_contract.catalog.findings import STYLE_TABLE, STYLES
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.clusters import cluster, scaled
+from iort_analysis.statistics.intervals import share_of
+from iort_contract.catalog.analysis.parameters import STYLE_TABLE, STYLES
+from iort_contract.messages.analysis.findings import Estimate
 
 Floats = NDArray[np.float64]
 _WINDOW_S = 0.5

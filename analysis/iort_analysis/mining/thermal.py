@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.fitting import Fit, Prior, fit, propagated
 from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, UNKNOWN_OHM, fit_motor
-from iort_analysis.mining.signals import binned, bridged, lagged
 from iort_analysis.results import Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.fitting import Fit, Prior, fit, propagated
+from iort_analysis.statistics.signals import binned, bridged, lagged
+from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
 

@@ -49,17 +49,10 @@ class Part(NamedTuple):
 
 
 def blocks(
-    pages: Iterable[Sequence[Item]],
-    refused: RefusedItems,
-    wanted: Wanted = lambda _name: True,
-    *,
-    messages: bool = True,
+    pages: Iterable[Sequence[Item]], refused: RefusedItems, wanted: Wanted = lambda _name: True
 ) -> Iterator[Block]:
-    """The samples of pages of items, in order of time, with the fields that are ``wanted``.
-
-    Without ``messages``, batches of ROS messages are skipped.
-    """
-    return in_order(part(items, refused, wanted, messages=messages) for items in pages if items)
+    """The samples of pages of items, in order of time, with the fields that are ``wanted``."""
+    return in_order(part(items, refused, wanted) for items in pages if items)
 
 
 def part(
@@ -69,7 +62,8 @@ def part(
     *,
     messages: bool = True,
 ) -> Part:
-    """The samples of a page of items, in the order of its batches."""
+    """The samples of a page of items, in the order of its batches. Without ``messages``, ROS messages
+    are skipped."""
     block = _block(_opened(items, refused, messages=messages), refused, wanted)
     return Part(block, start_us(items[-1]) if items else 0)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal, TypedDict, Union
 
 from iort_contract.limits import Value
-from iort_contract.messages.insights import (
+from iort_contract.messages.analysis.insights import (
     AnalysisAnswer,
     AnalysisStarted,
     DeltaAnswer,

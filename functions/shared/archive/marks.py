@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import heapq
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -12,6 +14,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.archive import (
     DUE_MS,
     FIRST_DUE_MS,
+    HOUR,
     PENDING,
     ArchiveTable,
     Pending,
@@ -102,9 +105,10 @@ class Marks:
 
     def every(self) -> Iterator[tuple[Pending, Item]]:
         """All marks, oldest hours first."""
-        for page in ArchiveTable(self._client, self._table).pages(PENDING):
-            for item in page.items:
-                yield parse_pending(item), item
+        table = ArchiveTable(self._client, self._table)
+        of_partitions = (chain.from_iterable(page.items for page in table.pages(one)) for one in PENDING)
+        for item in heapq.merge(*of_partitions, key=lambda item: str(item[HOUR]["S"])):
+            yield parse_pending(item), item
 
     def keep(self, pending: Pending, **values: Any) -> None:
         """Add numbers to a mark that is there."""

@@ -1,1 +1,2 @@
-"""The questions that a robot may ask: a module for each, by its name in the catalogue, with its ``work``."""
+"""The questions of robots: a module for each, by its name in the catalogue, with its ``work``; and what they
+share."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from functions.shared import parameters
-from functions.shared.work import RefusedError
+from functions.shared.questions import parameters
+from functions.shared.questions.work import RefusedError
+from iort_contract.messages.analysis.findings import encode_estimate
 from iort_contract.messages.ask import NO_DATA
-from iort_contract.messages.findings import encode_estimate
 
 
 def work(robot: str, _body: Mapping[str, Any]) -> dict[str, Any]:

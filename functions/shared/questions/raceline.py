@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from functions.shared import parameters
-from functions.shared.work import RefusedError
+from functions.shared.questions import parameters
+from functions.shared.questions.work import RefusedError
 from iort_analysis.errors import AnalysisError
 from iort_analysis.raceline.line import least_curvature
 from iort_analysis.raceline.reference import reference

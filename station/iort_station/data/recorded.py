@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, Generic, Literal, TypeAlias, TypeVar
 from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
 from iort_analysis.samples.blocks import Block, join
 from iort_analysis.samples.seconds import Batches, batches_of
-from iort_contract.archive import ArchivedHour, Hour, parse_hour
+from iort_contract.archive import ArchivedHour, Hour, hour_of, parse_hour
 from iort_contract.dynamodb import Keys, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
@@ -130,7 +130,9 @@ class Recorded:
         found = self._next(starting_between(t_us, None), newest=False)
         ids = (one for row in self._rows(t_us, found and found.t_us) for one in self._ids(row))
         archived = next((one for one in ids if t_us is None or one.t_us >= t_us), None)
-        return min((one for one in (found, archived) if one is not None), default=None)
+        if archived is None or (found is not None and found <= archived):
+            return found
+        return self._from_archive(archived)
 
     def before(self, t_us: int | None) -> BatchId | None:
         """The last batch before a time; None is the newest of all."""
@@ -139,7 +141,9 @@ class Recorded:
         rows = self._rows(found and found.t_us, last_us, newest_first=True)
         ids = (one for row in rows for one in reversed(self._ids(row)))
         archived = next((one for one in ids if last_us is None or one.t_us <= last_us), None)
-        return max((one for one in (found, archived) if one is not None), default=None)
+        if archived is None or (found is not None and found >= archived):
+            return found
+        return self._from_archive(archived)
 
     def block(self, batch: BatchId, wanted: Wanted = lambda _name: True) -> Block:
         """The samples of one batch; empty if it is not there, or is invalid."""
@@ -237,6 +241,10 @@ class Recorded:
             return _Archived(content)
         # Rare and slow: batches that came late, or items that are not batches.
         return within(sorted([*self._archive.read(row, HourFile.items), *beside], key=key_of), keys)
+
+    def _from_archive(self, batch: BatchId) -> BatchId:
+        self.origin.hours.append(hour_of(batch.t_us))
+        return batch
 
     def _ids(self, row: ArchivedHour) -> list[BatchId]:
         """The batches of an hour."""

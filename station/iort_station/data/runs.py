@@ -20,13 +20,13 @@ from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
+from iort_contract.messages.analysis.insights import Extent
 from iort_contract.messages.batch import BatchId, decode_batch
-from iort_contract.messages.insights import Extent
 from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.recorded import Recorded
+from iort_station.data.recorded import Origin, Recorded
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
@@ -70,15 +70,19 @@ def runs(
     start_us: int | None = None,
     end_us: int | None = None,
     count: int = 50,
+    origin: Origin | None = None,
 ) -> RunsAnswer:
     """The newest ``count`` runs of a robot that recorded in a range, with the extent of its streams.
+
+    ``origin`` learns which hours of the archive were read.
 
     ``streams`` None means all but the agent's own. A run that began before the range is given whole, and one
     that goes on after its end up to there. Raises `StationError` for an unknown robot.
     """
     if streams is None:
         streams = [name for name in inventory.check_recorded(cloud, robot) if name not in OWN_STREAMS]
-    reports, *readers = (_Reader(cloud, robot, stream) for stream in (ACCOUNT_STREAM, *streams))
+    recorded = (Recorded(cloud, robot, name, origin=origin) for name in (ACCOUNT_STREAM, *streams))
+    reports, *readers = map(_Reader, recorded)
 
     def parts(reader: _Reader) -> list[Part]:
         return list(islice(reader.parts(start_us, end_us), count + 1))
@@ -144,8 +148,8 @@ def _widen(extent: Extent, part: Part) -> None:
 class _Reader:
     """Reads single batches of a stream."""
 
-    def __init__(self, cloud: Cloud, robot: str, stream: str) -> None:
-        self._recorded = Recorded(cloud, robot, stream)
+    def __init__(self, recorded: Recorded) -> None:
+        self._recorded = recorded
 
     def whole(self) -> Part | None:
         """All that is stored of the stream; None if nothing is."""

@@ -20,10 +20,7 @@ from iort_contract.archive import (
     SWEEP,
     TASK,
     ArchivedHour,
-    ArchiveTable,
-    archived_hour,
     content_hash,
-    hours_between,
     item_hash,
     parse_hour,
     refused_key,
@@ -34,6 +31,7 @@ from iort_contract.tables import BATCH, SAMPLES, TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.archive import Archive
 from iort_station.data.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -60,14 +58,6 @@ def topics(cloud: Cloud, robot: str | None, stream: str | None) -> list[str]:
         topic_of(cloud, one, name)
         for one in robots
         for name in ([stream] if stream else inventory.known(cloud, one))
-    ]
-
-
-def rows(cloud: Cloud, topic: str) -> list[ArchivedHour]:
-    """The manifest's rows of a topic."""
-    table = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
-    return [
-        archived_hour(item) for page in table.pages(topic, hours_between(None, None)) for item in page.items
     ]
 
 
@@ -108,7 +98,7 @@ def verify(cloud: Cloud, topic: str) -> Verified:
     found = Verified()
     table = telemetry_table(cloud)
     objects = _Objects(cloud)
-    archived = {row.hour: row for row in rows(cloud, topic)}
+    archived = {row.hour: row for row in Archive(cloud, topic).rows()}
     until_us = time.time_ns() // 1000 - HOUR_REST_MS * 1000
     stored = [str(hour) for hour in stored_hours(table, topic, until_us)]
     for name in sorted({*archived, *stored}):

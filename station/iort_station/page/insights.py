@@ -7,11 +7,10 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
-from iort_contract.catalog.findings import GROUPS, KINDS
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
-from iort_contract.messages.analysis import MAX_RANGE_US, AnalysedDrive, AnalysisRequest
-from iort_contract.messages.findings import Estimate, Finding
-from iort_contract.messages.insights import (
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS
+from iort_contract.catalog.analysis.parameters import GROUPS
+from iort_contract.messages.analysis.findings import Estimate, Finding
+from iort_contract.messages.analysis.insights import (
     AnalysisAnswer,
     AnalysisStarted,
     DriveEntry,
@@ -19,9 +18,10 @@ from iort_contract.messages.insights import (
     FindingEntry,
     InsightsAnswer,
 )
+from iort_contract.messages.analysis.run import MAX_RANGE_US, AnalysedDrive, AnalysisRequest
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.data import findings as stored
+from iort_station.data.analysis import findings as stored
 from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.page.parameters import text, whole

@@ -11,12 +11,12 @@ from iort_analysis.errors import AnalysisError
 from iort_analysis.mining.laps.compare import compare
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
-from iort_contract.catalog.findings import LAPS_TABLE, PLACES_TABLE
-from iort_contract.messages.insights import DeltaAnswer, LapsAnswer
+from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PLACES_TABLE
+from iort_contract.messages.analysis.insights import DeltaAnswer, LapsAnswer
 from iort_contract.messages.page import Answer
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
-from iort_station.data.laps import laps_within
+from iort_station.data.analysis.laps import laps_within
 from iort_station.errors import StationError
 from iort_station.page.insights import estimate
 from iort_station.page.parameters import text, whole

@@ -16,15 +16,17 @@ import pytest
 from typing_extensions import Self
 
 from iort_analysis.samples.blocks import Block, values
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
-from iort_station.data import findings
+from iort_station.data.analysis import findings
+from iort_station.operations import analysis
+from local.cloud import EmbeddedCloud
 from tests.fakes import item_of
-from tests.local.conftest import run_agent, until
+from tests.local.conftest import fire, run_agent, until
 from tests.unit.analysis.simulated import streams
 
 pytestmark = pytest.mark.slow
@@ -58,6 +60,31 @@ def ago(seconds: int, blocks: dict[str, Block]) -> dict[str, Block]:
     first_us = min(int(block.times_us[0]) for block in blocks.values())
     by_us = time.time_ns() // 1000 // S * S - seconds * S - first_us
     return {name: Block(block.times_us + by_us, block.columns) for name, block in blocks.items()}
+
+
+def test_the_nightly_schedule_analyses_the_fleet(embedded, bundle) -> None:
+    cloud, car = embedded.cloud, bundle().robot
+    drive = ago(1000, streams(60))
+    stored(embedded, car, drive)
+    client, machine = cloud.client("stepfunctions"), cloud.output("analysis", "AnalysisMachine")
+
+    def runs() -> set[str]:
+        return {one["executionArn"] for one in client.list_executions(stateMachineArn=machine)["executions"]}
+
+    before = runs()
+    fire(embedded, "analysis-Nightly")
+    (run,) = until(lambda: runs() - before)
+
+    assert json.loads(client.describe_execution(executionArn=run)["input"]) == {
+        "robots": [],
+        "last_s": 2 * 86_400,
+    }
+    # It raises an error if the run fails.
+    *_, last = analysis.watch(cloud, run)
+    assert last.state == analysis.SUCCEEDED
+    (analysed,) = findings.drives(cloud, car)
+    assert analysed.job == run.rpartition(":")[2]
+    assert analysed.samples == sum(len(block.times_us) for block in drive.values())
 
 
 def test_two_drives_of_the_agent_are_analysed(embedded, bundle, iort) -> None:
@@ -101,13 +128,14 @@ def long() -> dict[str, Block]:
 class Killer(threading.Thread):
     """Kills workers of the function Analyse in the middle of their work, so many times."""
 
-    def __init__(self, times: int) -> None:
+    def __init__(self, embedded: EmbeddedCloud, times: int) -> None:
         super().__init__()
-        self.left, self._before, self._over = times, _analysing(), threading.Event()
+        self.left, self._over, self._embedded = times, threading.Event(), embedded
+        self._before = _analysing(embedded)
 
     def run(self) -> None:
         while self.left and not self._over.wait(0.02):
-            for process, used_s in _analysing().items():
+            for process, used_s in _analysing(self._embedded).items():
                 # Its imports take half a second of the processor.
                 if self.left and used_s - self._before.get(process, 0.0) > 1.1:
                     os.kill(process, signal.SIGKILL)
@@ -122,13 +150,14 @@ class Killer(threading.Thread):
         self.join()
 
 
-def _analysing() -> dict[int, float]:
-    """The processor time of each worker of the function, in seconds."""
+def _analysing(embedded: EmbeddedCloud) -> dict[int, float]:
+    """The processor time of each of the function's workers in this cloud, in seconds."""
     found = {}
     for status in Path("/proc").glob("[0-9]*"):
         # A process may end meanwhile.
         with suppress(OSError):
-            if b"iort-analysis-Analyse" in (status / "cmdline").read_bytes():
+            command = (status / "cmdline").read_text()
+            if str(embedded.folder) in command and "iort-analysis-Analyse" in command:
                 fields = (status / "stat").read_text().rpartition(")")[2].split()
                 found[int(status.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     return found
@@ -138,7 +167,7 @@ def test_a_killed_function_is_tried_again_and_three_times_are_a_finding(embedded
     good, bad = bundle("good").robot, bundle("bad").robot
     stored(embedded, good, ago(4000, long()))
 
-    with Killer(times=3) as killer:
+    with Killer(embedded, times=3) as killer:
         done = iort("analyse", good, "--last", "2h", "--wait", "--json")
 
     assert killer.left == 0
@@ -152,7 +181,7 @@ def test_a_killed_function_is_tried_again_and_three_times_are_a_finding(embedded
     # The next run has it, although it is killed once; nor does a field that is null stop it.
     null = dict(streams(60)["vesc"].columns, current_motor=np.full(3000, np.nan))
     stored(embedded, bad, ago(1000, {"vesc": Block(streams(60)["vesc"].times_us, null)}))
-    with Killer(times=1) as killer:
+    with Killer(embedded, times=1) as killer:
         done = iort("analyse", good, bad, "--last", "2h", "--wait", "--new", "--json")
 
     assert killer.left == 0

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime, timezone
 
 from iort_contract.archive import DUE_MS, HOUR, PENDING, ArchiveTable, archived_hour, parse_pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.local.conftest import run_agent, until
+from tests.local.conftest import fire, run_agent, until
 from tests.local.data.drives import RATE_HZ, counter_log
 
 SECONDS = 3
@@ -19,25 +18,6 @@ def rows(embedded, topic):
     return [item for page in table.pages(topic) for item in page.items]
 
 
-def fire(embedded, name):
-    """Let EventBridge Scheduler call what a schedule calls, once, now."""
-    client = embedded.cloud.client("scheduler")
-    (found,) = [
-        one["Name"]
-        for one in client.list_schedules()["Schedules"]
-        if one["Name"].startswith(f"{embedded.namespace}-archive-{name}-")
-    ]
-    schedule = client.get_schedule(Name=found)
-    assert schedule["State"] == "ENABLED"
-    client.create_schedule(
-        Name=f"{found}-now",
-        ScheduleExpression=f"at({datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S})",
-        FlexibleTimeWindow=schedule["FlexibleTimeWindow"],
-        Target=schedule["Target"],
-        ActionAfterCompletion="DELETE",
-    )
-
-
 def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundle, iort, tmp_path):
     log = counter_log(tmp_path / "2026-05-04_10-00-00.csv", SECONDS)
     source = {"type": "bag", "path": str(log), "speed": 0, "stamps": "original"}
@@ -46,10 +26,12 @@ def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundl
     topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
 
     def marked():
-        return [one for one in rows(embedded, PENDING) if parse_pending(one).topic == topic]
+        found = (one for partition in PENDING for one in rows(embedded, partition))
+        return [one for one in found if parse_pending(one).topic == topic]
 
     # The operator need not wait until no batch may follow.
     (mark,) = until(marked)
+    assert "nothing is archived yet" in iort("archive", "show", car.robot).stderr
     ran = iort("archive", "run", car.robot, "vesc", "--json")
     assert (ran.exit_code, json.loads(ran.stdout)) == (0, {"hours": 1}), ran.output
     row = archived_hour(rows(embedded, topic)[0])
@@ -67,7 +49,7 @@ def test_a_drive_is_archived_by_the_schedule_and_by_the_operator(embedded, bundl
         ExpressionAttributeNames={"#due": DUE_MS},
         ExpressionAttributeValues={":due": {"N": "0"}},
     )
-    fire(embedded, "Hourly")
+    fire(embedded, "archive-Hourly")
     until(lambda: [parse_pending(one).is_day for one in marked()] == [True])
     (shown,) = map(json.loads, iort("archive", "show", car.robot, "--json").stdout.splitlines())
     assert (shown["samples"], shown["hours"]) == (2 * SECONDS * RATE_HZ, 1)

@@ -18,7 +18,8 @@ from iort_agent.errors import AskError
 from iort_agent.files.http import downloader
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis import AnalysedDrive
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.messages.ask import (
     MALFORMED,
     MAX_INLINE_BYTES,
@@ -31,7 +32,6 @@ from iort_contract.messages.ask import (
     encode_ask,
 )
 from iort_contract.messages.ask import Ask as Question
-from iort_contract.messages.findings import DriveKey, Estimate
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_station.fleet import robots
 from iort_station.operations import quarantine

@@ -131,8 +131,7 @@ def test_lines_are_recorded_and_live_and_a_failing_link_adds_few(working: bool) 
     stored = [
         decode_batch(m.payload) for m in uplink.published if m.topic.endswith(topics) and "/dt/" in m.topic
     ]
-    # Live, only the newest line of each moment is sent: without a link, that may be a refusal's.
-    assert live
+    # Without a link the waiting threads move the manual clock by minutes: a live line may be too old to send.
     if working:
         told = ["source failed: failing: the device is gone"]
         assert [one.sample["text"] for one in live] == told

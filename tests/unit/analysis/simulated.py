@@ -11,7 +11,7 @@ from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey
 
 START_US, HZ = 1_700_000_000_000_000, 50
 KEY = DriveKey("car7", START_US, "00c0ffee")

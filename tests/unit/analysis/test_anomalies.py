@@ -18,7 +18,8 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import anomalies
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
-from iort_contract.catalog.findings import KINDS, PARAMETERS
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.catalog.analysis.parameters import PARAMETERS
 from tests.unit.analysis.simulated import KEY, START_US, changed, streams
 
 _CAR = 300  # apart from the cars of the proof
@@ -130,6 +131,15 @@ def test_samples_that_come_again_are_an_intermittent_link() -> None:
     assert event.kind == "can_intermittent"
     assert event.effect is not None
     assert event.effect.value == pytest.approx(0.035, abs=0.01)
+
+
+def test_a_recording_that_is_replayed_quickly_has_no_intermittent_link() -> None:
+    """Its samples have the times of the replay, of which a few wait for a tenth of a millisecond."""
+    made = dict(streams(120))
+    times, columns = made["vesc"]
+    steps_us = np.where(np.arange(len(times)) % 40 == 0, 100, 10)
+    made["vesc"] = Block(times[0] + np.cumsum(steps_us), columns)
+    assert not anomalies.mine(build(KEY, made)).events
 
 
 def test_a_reported_fault_is_an_event_by_its_name() -> None:

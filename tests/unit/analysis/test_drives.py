@@ -9,7 +9,6 @@ import pytest
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT
-from iort_analysis.drives.transform import windows
 from iort_analysis.samples.blocks import Block, join
 from tests.unit.analysis.simulated import HZ, KEY, START_US, VEHICLE, changed, streams
 
@@ -99,18 +98,6 @@ def test_derived_quantities_follow_the_car() -> None:
     assert distance[-1] == pytest.approx(counted, rel=0.01)
     assert speed[200] - speed[100] == pytest.approx(slope[100:200].mean() * 2, abs=0.2)
     assert power[0] == pytest.approx(streams()["vesc"].columns["current_input"][0] * 12.4, abs=2)
-
-
-def test_windows_hold_no_pause() -> None:
-    vesc = streams()["vesc"]
-    drive = build(KEY, {"vesc": join([vesc.take(slice(1000)), vesc.take(slice(2000, None))])})
-    found = list(windows(drive.samples, 10))
-
-    assert len(found) == 9
-    for window in found:
-        times = drive.samples.times_us[window]
-        assert len(times) == 500
-        assert times[-1] - times[0] < 10_000_000
 
 
 def test_an_odometry_is_a_position() -> None:

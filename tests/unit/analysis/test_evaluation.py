@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterable
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_analysis.evaluation.baselines import baseline, fleet_baseline
 from iort_analysis.evaluation.combined import combined
-from iort_analysis.evaluation.discovery import false_discovery_rates
 from iort_analysis.evaluation.evaluate import evaluate
-from iort_analysis.evaluation.student import quantile, tail
-from iort_analysis.evaluation.trends import US_PER_DAY, trend
+from iort_analysis.evaluation.trends import US_PER_DAY
 from iort_analysis.results import DriveResult, Event, Measured, Mined
-from iort_contract.messages.findings import DriveKey, Estimate, Finding
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
 
 NAME = "battery_resistance_ohm"
 
@@ -163,27 +159,6 @@ def test_healthy_drives_give_next_to_no_finding() -> None:
     assert found == 0
 
 
-@pytest.mark.parametrize(
-    ("p", "freedom", "t"),
-    [(0.95, 1, 6.313752), (0.975, 5, 2.570582), (0.999, 4, 7.173182), (0.95, math.inf, 1.644854)],
-)
-def test_students_t_is_that_of_the_tables(p: float, freedom: float, t: float) -> None:
-    assert quantile(p, freedom) == pytest.approx(t, rel=1e-6)
-    assert tail(t, freedom) == pytest.approx(1 - p, rel=1e-6)
-    assert tail(-t, freedom) == pytest.approx(p, rel=1e-6)
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=30))
-def test_the_rates_are_those_of_the_definition(p_values: list[float]) -> None:
-    n = len(p_values)
-    penalty = sum(1 / i for i in range(1, n + 1)) * n
-    ranked = sorted(p_values)
-    expected = [
-        min(1.0, *(penalty * ranked[j] / (j + 1) for j in range(n) if ranked[j] >= p), 1.0) for p in p_values
-    ]
-    assert false_discovery_rates(p_values) == pytest.approx(expected)
-
-
 def test_the_interval_of_a_baseline_holds_the_next_drive_as_often_as_it_says() -> None:
     chance = random.Random(5)
     held = 0
@@ -221,15 +196,3 @@ def test_robots_that_differ_widen_the_fleets_baseline() -> None:
     alike = fleet_baseline([[ohms(0.03)] * 3] * 4, 0.001)
     different = fleet_baseline([[ohms(value)] * 3 for value in (0.02, 0.03, 0.04, 0.05)], 0.001)
     assert different.spread > 3 * alike.spread
-
-
-@given(st.lists(st.floats(-100, 100), min_size=2, max_size=12))
-def test_a_trend_is_the_median_of_all_slopes(values: list[float]) -> None:
-    times = [i * US_PER_DAY for i in range(len(values))]
-    slopes = [
-        (values[j] - values[i]) / (j - i) for i in range(len(values)) for j in range(i + 1, len(values))
-    ]
-    found = trend(times, values, "V")
-    assert found.per_day.value == pytest.approx(float(np.median(slopes)))
-    assert min(slopes) - 1e-9 <= found.per_day.low <= found.per_day.value <= found.per_day.high
-    assert found.per_day.unit == "V/d"

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from iort_analysis.mining.fitting import Prior, fit, propagated
-from iort_analysis.mining.normal import between
-from iort_analysis.mining.signals import lagged, resolution
+from iort_analysis.statistics.fitting import Prior, fit, propagated
+from iort_analysis.statistics.signals import lagged, resolution
 
 
 def test_intervals_hold_although_neighbouring_errors_are_alike() -> None:
@@ -45,16 +44,6 @@ def test_a_reading_stands_for_all_that_rounds_to_it() -> None:
     assert plain < 30
 
 
-def test_the_chance_of_an_interval_has_the_right_slope() -> None:
-    def log_chance(low: float, high: float) -> float:
-        return math.log(math.erf(high / math.sqrt(2)) - math.erf(low / math.sqrt(2)))
-
-    low, high, step = -0.7, 1.1, 1e-3
-    slope, _, _ = between(np.array([low]), np.array([high]))
-    numeric = (log_chance(low - step, high - step) - log_chance(low + step, high + step)) / (2 * step)
-    assert float(slope[0]) == pytest.approx(numeric, abs=1e-4)
-
-
 def test_outliers_weigh_nothing_and_a_prior_decides_what_the_data_does_not() -> None:
     x = np.linspace(-1, 1, 500)
     y = 3 * x
@@ -80,12 +69,3 @@ def test_a_function_of_independent_fits_has_the_errors_of_all() -> None:
     )
     assert ratio.value == 2
     assert ratio.high - ratio.value == pytest.approx(1.729 * 2 * math.hypot(0.05, 0.05), rel=1e-3)
-
-
-def test_a_lag_is_the_recursion_that_it_stands_for() -> None:
-    values, steps = np.random.default_rng(0).normal(size=(2, 999)), 7.5
-    keep, state, wanted = math.exp(-1 / steps), np.zeros(2), np.zeros((2, 999))
-    for i in range(999):
-        state = keep * state + (1 - keep) * values[:, i]
-        wanted[:, i] = state
-    np.testing.assert_allclose(lagged(values, steps), wanted, atol=1e-12)

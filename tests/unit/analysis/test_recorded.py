@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 
 from iort_analysis.drives.recorded import Recorded, recorded
+from iort_contract.messages.analysis.findings import DriveKey
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.findings import DriveKey
 from tests.fakes import item_of
 
 START_US, S = 1_700_000_000_000_000, 1_000_000

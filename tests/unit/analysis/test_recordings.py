@@ -7,7 +7,7 @@ from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import battery, motor
 from iort_analysis.samples.blocks import Block
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey
 from tests.recordings import recording
 
 

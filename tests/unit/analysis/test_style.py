@@ -1,4 +1,4 @@
-"""Styles of a drive whose parts are known, and clusters."""
+"""Styles of a drive whose parts are known."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from iort_analysis.mining import style
-from iort_analysis.mining.clusters import cluster
 from tests.unit.analysis.drives import START_US, sampled
 
 
@@ -40,13 +39,3 @@ def test_a_car_in_corners_at_its_grip_is_told_from_one_on_a_straight():
 def test_a_short_drive_says_that_it_is_too_short():
     mined = style.mine(sampled([{"speed": 1.0}] * 100, [], START_US + 20_000 * np.arange(100)))
     assert mined.missing["style_standing_share"] == "the drive has 4 half seconds, at least 60 are needed"
-
-
-@pytest.mark.parametrize("k", [2, 3, 5])
-def test_clusters_that_are_apart_are_found_in_their_number(k):
-    chance = np.random.default_rng(7)
-    truth = np.repeat(np.arange(k), 200)
-    points = np.stack([np.cos(truth * 2 * np.pi / k), np.sin(truth * 2 * np.pi / k)], axis=1)
-    found = cluster(points + chance.normal(0, 0.1, points.shape), 8)
-    assert found.silhouette > 0.6
-    assert len(set(zip(truth, found.labels, strict=True))) == k

@@ -15,8 +15,9 @@ from bench.proof.judging import RIGHT, Car, coverage, detection, judge
 from bench.proof.truths import TRUTHS
 from iort_agent.sources.sim.faults import KINDS as FAULTS
 from iort_analysis.results import DriveResult, Event, Mined
-from iort_contract.catalog.findings import KINDS, PARAMETERS
-from iort_contract.messages.findings import Estimate
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.catalog.analysis.parameters import PARAMETERS
+from iort_contract.messages.analysis.findings import Estimate
 
 SECONDS = 60.0
 

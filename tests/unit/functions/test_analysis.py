@@ -6,41 +6,46 @@ import io
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import boto3
 import numpy as np
 import pytest
 
 from functions import analyse, evaluate, plan, present
-from functions.shared.kept import Kept
+from functions.shared.analysis.kept import Kept
 from iort_analysis.archive.tables import read_table
 from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.archive import ArchivedHour, hour_of
-from iort_contract.catalog.kinds import ANALYSIS_FAILED, SERIOUS
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, SERIOUS
 from iort_contract.cloud import drive_prefix, plan_key
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, encode_planned
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
+from iort_contract.messages.analysis.run import (
+    AnalysedDrive,
+    PlannedDrive,
+    encode_analysed,
+    encode_planned,
+)
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.findings import DriveKey, Estimate, Finding
 from iort_contract.page import PAGE_URL
-from iort_contract.tables import FINDING, ROBOT, STREAMS, TOPIC
+from iort_contract.tables import ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.fakes import item_of
+from tests.fakes import ARCHIVE, FILES, FINDINGS, ROBOTS, TELEMETRY, item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
 S = 1_000_000
-CAR, BUCKET, RUN = "car", "files", "00c0ffee"
-TELEMETRY, ARCHIVE, ROBOTS, FINDINGS = "telemetry", "archive", "robots", "findings"
+CAR, RUN = "car", "00c0ffee"
 VARIABLES = {
     "TELEMETRY_TABLE": TELEMETRY,
     "ARCHIVE_TABLE": ARCHIVE,
     "ROBOTS_TABLE": ROBOTS,
     "FINDINGS_TABLE": FINDINGS,
-    "FILES_BUCKET": BUCKET,
+    "FILES_BUCKET": FILES,
     "PAGE_URL": PAGE_URL,
 }
 JOB = "night"
@@ -49,8 +54,8 @@ JOB = "night"
 class Deployed:
     """The tables and the bucket in moto, and the state machine's calls of the functions."""
 
-    def __init__(self, topic: str) -> None:
-        self.dynamodb, self.s3, self.topic = boto3.client("dynamodb"), boto3.client("s3"), topic
+    def __init__(self, dynamodb: Any, s3: Any, topic: str) -> None:
+        self.dynamodb, self.s3, self.topic = dynamodb, s3, topic
         self.table = FindingsTable(self.dynamodb, FINDINGS)
 
     def register(self, robot: str, *streams_of: str, **numbers: float) -> None:
@@ -87,35 +92,15 @@ class Deployed:
         return drives
 
     def json(self, key: str) -> object:
-        return json.loads(self.s3.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+        return json.loads(self.s3.get_object(Bucket=FILES, Key=key)["Body"].read())
 
 
 @pytest.fixture
-def cloud(aws: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
-    dynamodb = boto3.client("dynamodb")
-    tables = {
-        TELEMETRY: (TOPIC, "batch"),
-        ARCHIVE: (TOPIC, "hour"),
-        ROBOTS: (ROBOT,),
-        FINDINGS: (ROBOT, FINDING),
-    }
-    for table, keys in tables.items():
-        dynamodb.create_table(
-            TableName=table,
-            KeySchema=[
-                {"AttributeName": key, "KeyType": kind}
-                for key, kind in zip(keys, ("HASH", "RANGE"), strict=False)
-            ],
-            AttributeDefinitions=[{"AttributeName": key, "AttributeType": "S"} for key in keys],
-            BillingMode="PAY_PER_REQUEST",
-        )
-    boto3.client("s3").create_bucket(
-        Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"}
-    )
+def cloud(dynamodb: Any, s3: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
     topic = boto3.client("sns").create_topic(Name="alarms")["TopicArn"]
     for name, value in {**VARIABLES, "ALARM_TOPIC": topic}.items():
         monkeypatch.setenv(name, value)
-    return Deployed(topic)
+    return Deployed(dynamodb, s3, topic)
 
 
 def later(blocks: dict[str, Block], seconds: int) -> dict[str, Block]:
@@ -139,7 +124,7 @@ def test_two_drives_with_a_stand_between_them_have_two_results(cloud: Deployed) 
     assert first.estimates["lap_mean_s"].unit == "s"
     result = cloud.json(f"{drive_prefix(first.drive)}result.json")
     assert result["estimates"].keys() == first.estimates.keys()
-    file = cloud.s3.get_object(Bucket=BUCKET, Key=f"{drive_prefix(first.drive)}laps.parquet")
+    file = cloud.s3.get_object(Bucket=FILES, Key=f"{drive_prefix(first.drive)}laps.parquet")
     laps = read_table(file["Body"].read())
     assert laps["time_s"][laps["best"]] == pytest.approx([first.estimates["lap_best_s"].value])
     assert set(laps["method"]) == {"gate"}
@@ -173,7 +158,7 @@ def test_hours_that_have_expired_are_read_from_the_archive(cloud: Deployed) -> N
         1,
         first_expires_s=1,
     )
-    cloud.s3.put_object(Bucket=BUCKET, Key=row.key, Body=file.getvalue())
+    cloud.s3.put_object(Bucket=FILES, Key=row.key, Body=file.getvalue())
     cloud.dynamodb.put_item(TableName=ARCHIVE, Item=row.item())
     for one in first[:-5]:
         key = {name: one[name] for name in (TOPIC, "batch")}
@@ -229,6 +214,10 @@ def test_no_state_of_a_recording_stops_the_others(cloud: Deployed) -> None:
             {"imu": Block(START_US + np.arange(100) * 20_000, {"speed": text})},
             {"vesc": "no stream has"},
         ),
+        "two": (
+            {"front": streams(20)["vesc"], "rear": streams(20)["vesc"]},
+            {"rear": "only the first is analysed, front"},
+        ),
     }
     for robot, (blocks, _) in troubles.items():
         cloud.register(robot, *blocks)
@@ -277,11 +266,12 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     cloud.table.put_drive(worn)
     result = DriveResult(worn.drive, worn.end_us, 3000, {}, Mined(estimates=worn.estimates))
     planned = PlannedDrive(worn.drive, worn.end_us, ("vesc",), "vesc")
-    kept = Kept(cloud.s3, BUCKET)
+    kept = Kept(cloud.s3, FILES)
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
-    evaluate.handler({"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1}, None)
+    run = {"job": JOB, "robots": [CAR], "start_us": START_US, "end_us": START_US + 1, "again": False}
+    evaluate.handler(run, None)
     present.handler({"job": JOB}, None)
 
     (found,) = cloud.table.findings(CAR)
@@ -324,6 +314,8 @@ def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Dep
         "&to=2023-11-14T22:13:40.000Z&fields=voltage_input,current_input\n"
     )
     assert link in text
+    share = replace(finding(), effect=Estimate(0.087, 0.005, 0.17, "1"))
+    assert "effect   0.087, 90 % sure" in present.mail(share, PAGE_URL)[1]
 
 
 def test_a_year_of_drives_with_one_fault_is_one_mail(cloud: Deployed) -> None:
@@ -374,6 +366,91 @@ def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) 
     for end_us, left in ((START_US + 30 * S, [found]), (START_US + 60 * S, [])):
         cloud.run(end_us=end_us)
         assert list(cloud.table.findings(CAR)) == left
+
+
+def test_a_drive_that_ends_without_an_answer_is_a_finding_too(cloud: Deployed) -> None:
+    """Its workflow took too long, or could not write the finding."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    run = plan.handler(
+        {"input": {"robots": [], "start_us": START_US, "end_us": START_US + S}, "job": JOB}, None
+    )
+    plan.handler({**run, "robot": CAR}, None)
+    cloud.table.put_finding(finding())
+
+    evaluate.handler(run, None)
+    present.handler({"job": JOB}, None)
+
+    failed, earlier = sorted(cloud.table.findings(CAR), key=lambda one: one.kind)
+    assert failed.text == "the drive could not be analysed in three attempts: they ended without an answer"
+    assert earlier == finding()
+
+
+def test_the_next_night_looks_for_the_drives_of_a_failed_plan(cloud: Deployed) -> None:
+    """Nights overlap by a day only, so what failed may begin before the next range."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    failed = {"robot": CAR, "start_us": START_US - S, "end_us": START_US + 600 * S}
+    present.handler({"failed": failed, "error": {"Cause": "no answer"}}, None)
+    next_night = {"start_us": START_US + 300 * S, "end_us": START_US + 900 * S}
+
+    # An operator's range stays as it is.
+    assert cloud.run(**next_night, again=True) == []
+    assert len(list(cloud.table.findings(CAR))) == 1
+    (drive,) = cloud.run(**next_night)
+
+    assert drive["start_us"] == START_US
+    assert list(cloud.table.findings(CAR)) == []
+
+
+def test_a_drive_whose_start_moves_is_one_drive(cloud: Deployed) -> None:
+    """Its first half minute arrives a day later; and what had failed under the old start is done, too."""
+    cloud.register(CAR, "vesc", "pose")
+    cloud.record(later(streams(90), 30), first_seq=30)
+    cloud.run()
+    (half,) = cloud.table.drives(CAR)
+    cloud.table.put_finding(replace(finding(), drive=half.drive))
+    failed = {**vars(half.drive), "start_us": START_US + 20 * S, "end_us": half.end_us}
+    present.handler({"failed": failed, "error": {}}, None)
+    # Another run of the agent at the same time is another drive.
+    cloud.record(later(streams(30), 40), run="00c0ffef")
+    cloud.record(streams(30))
+
+    cloud.run()
+
+    other, whole = cloud.table.drives(CAR)
+    assert (other.drive.run, whole.drive) == ("00c0ffef", DriveKey(CAR, START_US, RUN))
+    assert {one.drive for one in cloud.table.findings(CAR)} <= {whole.drive, other.drive}
+    kept = cloud.s3.list_objects_v2(Bucket=FILES, Prefix="analysis/robot=")["Contents"]
+    folders = {one["Key"].rpartition("/")[0] + "/" for one in kept}
+    assert folders == {drive_prefix(whole.drive), drive_prefix(other.drive)}
+
+
+def test_a_field_that_comes_later_tells_of_motion(cloud: Deployed) -> None:
+    """The driver published no speed at first, and another stream has one all the time."""
+    drive = streams(120)["vesc"]
+    without = {name: column for name, column in drive.columns.items() if name != "speed"}
+    half = len(drive.times_us) // 2
+    cloud.register(CAR, "vesc", "wheels")
+    cloud.record({"vesc": Block(drive.times_us, without).take(slice(half))})
+    cloud.record({"vesc": drive.take(slice(half, None))}, first_seq=60)
+    cloud.record({"wheels": Block(drive.times_us, {"speed": drive.columns["speed"]})})
+
+    (planned,) = cloud.run(end_us=START_US + 120 * S)
+
+    assert planned["motion"] == "vesc"
+
+
+def test_the_row_of_a_drive_with_thousands_of_null_fields_fits_in_an_item() -> None:
+    missing = {f"a_stream_{i // 100}.{'f' * 60}{i}": "the field is null in every sample" for i in range(5000)}
+    drive = DriveKey(CAR, START_US, RUN)
+    made = analyse.row(
+        DriveResult(drive, START_US, 1, {}, Mined(missing={**missing, "lap_mean_s": "too short"})), JOB
+    )
+
+    assert len(json.dumps(encode_analysed(made))) < 100_000
+    assert made.missing["lap_mean_s"] == "too short"
+    assert made.missing["others"] == "4,801 more are in the drive's result.json"
 
 
 @pytest.mark.parametrize(

@@ -6,22 +6,21 @@ import hashlib
 import json
 from pathlib import Path
 
-import boto3
 import pytest
-from botocore.config import Config
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from functions import answer
 from functions.quarantine import entries
-from functions.shared.bodies import Bodies
+from functions.shared.questions.bodies import Bodies
+from functions.shared.questions.work import RefusedError, work_of
 from functions.shared.quota import HOUR, Quota
-from functions.shared.work import RefusedError, work_of
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, RACELINE, Question
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.messages.ask import (
     FAILED,
     INVALID,
@@ -43,17 +42,16 @@ from iort_contract.messages.ask import (
 )
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import File, file_key
-from iort_contract.messages.findings import DriveKey, Estimate
-from iort_contract.tables import FINDING, ROBOT
+from iort_contract.tables import ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_contract.track import parse_track
+from tests.fakes import FILES, FINDINGS, ROBOTS
 
 NOW_S = 1_700_000_000.0
 NOW_US, NOW_MS = int(NOW_S * 1e6), int(NOW_S * 1000)
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:answer"
 ID = "0123456789abcdef"
 ECHO = Question("echo", "the body", 2, max_question_bytes=2 * MAX_INLINE_BYTES, max_answer_bytes=10**6)
-BUCKET, ROBOTS, FINDINGS = "files", "robots", "findings"
 
 
 def ask(body=None, **changes):
@@ -65,28 +63,9 @@ def event(asked, robot="car", name="echo"):
     return rule_event(message, build_topic(ASK, robot, name), NOW_MS)
 
 
-@pytest.fixture
-def s3(aws):
-    client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
-    client.create_bucket(Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
-    return client
-
-
-@pytest.fixture
-def dynamodb(aws):
-    client = boto3.client("dynamodb")
-    for table, keys in {ROBOTS: (ROBOT,), FINDINGS: (ROBOT, FINDING)}.items():
-        client.create_table(
-            TableName=table,
-            KeySchema=[
-                {"AttributeName": key, "KeyType": kind}
-                for key, kind in zip(keys, ("HASH", "RANGE"), strict=False)
-            ],
-            AttributeDefinitions=[{"AttributeName": key, "AttributeType": "S"} for key in keys],
-            BillingMode="PAY_PER_REQUEST",
-        )
-    client.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
-    return client
+@pytest.fixture(autouse=True)
+def registered(dynamodb):
+    dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
 
 
 class Served:
@@ -97,7 +76,7 @@ class Served:
         self.said, self.kept, self.takes = [], [], True
         self.work = lambda _robot, body: body
         self.desk = answer.Desk(
-            lambda _: self._worked, self._quota, Bodies(s3, BUCKET), self._reply, self._keep
+            lambda _: self._worked, self._quota, Bodies(s3, FILES), self._reply, self._keep
         )
 
     def __call__(self, asked, *, now_s=NOW_S, **event_of):
@@ -192,15 +171,15 @@ def uploaded(s3, content, name="ask/track.json", robot="car"):
     """The file of a body, as the agent's upload leaves it."""
     sha256 = hashlib.sha256(content).hexdigest()
     key = file_key(robot, File(name, "other", "application/json", len(content), sha256, NOW_US))
-    s3.put_object(Bucket=BUCKET, Key=key, Body=content)
+    s3.put_object(Bucket=FILES, Key=key, Body=content)
     return Content(key, sha256, len(content))
 
 
 def test_a_large_body_is_a_file_both_ways(serve, s3):
     body = {"text": text(MAX_INLINE_BYTES)}
     found = serve(ask(uploaded(s3, json.dumps(body).encode())))
-    assert found.place.startswith(f"https://{BUCKET}.s3.eu-west-1.amazonaws.com/results/ask/car/{ID}.json?")
-    stored = s3.get_object(Bucket=BUCKET, Key=f"results/ask/car/{ID}.json")["Body"].read()
+    assert found.place.startswith(f"https://{FILES}.s3.eu-west-1.amazonaws.com/results/ask/car/{ID}.json?")
+    stored = s3.get_object(Bucket=FILES, Key=f"results/ask/car/{ID}.json")["Body"].read()
     assert json.loads(stored) == body
     assert (hashlib.sha256(stored).hexdigest(), len(stored)) == (found.sha256, found.size)
 
@@ -282,7 +261,7 @@ class Context:
 
 @pytest.fixture
 def deployed(aws, s3, dynamodb, monkeypatch):
-    given = AnswerEnvironment("iort", ROBOTS, FINDINGS, BUCKET, "queue")
+    given = AnswerEnvironment("iort", ROBOTS, FINDINGS, FILES, "queue")
     for name, value in given.variables().items():
         monkeypatch.setenv(name, value)
     return dynamodb

@@ -8,9 +8,7 @@ import json
 from dataclasses import replace
 from urllib.parse import parse_qs, urlsplit
 
-import boto3
 import pytest
-from botocore.config import Config
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -39,8 +37,8 @@ from iort_contract.messages.files import (
 )
 from iort_contract.tables import FILES_BYTES, FILES_DAY, ROBOT
 from iort_contract.topics import FILE, PING, PONG, build_topic
+from tests.fakes import FILES, ROBOTS
 
-NAME, ROBOTS = "files", "robots"
 NOW_S = 1_700_000_000.0
 ID = "0123456789abcdef"
 
@@ -237,23 +235,13 @@ class ListsChecksums:
 
 
 @pytest.fixture
-def s3(aws):
-    client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
-    client.create_bucket(Bucket=NAME, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
-    return ListsChecksums(client)
+def s3(s3):
+    return ListsChecksums(s3)
 
 
-@pytest.fixture
-def dynamodb(aws):
-    client = boto3.client("dynamodb")
-    client.create_table(
-        TableName=ROBOTS,
-        KeySchema=[{"AttributeName": ROBOT, "KeyType": "HASH"}],
-        AttributeDefinitions=[{"AttributeName": ROBOT, "AttributeType": "S"}],
-        BillingMode="PAY_PER_REQUEST",
-    )
-    client.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
-    return client
+@pytest.fixture(autouse=True)
+def registered(dynamodb):
+    dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
 
 
 @pytest.fixture
@@ -262,7 +250,7 @@ def ask(s3, dynamodb):
 
     def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
         allotment = quota(dynamodb, bytes_a_day)
-        return upload.answer(robot, request, Bucket(s3, NAME), allotment, now_s)
+        return upload.answer(robot, request, Bucket(s3, FILES), allotment, now_s)
 
     return ask
 
@@ -272,7 +260,7 @@ def test_a_small_files_address_allows_exactly_this_content_once(ask):
     url = urlsplit(address.url)
     query = {name: value for name, (value,) in parse_qs(url.query).items()}
     # The region's own host: an address on the global one would be redirected.
-    assert (url.scheme, url.netloc) == ("https", f"{NAME}.s3.eu-west-1.amazonaws.com")
+    assert (url.scheme, url.netloc) == ("https", f"{FILES}.s3.eu-west-1.amazonaws.com")
     assert url.path == "/" + file_key("car", SMALL.file)
     assert query["X-Amz-Expires"] == str(UPLOAD_URL_S)
     signed = set(query["X-Amz-SignedHeaders"].split(";"))
@@ -294,7 +282,7 @@ def test_a_parts_address_allows_exactly_this_part(ask):
 
 
 def test_a_stored_file_is_not_requested_again(ask, s3):
-    s3.put_object(Bucket=NAME, Key=file_key("car", SMALL.file), Body=b"small")
+    s3.put_object(Bucket=FILES, Key=file_key("car", SMALL.file), Body=b"small")
     answer = ask(SMALL)
     assert (answer.stored, answer.addresses) == (True, ())
     # A key with the same beginning is another file.
@@ -305,7 +293,7 @@ def test_a_stored_file_is_not_requested_again(ask, s3):
 def put(s3, key, upload_id, part, content):
     checksum = base64.b64encode(hashlib.sha256(content).digest()).decode()
     s3.upload_part(
-        Bucket=NAME, Key=key, UploadId=upload_id, PartNumber=part, Body=content, ChecksumSHA256=checksum
+        Bucket=FILES, Key=key, UploadId=upload_id, PartNumber=part, Body=content, ChecksumSHA256=checksum
     )
 
 
@@ -313,7 +301,7 @@ def test_a_large_file_resumes_and_becomes_one_object(ask, s3):
     content = bytes(2 * PART_BYTES) + b"rest"
     key, parts = file_key("car", file_of(content)), parts_of(content)
     assert [one.part for one in ask(asking(content, 1, 2, 3)).addresses] == [1, 2, 3]
-    (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
+    (begun,) = s3.list_multipart_uploads(Bucket=FILES)["Uploads"]
     for part in (1, 3):
         put(s3, key, begun["UploadId"], part, parts[part])
     answer = ask(asking(content, 1, 2, 3))
@@ -323,25 +311,25 @@ def test_a_large_file_resumes_and_becomes_one_object(ask, s3):
     assert not ask(asking(content, done=True)).stored
     put(s3, key, begun["UploadId"], 2, parts[2])
     assert ask(asking(content, done=True)).stored
-    stored = s3.get_object(Bucket=NAME, Key=key)
+    stored = s3.get_object(Bucket=FILES, Key=key)
     assert stored["Body"].read() == content
     assert stored["Metadata"] == {"sha256": sha256(content), "kind": "recording", "t": "1700000000000000"}
     assert ask(asking(content, 1)).stored
-    assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
+    assert "Uploads" not in s3.list_multipart_uploads(Bucket=FILES)
 
 
 def test_parts_of_another_content_never_become_the_file(ask, s3):
     content = bytes(PART_BYTES) + b"rest"
     key = file_key("car", file_of(content))
     ask(asking(content, 1, 2))
-    (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
+    (begun,) = s3.list_multipart_uploads(Bucket=FILES)["Uploads"]
     put(s3, key, begun["UploadId"], 1, bytes(PART_BYTES))
     put(s3, key, begun["UploadId"], 2, b"evil")
     assert [one.part for one in ask(asking(content, 1, 2)).addresses] == [2]
     answer = ask(asking(content, done=True))
     assert (answer.refused, answer.again_s) == ("the parts stored are not this file's", 0)
-    assert "Contents" not in s3.list_objects_v2(Bucket=NAME)
-    assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
+    assert "Contents" not in s3.list_objects_v2(Bucket=FILES)
+    assert "Uploads" not in s3.list_multipart_uploads(Bucket=FILES)
 
 
 def test_a_robots_bytes_a_day_are_limited_and_a_large_file_counts_once(ask, dynamodb):
@@ -369,7 +357,7 @@ class Desk:
     """One environment of the function, with its answers and its dead letters."""
 
     def __init__(self, s3, dynamodb):
-        self.bucket = Bucket(s3, NAME)
+        self.bucket = Bucket(s3, FILES)
         self.quota = quota(dynamodb, 10**9)
         self.answered, self.kept, self.takes = [], [], True
 
@@ -402,7 +390,7 @@ def event(request, robot="car", **changes):
 def test_the_robot_of_the_topic_is_answered_and_counted(desk, capsys, s3):
     desk(event(SMALL))
     key = file_key("car", SMALL.file)
-    s3.put_object(Bucket=NAME, Key=key, Body=b"small")
+    s3.put_object(Bucket=FILES, Key=key, Body=b"small")
     desk(event(asking(b"small", done=True)))
     (robot, asked), (_, stored) = desk.answered
     assert (robot, asked.key, asked.stored, stored.stored) == ("car", key, False, True)
@@ -460,10 +448,10 @@ def test_the_handler_uses_the_clients_of_its_environment(aws, s3, dynamodb, monk
     class Context:
         invoked_function_arn = ARN
 
-    for name, value in UploadEnvironment("iort", NAME, ROBOTS, "queue", 10**9).variables().items():
+    for name, value in UploadEnvironment("iort", FILES, ROBOTS, "queue", 10**9).variables().items():
         monkeypatch.setenv(name, value)
     upload.handler(event(SMALL), Context)
     ((topic, payload),) = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"].published_payloads
     (address,) = decode_file_answer(payload).addresses
     assert topic == build_topic(PONG, "car", FILE)
-    assert urlsplit(address.url).netloc == f"{NAME}.s3.eu-west-1.amazonaws.com"
+    assert urlsplit(address.url).netloc == f"{FILES}.s3.eu-west-1.amazonaws.com"

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.message_sizes import stored_bytes
-from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, decode_together
+from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, decode_together, part
 from iort_analysis.samples.blocks import join
 from iort_contract.checks import wire_column
 from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
@@ -137,7 +137,7 @@ def test_messages_are_read_as_samples_or_skipped():
     ]  # fmt: skip
     assert [value for value in whole.columns["s.0"].tolist() if value is not None] == ["a"]
     assert refused.count == 0
-    alone = join(list(blocks([items], refused, messages=False)))
+    alone = part(items, refused, messages=False).block
     assert (alone.times_us.tolist(), alone.columns["x"].tolist()) == ([310], [9.5])
     assert refused.count == 0
 

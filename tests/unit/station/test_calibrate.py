@@ -9,11 +9,12 @@ from typer.testing import CliRunner
 
 from iort_analysis.evaluation.combined import combined
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.data import findings, inventory
+from iort_station.data import inventory
+from iort_station.data.analysis import findings
 
 DAY_US = 86_400_000_000
 

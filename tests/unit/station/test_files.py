@@ -6,7 +6,6 @@ import hashlib
 import json
 from types import SimpleNamespace
 
-import boto3
 import pytest
 from typer.testing import CliRunner
 
@@ -16,8 +15,8 @@ from iort_station.cli.main import app
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files
+from tests.fakes import FILES
 
-NAME = "files"
 # 2023-11-14T22:13:20Z
 NOON = 1_700_000_000
 
@@ -47,10 +46,8 @@ class PagedS3:
 
 
 @pytest.fixture
-def s3(aws):
-    client = boto3.client("s3")
-    client.create_bucket(Bucket=NAME, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
-    return PagedS3(client)
+def s3(s3):
+    return PagedS3(s3)
 
 
 @pytest.fixture
@@ -58,7 +55,7 @@ def cloud(s3, monkeypatch):
     made = Cloud(region="eu-west-1")
     made._clients["s3", None] = s3
     monkeypatch.setattr(
-        Cloud, "output", lambda _self, noun, name: {("storage", "FilesBucket"): NAME}[noun, name]
+        Cloud, "output", lambda _self, noun, name: {("storage", "FilesBucket"): FILES}[noun, name]
     )
     return made
 
@@ -71,7 +68,7 @@ def store(s3):
         digest = hashlib.sha256(content).hexdigest()
         file = File(name, "recording", "application/x-rosbag", len(content), digest, second * 1_000_000)
         key = file_key(robot, file)
-        s3.put_object(Bucket=NAME, Key=key, Body=content, Metadata={"sha256": sha256 or digest})
+        s3.put_object(Bucket=FILES, Key=key, Body=content, Metadata={"sha256": sha256 or digest})
         return key
 
     return put
@@ -85,8 +82,8 @@ def test_a_robots_files_are_listed_by_time_across_pages(cloud, store, s3):
     for i in (4, 0, 3, 1, 2):
         store(name=f"{i}.bag", second=NOON + i * 86_400)
     store(robot="car2", name="other.bag")
-    s3.put_object(Bucket=NAME, Key="robots/car/by-hand.txt", Body=b"")
-    s3.put_object(Bucket=NAME, Key="results/x", Body=b"")
+    s3.put_object(Bucket=FILES, Key="robots/car/by-hand.txt", Body=b"")
+    s3.put_object(Bucket=FILES, Key="results/x", Body=b"")
     found = list(files.listed(cloud, "car"))
     assert names(found) == ["0.bag", "1.bag", "2.bag", "3.bag", "4.bag"]
     assert s3.pages == 3
@@ -164,12 +161,12 @@ def test_a_damaged_part_is_detected_and_deleted(cloud, store, tmp_path):
 def test_empty_deletes_all_files(cloud, store, s3):
     for i in range(5):
         store(name=f"{i}.bag")
-    s3.create_multipart_upload(Bucket=NAME, Key="robots/car/begun")
+    s3.create_multipart_upload(Bucket=FILES, Key="robots/car/begun")
     gone = []
     files.empty(cloud, gone.append)
     assert sum(gone) == 6
-    assert "Contents" not in s3.list_objects_v2(Bucket=NAME)
-    assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
+    assert "Contents" not in s3.list_objects_v2(Bucket=FILES)
+    assert "Uploads" not in s3.list_multipart_uploads(Bucket=FILES)
 
 
 # --- the command ------------------------------------------------------------------------------------
@@ -221,6 +218,6 @@ def test_get_downloads_the_newest_file_or_all(iort, store, tmp_path):
 def test_empty_asks_for_confirmation(iort, store, s3):
     store()
     assert "Nobody can answer here" in str(iort("empty", status=2).exception)
-    assert s3.list_objects_v2(Bucket=NAME)["KeyCount"] == 1
+    assert s3.list_objects_v2(Bucket=FILES)["KeyCount"] == 1
     assert "1 deleted" in iort("empty", "--yes").output
-    assert s3.list_objects_v2(Bucket=NAME)["KeyCount"] == 0
+    assert s3.list_objects_v2(Bucket=FILES)["KeyCount"] == 0

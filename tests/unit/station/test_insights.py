@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from iort_contract.catalog.findings import GROUPS
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import DriveKey, Estimate, Finding
+from iort_contract.catalog.analysis.parameters import GROUPS
+from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.errors import StationError
 from iort_station.page import insights, laps
 from tests.unit.station.test_data import START

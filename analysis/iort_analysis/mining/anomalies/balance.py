@@ -14,8 +14,8 @@ import numpy as np
 
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
-from iort_analysis.mining.fitting import Fit, fit
 from iort_analysis.results import Mined
+from iort_analysis.statistics.fitting import Fit, fit
 
 INERTIA, ROLLING, BRAKE = "inertia_a_per_krpm_s", "rolling_current_a", "brake_drag_a"
 # Steps, and the time over which both sides are integrated.

@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from iort_analysis.mining.anomalies.readings import Array
-from iort_contract.messages.findings import INTERVAL, Estimate
+from iort_analysis.statistics.intervals import sides
+from iort_contract.messages.analysis.findings import Estimate
 
-# The 95 % quantile of the normal distribution: 90 % lie within, either way.
-_Z = 1.645
 _LEAST = 30
 # Before and after a change there is at least this share of the series.
 _SHARE = 0.1
-assert INTERVAL == 0.9
 
 
 class Change(NamedTuple):
@@ -37,16 +35,19 @@ def changed(values: Array, unit: str) -> Change | None:
         return None
     sums = np.cumsum(values - values.mean())
     margin = max(2, round(_SHARE * n))
-    place = int(np.argmax(np.abs(sums[margin - 1 : n - margin]))) + margin
+    places = np.arange(margin, n - margin + 1)
+    away = np.abs(sums[places - 1])
+    # The two pieces of the least squares: where the sum itself is largest would lie too near the middle.
+    place = int(places[np.argmax(away**2 / (places * (n - places)))])
     before, after = values[:place], values[place:]
     # About their own means, or a change would hide itself.
     within = np.concatenate([before - before.mean(), after - after.mean()])
     deviation = _long_run(within)
     if not deviation:
         return None
-    distance = abs(float(sums[place - 1])) / (deviation * math.sqrt(n))
+    distance = float(away.max()) / (deviation * math.sqrt(n))
     value = float(after.mean() - before.mean())
-    half = _Z * deviation * math.sqrt(1 / len(before) + 1 / len(after))
+    half = sides() * deviation * math.sqrt(1 / len(before) + 1 / len(after))
     return Change(place, Estimate(value, value - half, value + half, unit), _beyond(distance))
 
 

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from iort_analysis.mining.anomalies.readings import FULL_DUTY, MOVING_KRPM, Array, Mask, Readings
-from iort_analysis.mining.fitting import Fit, fit
-from iort_analysis.mining.signals import binned
 from iort_analysis.results import Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.fitting import Fit, fit
+from iort_analysis.statistics.signals import binned
+from iort_contract.messages.analysis.findings import Estimate
 
 VOLTAGE_DRIFT, CURRENT_DRIFT = "voltage_drift_v", "motor_current_drift_a"
 _STEP_S, _LEAST_S = 0.2, 180.0

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.readings import BATTERY, VOLTAGE, Array, Readings
-from iort_analysis.mining.fitting import fit
-from iort_analysis.mining.signals import binned, bridged, smooth_basis
 from iort_analysis.results import Event, Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.fitting import fit
+from iort_analysis.statistics.signals import binned, bridged, smooth_basis
+from iort_contract.messages.analysis.findings import Estimate
 
 KIND = "cell_dropout"
 _STEP_S = 0.1

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from iort_analysis.drives.drive import FROZEN, Drive, Repair
 from iort_analysis.results import Event, Mined
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.messages.findings import Estimate
+from iort_contract.messages.analysis.findings import Estimate
 
 KIND = "sensor_stuck"
 # The units of what a sensor measures; counters and codes may stand still.

@@ -9,9 +9,9 @@ import numpy as np
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
-from iort_analysis.mining.intervals import mean_of
 from iort_analysis.results import Mined
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.intervals import mean_of, sides
+from iort_contract.messages.analysis.findings import Estimate
 
 SLIP = "slip_under_torque"
 # Distances over this time are compared: long enough for a pose with a centimetre's noise.
@@ -20,8 +20,6 @@ _OVER_S = 0.25
 _HIGH, _IDLE, _TORQUE = 0.95, 0.25, 0.6
 # The drive in so many parts gives the gain's interval.
 _PARTS, _LEAST, _LEAST_PULLS = 20, 200, 20
-# The 95 % quantile of the normal distribution: 90 % lie within, either way.
-_Z = 1.645
 
 
 class _Ways(NamedTuple):
@@ -53,7 +51,7 @@ def mine_slip(drive: Drive, samples: Readings) -> Mined:
     noise_m = float(np.std(ways.moved_m[idle] - ways.turns[idle] / gain))
     turned_m = float(ways.turns[pulls].sum()) / gain
     slip = 1 - float(ways.moved_m[pulls].sum()) / turned_m
-    half = math.hypot(_Z * noise_m * math.sqrt(float(pulls.sum())) / turned_m, (high - low) / 2 / gain)
+    half = math.hypot(sides() * noise_m * math.sqrt(float(pulls.sum())) / turned_m, (high - low) / 2 / gain)
     return Mined(estimates={SLIP: Estimate(slip, slip - half, slip + half, "1")})
 
 

@@ -9,8 +9,8 @@ from iort_analysis.mining.anomalies.balance import balance
 from iort_analysis.mining.anomalies.cusum import Change, changed
 from iort_analysis.mining.anomalies.drift import voltage_residuals
 from iort_analysis.mining.anomalies.readings import DUTY, MOTOR, SPEED, VOLTAGE, Array, Readings
-from iort_analysis.mining.signals import binned
 from iort_analysis.results import Event, Mined
+from iort_analysis.statistics.signals import binned
 
 # Means over this time are compared: about a lap's corner.
 _STEP_S = 5.0

@@ -12,11 +12,11 @@ import numpy as np
 
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.readings import Array, Readings
-from iort_analysis.mining.fitting import Fit, fit
-from iort_analysis.mining.signals import binned, bridged, lagged
 from iort_analysis.results import Mined
+from iort_analysis.statistics.fitting import Fit, fit
+from iort_analysis.statistics.signals import binned, bridged, lagged
 from iort_contract.catalog.vesc import TEMPERATURES
-from iort_contract.messages.findings import Estimate
+from iort_contract.messages.analysis.findings import Estimate
 
 TEMPERATURE_DRIFT, LAG = "temperature_drift_k", "controller_lag_s"
 _STEP_S, _LEAST_S = 2.0, 240.0

@@ -8,16 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.intervals import mean_of
 from iort_analysis.mining.laps.laps import Laps, best, find_laps, speed_mps
 from iort_analysis.mining.laps.path import Floats
 from iort_analysis.results import Mined, Table
-from iort_contract.catalog.findings import LAPS_TABLE, PARAMETERS, PLACES_TABLE
-from iort_contract.messages.findings import Estimate
+from iort_analysis.statistics.intervals import mean_of, sides
+from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PARAMETERS, PLACES_TABLE
+from iort_contract.messages.analysis.findings import Estimate
 
 _NAMES = ("lap_best_s", "lap_mean_s", "lap_distance_m", "lap_energy_wh", "lap_energy_wh_per_km")
-# The half width of a 90 % interval, in standard deviations.
-_Z = 1.645
 
 
 def mine(drive: Drive) -> Mined:
@@ -42,7 +40,7 @@ def mine(drive: Drive) -> Mined:
 
 def _estimates(laps: Laps) -> Iterator[tuple[str, Estimate]]:
     times = laps.time_s[laps.complete]
-    either_s = _Z * math.sqrt(2) * laps.jitter_s
+    either_s = sides() * math.sqrt(2) * laps.jitter_s
     least = float(times.min())
     yield "lap_best_s", Estimate(least, least - either_s, least + either_s, "s")
     for name, values in (

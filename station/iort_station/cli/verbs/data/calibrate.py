@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from iort_contract.catalog.car import GROUPS
-from iort_contract.messages.findings import encode_estimate
+from iort_contract.catalog.analysis.car import GROUPS
+from iort_contract.messages.analysis.findings import encode_estimate
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
-from iort_station.data import findings, inventory
+from iort_station.data import inventory
+from iort_station.data.analysis import findings
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from iort_station.data.calibration import Calibration
+    from iort_station.data.analysis.calibration import Calibration
 
 commands = typer.Typer()
 
@@ -36,7 +37,7 @@ def calibrate(
     not tell is listed with the reason.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data import calibration  # noqa: PLC0415 - see above
+    from iort_station.data.analysis import calibration  # noqa: PLC0415 - see above
 
     within, cloud = when.range(), context.obj.cloud()
     drives = findings.drives(cloud, robot, within.start_us, within.end_us, most=count)

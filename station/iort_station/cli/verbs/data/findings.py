@@ -8,15 +8,15 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract.catalog.kinds import KINDS
-from iort_contract.messages.analysis import AnalysedDrive, encode_analysed
-from iort_contract.messages.findings import Estimate, Finding, encode_finding
+from iort_contract.catalog.analysis.kinds import KINDS
+from iort_contract.messages.analysis.findings import Estimate, Finding, encode_finding
+from iort_contract.messages.analysis.run import AnalysedDrive, encode_analysed
 from iort_contract.page import PAGE_URL, history_link
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples
-from iort_station.data import findings as stored
+from iort_station.data.analysis import findings as stored
 from iort_station.fleet import registry
 from iort_station.times import iso_s
 
@@ -61,7 +61,8 @@ def findings(
     if not found and robot is not None:
         registry.get(cloud, robot)
     if not found and not as_json:
-        errors.print("nothing was found in this range; `iort analyse` looks now")
+        what = "no drive in this range is analysed" if drives else "nothing was found in this range"
+        errors.print(f"{what}; `iort analyse` looks now")
 
 
 def _show(one: Finding) -> None:
@@ -88,7 +89,8 @@ def _show(one: Finding) -> None:
 
 
 def _interval(estimate: Estimate) -> str:
-    return f"{estimate.value:.4g} {estimate.unit} ({estimate.low:.4g} to {estimate.high:.4g})"
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{estimate.value:.4g}{unit} ({estimate.low:.4g} to {estimate.high:.4g})"
 
 
 def _show_drive(one: AnalysedDrive) -> None:
@@ -101,6 +103,9 @@ def _show_drive(one: AnalysedDrive) -> None:
         rows.add_row(name, _interval(estimate))
     for kind, samples in one.repairs.items():
         rows.add_row(f"repaired: {kind}", f"{samples:,} samples")
+    names_of: dict[str, list[str]] = {}
     for name, reason in one.missing.items():
-        rows.add_row(f"missing: {name}", reason, style="yellow")
+        names_of.setdefault(reason, []).append(name)
+    for reason, names in names_of.items():
+        rows.add_row("missing", f"{', '.join(names)}: {reason}", style="yellow")
     out.print(rows)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract.catalog.findings import LAPS_TABLE, PARAMETERS, PLACES_TABLE
-from iort_contract.messages.findings import encode_estimate
+from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PARAMETERS, PLACES_TABLE
+from iort_contract.messages.analysis.findings import encode_estimate
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, Force, Robot, When, ranged, to_file
 from iort_station.cli.progress import reading
@@ -21,7 +21,7 @@ from iort_station.times import iso, iso_s
 
 if TYPE_CHECKING:
     from iort_analysis.results import Table as Columns
-    from iort_station.data.laps import RunLaps
+    from iort_station.data.analysis.laps import RunLaps
 
 commands = typer.Typer()
 # The rows of a comparison in a terminal; JSON and the picture have every place.
@@ -63,7 +63,7 @@ def laps(
     below a table says which. Without a range, the newest run is searched. Intervals are of 90 %.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data.laps import laps_of_runs  # noqa: PLC0415 - see above
+    from iort_station.data.analysis.laps import laps_of_runs  # noqa: PLC0415 - see above
 
     if file is not None:
         if compare is None:

@@ -11,11 +11,12 @@ from rich.table import Table
 from iort_contract.messages.page import Run
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
-from iort_station.cli.words import examples, say
+from iort_station.cli.words import examples, say, say_archived
 from iort_station.cloud import Cloud
-from iort_station.times import between, iso, iso_s
+from iort_station.times import between, between_hours, iso, iso_s
 
 if TYPE_CHECKING:
+    from iort_station.data.recorded import Origin
     from iort_station.operations.audit import Missing
 
 commands = typer.Typer()
@@ -42,18 +43,22 @@ def runs(
     record.
     """
     # numpy takes longer to load than TAB may take.
-    from iort_station.data.runs import runs as find  # noqa: PLC0415 - see above
+    from iort_station.data.recorded import Origin  # noqa: PLC0415 - see above
+    from iort_station.data.runs import runs as find  # noqa: PLC0415 - as above
 
-    within, cloud = when.range(), context.obj.cloud()
+    within, cloud, origin = when.range(), context.obj.cloud(), Origin()
     gaps: Gaps = {}
     with errors.status("reading") as status:
-        found = find(cloud, robot, start_us=within.start_us, end_us=within.end_us, count=count)
+        start_us, end_us = within.start_us, within.end_us
+        found = find(cloud, robot, start_us=start_us, end_us=end_us, count=count, origin=origin)
         for run in found["runs"] if with_gaps else ():
             status.update(f"counting the batches of {run['run'][:8]}")
-            gaps |= _gaps(cloud, robot, run)
+            gaps |= _gaps(cloud, robot, run, origin)
+    archived = _of(found["runs"], origin).told()
     if as_json:
         listed = [_as_json(run, gaps if with_gaps else None) for run in found["runs"]]
-        print_json({"robot": robot, "runs": listed, "more_runs": found["older"]})
+        of_archive = archived and between_hours(archived)
+        print_json({"robot": robot, "runs": listed, "more_runs": found["older"], "archive": of_archive})
         return
     if not found["runs"]:
         errors.print(f"{robot} has no runs in this range")
@@ -66,16 +71,23 @@ def runs(
             out.print(f"{boot[:8]} {stream}: {gap.batches:,} batches missing between {after} and {before}")
     if found["older"]:
         say(f"there are older runs: --count {2 * count}, or --to {iso_s(found['runs'][-1]['from_us'])}")
+    say_archived(archived)
 
 
-def _gaps(cloud: Cloud, robot: str, run: Run) -> Gaps:
+def _of(found: list[Run], origin: Origin) -> Origin:
+    """The hours of the listed runs: the oldest batch of each stream is read, too."""
+    start_us = min((run["from_us"] for run in found), default=None)
+    return origin.within(start_us, max((run["to_us"] for run in found), default=None))
+
+
+def _gaps(cloud: Cloud, robot: str, run: Run, origin: Origin) -> Gaps:
     from iort_station.operations import audit  # noqa: PLC0415 - as above
 
     return {
         (run["run"], stream): one.missing
         for stream, part in run["streams"].items()
         for one in audit.audit(
-            stream, audit.headers(cloud, robot, stream, part["from_us"], part["to_us"])
+            stream, audit.headers(cloud, robot, stream, part["from_us"], part["to_us"], origin=origin)
         ).runs
         if one.boot == run["run"]
     }

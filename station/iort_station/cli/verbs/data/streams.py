@@ -10,8 +10,8 @@ from rich.table import Table
 
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
-from iort_station.cli.words import examples
-from iort_station.times import between, iso_s
+from iort_station.cli.words import examples, say_archived
+from iort_station.times import between, between_hours, iso_s
 
 if TYPE_CHECKING:
     from iort_station.data.overview import StreamOverview
@@ -27,12 +27,15 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
     """
     # numpy takes longer to load than TAB may take.
     from iort_station.data.overview import overview  # noqa: PLC0415 - see above
+    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
 
-    cloud = context.obj.cloud()
+    cloud, origin = context.obj.cloud(), Origin()
     with errors.status("reading"):
-        found = overview(cloud, robot)
+        found = overview(cloud, robot, origin=origin)
+    archived = origin.told()
     if as_json:
-        print_json({"robot": robot, "streams": [_as_json(one) for one in found]})
+        listed = [_as_json(one) for one in found]
+        print_json({"robot": robot, "streams": listed, "archive": archived and between_hours(archived)})
         return
     if not found:
         errors.print(f"{robot} has sent nothing yet")
@@ -44,6 +47,7 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
         extent = f"{iso_s(one.extent['from_us'])} to {iso_s(one.extent['to_us'])}"
         out.print(f"{one.stream}: {counted}, {extent}", style="bold", soft_wrap=True)
         out.print(Padding(table, (0, 0, 1, 2)))
+    say_archived(archived)
 
 
 def _as_json(one: StreamOverview) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract.catalog.car import KNOWN
+from iort_contract.catalog.analysis.car import KNOWN
 from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,

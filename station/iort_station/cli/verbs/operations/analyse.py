@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from datetime import timedelta
 from typing import Annotated
 
 import typer
 
-from iort_contract.catalog.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import (
+from iort_contract.messages.analysis.run import (
     MAX_RANGE_US,
     AnalysisRequest,
     decode_request,
@@ -20,7 +21,7 @@ from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
-from iort_station.data import findings
+from iort_station.data.analysis import findings
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
@@ -70,8 +71,10 @@ def analyse(
         for finding in findings.findings(cloud, robot, request.start_us, request.end_us)
     )
     facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
-    text = f"{done.drives or 0} drives analysed, {done.findings} findings"
-    tell(facts, f"{text}, {failed} drives failed" if failed else text, as_json=as_json)
+    text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
+    if not done.drives:
+        text += "; a drive begins when the car moves: `iort runs` lists what was recorded"
+    tell(facts, f"{text}, drives failed: {failed}" if failed else text, as_json=as_json)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -87,14 +90,24 @@ def _request(robots: list[str], when: When, *, again: bool) -> AnalysisRequest:
 
 
 def _watched(cloud: Cloud, run: str) -> analysis.Progress:
-    """Follow a run to its end; drives that are done are shown to whoever looks."""
-    last = analysis.Progress(analysis.RUNNING)
+    """Follow a run to its end; whoever looks sees the drives that are done and the time that is left."""
+    last, found_s = analysis.Progress(analysis.RUNNING), 0.0
     try:
         with errors.status("finding the drives") as status:
             for last in analysis.watch(cloud, run):
                 if last.drives is not None:
-                    status.update(f"{last.done} of {last.drives} drives")
+                    found_s = found_s or time.monotonic()
+                    status.update(progress(last, time.monotonic() - found_s))
     except KeyboardInterrupt:
         say("the analysis goes on in the cloud; `iort findings` prints what it finds")
         raise
     return last
+
+
+def progress(run: analysis.Progress, seconds: float) -> str:
+    """How far a run is, so many seconds after its drives were found."""
+    drives, done = run.drives or 0, run.done
+    if done == drives:
+        return f"{drives} drives analysed; comparing them with earlier ones"
+    left = f", {timedelta(seconds=round(seconds / done * (drives - done)))} left" if done else ""
+    return f"{done} of {drives} drives{left}"

@@ -11,13 +11,16 @@ from iort_contract.topics import parse_topic
 from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson
 from iort_station.cli.progress import bar
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say
+from iort_station.data.archive import Archive
 from iort_station.errors import StationError
 from iort_station.operations import archive
 
 commands = typer.Typer(
     name="archive", no_args_is_help=True, help="Telemetry that is kept for good, as Parquet in the bucket."
 )
+
+_EMPTY = "nothing is archived yet: an hour is, from a quarter past the next one"
 
 _Robot = Annotated[
     str | None,
@@ -32,11 +35,12 @@ def show(
 ) -> None:
     """List the streams in the archive: hours, samples, bytes. With --json, print a line of JSON for each."""
     cloud = context.obj.cloud()
+    empty = True
     for topic in archive.topics(cloud, robot, stream):
-        rows = archive.rows(cloud, topic)
+        rows = list(Archive(cloud, topic).rows())
         if not rows:
             continue
-        name = parse_topic(topic)
+        empty, name = False, parse_topic(topic)
         # The hours of a day are one object.
         size = sum({row.key: row.size_bytes for row in rows}.values())
         facts = {
@@ -55,6 +59,8 @@ def show(
             f"{facts['samples']:,} samples, {size:,} bytes"
         )
         console.tell(facts, text, as_json=as_json)
+    if empty:
+        say(_EMPTY)
 
 
 @commands.command("run", epilog=examples("archive run", "archive run car7 vesc"))
@@ -91,16 +97,19 @@ def verify(
     Fails if anything is missing. With --json, print a line of JSON for each stream.
     """
     cloud = context.obj.cloud()
-    wrong = 0
+    wrong, empty = 0, True
     for topic in archive.topics(cloud, robot, stream):
         name, found = parse_topic(topic), archive.verify(cloud, topic)
         wrong += len(found.problems)
         if not found.hours and not found.problems:
             continue
+        empty = False
         facts = {"robot": name.robot, "stream": name.name, **vars(found)}
         lines = [f"{name.robot} {name.name}: {found.hours:,} hours, {found.samples:,} samples"]
         lines += [f"    {hour}: {problem}" for hour, problem in found.problems.items()]
         console.tell(facts, "\n".join(lines), as_json=as_json)
+    if empty:
+        say(_EMPTY)
     if wrong:
         raise StationError(
             f"{wrong} hours are not as they should be: `iort archive run`, then look at `iort alarms`"

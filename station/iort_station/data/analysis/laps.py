@@ -12,7 +12,7 @@ from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
 from iort_analysis.samples.positions import position_fields
 from iort_contract.catalog.streams import OWN_STREAMS
-from iort_contract.messages.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.batches import PageProgress

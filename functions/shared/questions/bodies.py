@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from functions.shared.work import RefusedError
+from functions.shared.questions.work import RefusedError
 from iort_contract.catalog.questions import Question
 from iort_contract.checks import json_object
 from iort_contract.cloud import RESULTS_PREFIX

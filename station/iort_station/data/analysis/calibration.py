@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from iort_analysis.evaluation.combined import combined
-from iort_contract.catalog.car import GROUPS
+from iort_contract.catalog.analysis.car import GROUPS
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import Estimate
+from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
 
 GAIN = "speed_to_erpm_gain"
 

@@ -6,7 +6,7 @@ from functions.shared import clients
 from functions.shared.environment import variables
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
 
 # A parameter that none of so many drives has is not known.
 _DRIVES = 50

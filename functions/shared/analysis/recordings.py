@@ -10,8 +10,8 @@ from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from functions.shared import clients
+from functions.shared.analysis.expired import Expired
 from functions.shared.environment import variables
-from functions.shared.expired import Expired
 from iort_contract.archive import ArchiveTable
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.environments import PlanEnvironment
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 # A stream with more fields is a scan or an image, from which nothing is mined.
 MAX_FIELDS = 100
-# A stream that begins with so many broken batches has no known fields.
-_TRIES = 5
+# A stream's fields are looked at so often in a range: a field may come later. So many broken batches in a row
+# tell none.
+_LOOKS, _TRIES = 4, 5
 
 
 class Registered(NamedTuple):
@@ -82,13 +83,19 @@ class Recordings:
             yield next(same)
 
     def fields(self, robot: str, stream: str, start_us: int, end_us: int) -> list[str] | None:
-        """The fields of a stream at the beginning of a range; None if it has no samples there that could be
-        mined."""
-        for item in islice(self.items(robot, stream, start_us, end_us, page_items=_TRIES), _TRIES):
-            with suppress(ContractError):
-                names = list(decode_batch(plain(item)).columns)
-                return names if len(names) <= MAX_FIELDS else None
-        return None
+        """The fields that a stream has at the beginning of a range or at some times later; None if it has no
+        samples there that could be mined."""
+        names: dict[str, None] | None = None
+        for look in range(_LOOKS):
+            at_us = start_us + (end_us - start_us) * look // _LOOKS
+            found = list(islice(self.items(robot, stream, at_us, end_us, page_items=_TRIES), _TRIES))
+            if not found:
+                break
+            for item in found:
+                with suppress(ContractError):
+                    names = (names or {}) | dict.fromkeys(decode_batch(plain(item)).columns)
+                    break
+        return None if names is None or len(names) > MAX_FIELDS else list(names)
 
 
 def robots_of(client: DynamoDBClient, table: str) -> list[str]:

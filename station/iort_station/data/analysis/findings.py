@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from itertools import islice
 
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis import AnalysedDrive
-from iort_contract.messages.findings import Finding
+from iort_contract.messages.analysis.findings import Finding
+from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.cloud import Cloud
 from iort_station.fleet import registry
 

@@ -1,24 +1,9 @@
-"""What an analysis of drives can say: its parameters, and the kinds of its findings.
-
-A miner's estimate is an entry of `PARAMETERS`, a finding's kind one of `KINDS`.
-"""
+"""Every parameter that an analysis of drives can estimate: a miner's estimate is an entry of `PARAMETERS`."""
 
 from __future__ import annotations
 
-from iort_contract.catalog.car import BATTERY, FORCES, HEAT, MOTOR
-from iort_contract.catalog.kinds import KINDS
-from iort_contract.catalog.parameter import Parameter
-
-__all__ = [
-    "GROUPS",
-    "KINDS",
-    "LAPS_TABLE",
-    "PARAMETERS",
-    "PLACES_TABLE",
-    "STYLES",
-    "STYLE_TABLE",
-    "Parameter",
-]
+from iort_contract.catalog.analysis.car import BATTERY, FORCES, HEAT, MOTOR
+from iort_contract.catalog.analysis.parameter import Parameter
 
 _LAPS = (
     Parameter("lap_best_s", "s", "time of the best lap", worse="up"),

@@ -26,6 +26,14 @@ class Kept:
         text = json.dumps(content, separators=(",", ":"), allow_nan=False)
         self.put(key, text.encode(), "application/json")
 
+    def remove(self, prefix: str) -> None:
+        """Remove all objects whose keys begin so."""
+        for page in self._client.get_paginator("list_objects_v2").paginate(
+            Bucket=self._bucket, Prefix=prefix
+        ):
+            for found in page.get("Contents", ()):
+                self._client.delete_object(Bucket=self._bucket, Key=found["Key"])
+
     def json(self, key: str) -> Any:
         """Read an object of JSON; None if there is none."""
         try:

@@ -1,0 +1,1 @@
+"""The analysis' messages: a run, the findings it makes, and both for the page."""

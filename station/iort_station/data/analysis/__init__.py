@@ -1,0 +1,1 @@
+"""What the analysis says of drives: findings, a car's calibration, laps."""

@@ -1,0 +1,271 @@
+"""The preflight: every verdict of every item, with a fake account that answers like AWS."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.unit.verify.account import QUOTAS, Account, Refused, denied, limits, quota, settings, stack_answers
+from verify.preflight import account, deployed
+from verify.preflight.finding import Verdict
+
+FINE, WARNING, STOPS = Verdict.FINE, Verdict.WARNING, Verdict.STOPS
+ROLE = "arn:aws:iam::123456789012:role/somebody"
+
+
+ALL = dict.fromkeys(deployed.STACKS, "UPDATE_COMPLETE")
+LIVE = ("AWS::Lambda::Function", "Live848578DF", "iort-processing-Live")
+LOG = {"roleArn": ROLE, "defaultLogLevel": "ERROR", "disableAllLogs": False}
+KEY = "iort-storage:ExportsOutputFnGetAttKey961B73FDArn5A860C43"
+OLD = "iort-storage:ExportsOutputRefTelemetryE3B0C442ABCDEF01"
+
+
+def exported(name, *importers):
+    answers = {"ListExports": {"Exports": [{"Name": name}, {"Name": "another-storage:ExportsOutputRefKey"}]}}
+    return {**answers, **({"ListImports": {"Imports": list(importers)}} if importers else {})}
+
+
+CASES = [
+    ("bootstrap", {}, {}, FINE, "version 21, needed is 6"),
+    ("bootstrap", {}, {"GetParameter": Refused("ParameterNotFound")}, STOPS, "not bootstrapped"),
+    (
+        "bootstrap",
+        {},
+        {"GetParameter": {"Parameter": {"Value": "5"}}},
+        STOPS,
+        "version must be 6 or newer, got 5",
+    ),
+    ("iot_log", {}, {}, FINE, "not configured; iot_log_level is off"),
+    ("iot_log", {"iot_log_level": "error"}, {}, FINE, "not configured; iot_log_level is error"),
+    ("iot_log", {}, {"GetV2LoggingOptions": LOG}, FINE, "configured (ERROR); iot_log_level is off"),
+    ("iot_log", {"iot_log_level": "error"}, {"GetV2LoggingOptions": LOG}, STOPS, "already exists"),
+    (
+        "iot_log",
+        {"iot_log_level": "error"},
+        {"GetV2LoggingOptions": {**LOG, "disableAllLogs": True}},
+        FINE,
+        "not configured",
+    ),
+    (
+        "iot_log",
+        {"iot_log_level": "error"},
+        {"GetV2LoggingOptions": LOG}
+        | stack_answers(ALL, resources={"account": [("AWS::IoT::Logging", "Log", "123456789012")]}),
+        FINE,
+        "by this deployment",
+    ),
+    ("audit", {"device_defender": True}, {}, FINE, "not configured; wanted"),
+    ("audit", {}, {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}, FINE, "configured; not wanted"),
+    (
+        "audit",
+        {"device_defender": True},
+        {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}},
+        STOPS,
+        "already exists",
+    ),
+    (
+        "audit",
+        {"device_defender": True},
+        {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}
+        | stack_answers(ALL, resources={"account": [("AWS::IoT::AccountAuditConfiguration", "Audit", "1")]}),
+        FINE,
+        "by this deployment",
+    ),
+    ("concurrency", {}, {}, FINE, "0 are to be reserved"),
+    ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 concurrent executions"),
+    (
+        "concurrency",
+        {"stage": "prod"},
+        {"GetAccountSettings": limits(105, 105)},
+        FINE,
+        "5 are to be reserved",
+    ),
+    (
+        "concurrency",
+        {"stage": "prod"},
+        {"GetAccountSettings": limits(104, 104)},
+        STOPS,
+        "requires 100 unreserved",
+    ),
+    (
+        "concurrency",
+        {"stage": "prod"},
+        {
+            "GetAccountSettings": limits(105, 100),
+            "GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5},
+        }
+        | stack_answers(ALL, resources={"processing": [LIVE]}),
+        FINE,
+        "100 of them unreserved",
+    ),
+    ("cloudfront", {}, {"ListDistributions": denied("cloudfront:ListDistributions")}, FINE, "not wanted"),
+    ("cloudfront", {"site": True}, {}, WARNING, "cannot be read"),
+    (
+        "cloudfront",
+        {"site": True},
+        stack_answers(ALL, resources={"site": [("AWS::S3::Bucket", "Page", "iort-site-page")]}),
+        FINE,
+        "deployed",
+    ),
+    ("quotas", {}, {}, FINE, "first limit: "),
+    (
+        "quotas",
+        {},
+        {"ListServiceQuotas": {"Quotas": [quota("Inbound publish requests per second per account", 500)]}},
+        WARNING,
+        "Inbound publish requests per second per account, 500",
+    ),
+    (
+        "quotas",
+        {},
+        {"ListAWSDefaultServiceQuotas": {"Quotas": QUOTAS[:1]}},
+        FINE,
+        "unknown: Connect requests",
+    ),
+    ("quotas", {}, {"ListAWSDefaultServiceQuotas": {"Quotas": []}}, WARNING, "none of the quotas"),
+    (
+        "quotas",
+        {},
+        {"ListTopicRules": {"rules": [{"ruleName": f"other{n}"} for n in range(992)]}},
+        STOPS,
+        "992 rules of others and 10 of ours exceed the limit 1000",
+    ),
+    (
+        "quotas",
+        {},
+        {"ListTopicRules": {"rules": [{"ruleName": f"iort_{n}"} for n in ("live", "record")]}},
+        FINE,
+        "robots",
+    ),
+    ("stacks", {}, {}, FINE, "none: a first one"),
+    ("stacks", {}, stack_answers(ALL), FINE, "10 of 10"),
+    *(
+        ("stacks", {}, stack_answers({**ALL, "fleet": state}), STOPS, f"iort-fleet is {state}")
+        for state in (
+            "ROLLBACK_COMPLETE",
+            "ROLLBACK_FAILED",
+            "CREATE_FAILED",
+            "DELETE_FAILED",
+            "REVIEW_IN_PROGRESS",
+            "UPDATE_ROLLBACK_FAILED",
+            "UPDATE_IN_PROGRESS",
+        )
+    ),
+    ("stacks", {}, stack_answers({"storage": "UPDATE_ROLLBACK_COMPLETE"}), FINE, "1 of 10"),
+    ("names", {}, {}, FINE, "free"),
+    ("names", {}, {"GetPolicy": {"policyName": "a"}}, STOPS, "policy iort-robot, policy iort-claim"),
+    ("names", {}, {"DescribeThingType": {"thingTypeName": "a"}}, STOPS, "thing type iort-robot"),
+    ("names", {}, {"ListTopicRules": {"rules": [{"ruleName": "iort_live"}]}}, STOPS, "rule iort_live"),
+    (
+        "names",
+        {},
+        {
+            "ListDashboards": {
+                "DashboardEntries": [{"DashboardName": "iort-platform"}, {"DashboardName": "iort-x"}]
+            }
+        },
+        STOPS,
+        "without their stack: dashboard iort-platform",
+    ),
+    ("names", {}, {"GetPolicy": {"policyName": "a"}} | stack_answers(ALL), FINE, "used by this deployment"),
+    ("kept", {}, {}, FINE, "no leftovers"),
+    (
+        "kept",
+        {},
+        {
+            "ListTables": {"TableNames": ["iort-storage-Batches-A", "another-storage-Batches"]},
+            "ListBuckets": {"Buckets": [{"Name": "iort-storage-files-a"}]},
+            "ListQueues": {"QueueUrls": ["https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"]},
+            "DescribeLogGroups": {"logGroups": [{"logGroupName": "iort-fleet-AdmitLog-A"}]},
+        },
+        WARNING,
+        "iort-fleet-AdmitLog-A, iort-quarantine-Last-A, iort-storage-Batches-A, iort-storage-files-a",
+    ),
+    (
+        "kept",
+        {},
+        {
+            "ListTables": {"TableNames": ["iort-storage-Batches-A"]},
+            "ListQueues": {"QueueUrls": ["https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"]},
+        }
+        | stack_answers(
+            ALL,
+            resources={
+                "storage": [("AWS::DynamoDB::Table", "Batches", "iort-storage-Batches-A")],
+                "quarantine": [
+                    ("AWS::SQS::Queue", "L", "https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A")
+                ],
+            },
+        ),
+        FINE,
+        "no leftovers",
+    ),
+    ("changes", {}, {}, FINE, "nothing is deployed"),
+    ("changes", {"site": True, "device_defender": True}, stack_answers(ALL), FINE, "none that must not be"),
+    (
+        "changes",
+        {},
+        stack_answers(ALL) | exported(KEY, "iort-fleet", "iort-ingest"),
+        STOPS,
+        "iort-fleet, iort-ingest import the key",
+    ),
+    ("changes", {}, stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(KEY), FINE, "none that must"),
+    *(
+        (
+            "changes",
+            {key: True},
+            stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(KEY, "iort-fleet"),
+            FINE,
+            "none that must",
+        )
+        for key in ("customer_key", "keep_customer_key")
+    ),
+    (
+        "changes",
+        {},
+        stack_answers(ALL) | exported(OLD, "iort-processing"),
+        STOPS,
+        "iort-processing imports it",
+    ),
+    (
+        "changes",
+        {"old_telemetry": True},
+        stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(OLD, "iort-processing"),
+        FINE,
+        "none that must",
+    ),
+    (
+        "changes",
+        {},
+        stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")]),
+        WARNING,
+        "protected",
+    ),
+    (
+        "changes",
+        {"stage": "prod"},
+        stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")]),
+        FINE,
+        "none that must",
+    ),
+    ("changes", {}, stack_answers(ALL), WARNING, "iort-site, iort-account (stays as it is)"),
+]
+
+
+def function(name):
+    return getattr(account, name, None) or getattr(deployed, name)
+
+
+@pytest.mark.parametrize(("name", "given", "answers", "verdict", "text"), CASES)
+def test_an_item_reports_its_finding(name, given, answers, verdict, text):
+    finding = function(name)(Account(**answers), settings(**given))
+    assert (finding.verdict, text in finding.found) == (verdict, True), finding
+    assert bool(finding.do) == (verdict is not FINE)
+
+
+def test_every_item_is_tested_with_each_of_its_verdicts():
+    verdicts = {}
+    for name, _, _, verdict, _ in CASES:
+        verdicts.setdefault(name, set()).add(verdict)
+    items = {*account.ITEMS, *deployed.ITEMS}
+    assert {function(name) for name in verdicts} == items
+    assert all(FINE in seen and len(seen) > 1 for seen in verdicts.values())
