@@ -314,6 +314,8 @@ def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Dep
         "&to=2023-11-14T22:13:40.000Z&fields=voltage_input,current_input\n"
     )
     assert link in text
+    share = replace(finding(), effect=Estimate(0.087, 0.005, 0.17, "1"))
+    assert "effect   0.087, 90 % sure" in present.mail(share, PAGE_URL)[1]
 
 
 def test_a_year_of_drives_with_one_fault_is_one_mail(cloud: Deployed) -> None:
@@ -364,6 +366,24 @@ def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) 
     for end_us, left in ((START_US + 30 * S, [found]), (START_US + 60 * S, [])):
         cloud.run(end_us=end_us)
         assert list(cloud.table.findings(CAR)) == left
+
+
+def test_a_drive_that_ends_without_an_answer_is_a_finding_too(cloud: Deployed) -> None:
+    """Its workflow took too long, or could not write the finding."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    run = plan.handler(
+        {"input": {"robots": [], "start_us": START_US, "end_us": START_US + S}, "job": JOB}, None
+    )
+    plan.handler({**run, "robot": CAR}, None)
+    cloud.table.put_finding(finding())
+
+    evaluate.handler(run, None)
+    present.handler({"job": JOB}, None)
+
+    failed, earlier = sorted(cloud.table.findings(CAR), key=lambda one: one.kind)
+    assert failed.text == "the drive could not be analysed in three attempts: they ended without an answer"
+    assert earlier == finding()
 
 
 def test_the_next_night_looks_for_the_drives_of_a_failed_plan(cloud: Deployed) -> None:
