@@ -61,5 +61,5 @@ class Plan:
         return self.cars * self.healthy * self.seconds / 3600
 
 
-FULL = Plan(cars=20, baseline=8, healthy=8, covered=400)
+FULL = Plan(cars=20, baseline=8, healthy=8, covered=270)
 QUICK = Plan(cars=4, baseline=6, healthy=3, covered=16)
