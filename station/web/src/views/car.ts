@@ -59,6 +59,7 @@ export class CarView {
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
     links: HTMLElement,
+    drive: HTMLElement,
     /** Called when the address is another one. */
     changed: () => void,
   ) {
@@ -80,6 +81,7 @@ export class CarView {
       { class: "car", id: "car" },
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
+      drive,
       this.tools.node,
       el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note only-look" }, ONLY_LOOK)] : []))),
       this.streams,
@@ -188,6 +190,11 @@ export class CarView {
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };
     this.state.set(linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`);
+  }
+
+  /** Who drives the car. */
+  driver(now: number): string | undefined {
+    return this.robot?.driver(now);
   }
 
   draw(now: number): void {
