@@ -68,8 +68,8 @@ class Terminal:
         self.shown = ""
 
     def hold(self, key: str, text: str) -> bool:
-        """Press the key once more, as its repetition does; whether the text is shown. A hold that a slow machine
-        has ended is let go."""
+        """Press the key once more, as its repetition does; whether the text is shown. A hold that a slow
+        machine has ended is let go."""
         if "let go" not in self.shown:
             os.write(self._keys, key.encode())
         if select.select([self._keys], [], [], _KEY_S)[0]:
