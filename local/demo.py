@@ -45,14 +45,18 @@ ROBOT = "car1"
 _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
-# `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`; nobody is hurt by a long lease.
-DRIVE_COMMANDS = {
-    "drive": {
-        "topic": "/drive",
-        "type": DRIVE_TYPE,
-        "partial": True,
-        "motion": {"lease_s": 10.0, "stop": {"drive": {"speed": 0.0}}},
-    }
+# `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`, and the stick of page and terminal.
+# Nobody is hurt by a long lease.
+DOWNLINK = {
+    "cmd": {
+        "drive": {
+            "topic": "/drive",
+            "type": DRIVE_TYPE,
+            "partial": True,
+            "motion": {"lease_s": 10.0, "stop": {"drive": {"speed": 0.0}}},
+        }
+    },
+    "drive": {"max_speed_mps": 2.0, "max_steering_rad": 0.4},
 }
 _CATCH_UP_S = 30.0
 _STATUS_S = 1.0
@@ -153,9 +157,7 @@ class _Demo:
         if duration_s is not None:
             source["duration_s"] = duration_s
         settings = {"sources": [source], "ping": _PING}
-        return (
-            settings if self._options.bag is not None else {**settings, "downlink": {"cmd": DRIVE_COMMANDS}}
-        )
+        return settings if self._options.bag is not None else {**settings, "downlink": DOWNLINK}
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"

@@ -136,4 +136,4 @@ class Agent:
         """Takes the samples of who drove; a source with a stream of this name goes first."""
         if any(DRIVE_STREAM in source.streams() for source in config.sources):
             return lambda _: None
-        return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values)
+        return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values, urgent=True)

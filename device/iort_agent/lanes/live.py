@@ -13,7 +13,7 @@ Messages go to the live rule by Basic Ingest, which costs no messaging and which
 first message of a run, one with another fault code, and one every ten seconds go to the broker instead, for
 the rules that alert a human and for other subscribers. The live rule receives those, too, so the dashboard
 shows each message once. Another fault code waits for no slow rate and no line: it is sent at the fastest
-rate.
+rate. So is every sample of an urgent stream, which a driver waits for.
 
 Every message says when the stream's next one comes. So a change of the rate is told at once.
 """
@@ -103,7 +103,7 @@ class LiveLane:
             self._serve(now)
             self._meter.set_rate(demand.rate_hz)
 
-    def offer(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+    def offer(self, stream: str, t_us: int, values: Mapping[str, Value], *, urgent: bool = False) -> None:
         """Take the newest sample of a stream; it replaces the one that waits."""
         if not self.enabled:
             return
@@ -115,9 +115,10 @@ class LiveLane:
                 broker_topic = self._link.topic(topics.LIVE, stream)
                 slot = self._slots[stream] = Slot(basic_ingest, broker_topic, turn=self._turn)
                 self._turn += 1
+            slot.urgent = urgent
             slot.t_us, slot.values, slot.newest, slot.offered = t_us, values, values, now
             slot.offers += 1
-            if now >= slot.due or slot.is_newfault_of(now):
+            if now >= slot.due or slot.is_urgent(now):
                 self._take_turn(slot, now)
             self._serve(now)
 
@@ -130,7 +131,7 @@ class LiveLane:
                     continue
                 if now - slot.offered > _PRESENT_S:
                     slot.values = None
-                elif now >= slot.due + self._patience_s or slot.is_newfault_of(now):
+                elif now >= slot.due + self._patience_s or slot.is_urgent(now):
                     self._take_turn(slot, now)
             self._serve(now)
             if now - self._marked >= 1:
@@ -144,9 +145,9 @@ class LiveLane:
             self._take_turn(slot, now)
 
     def _take_turn(self, slot: Slot, now: float) -> None:
-        """Send another fault code at once; put any other sample in line."""
+        """Send an urgent sample and another fault code at once; put any other sample in line."""
         if (
-            slot.is_newfault_of(now)
+            slot.is_urgent(now)
             and slot.seq
             and self._rate_limiter.may_go(URGENT, slot.broker_topic, slot.payload_bytes)
         ):
@@ -159,7 +160,7 @@ class LiveLane:
         """Send from the line as much as the rate limiter allows."""
         while self._line:
             slot = self._line[0][1]
-            # A stream that has just sent another fault code is no longer due.
+            # A stream that has just sent an urgent sample is no longer due.
             ready = (
                 slot.values is not None and now >= slot.due and not slot.writing and self._uplink.connected()
             )
@@ -199,10 +200,11 @@ class LiveLane:
             slot.due = max(slot.due, now - self._patience_s) + self._period_s
         else:
             slot.due = max(slot.due, now + _FASTEST_S)
-        slot.fault_due = now + _FASTEST_S
+        # On a grid, too.
+        slot.fault_due = max(slot.fault_due, now - _FASTEST_S / 2) + _FASTEST_S
         slot.writing = True
         slot.payload_bytes = len(payload)
-        topic = slot.broker_topic if self._to_broker else slot.topic
+        topic = slot.broker_topic if self._to_broker or slot.urgent else slot.topic
         if now >= slot.broker_due or fault_of(values) != slot.fault:
             slot.broker_due, slot.fault = now + LIVE_BROKER_EVERY_S, fault_of(values)
             topic = slot.broker_topic

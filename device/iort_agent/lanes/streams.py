@@ -39,8 +39,8 @@ class Streams:
         self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Iterable[str]] = {}
 
-    def emit(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
-        """Take a sample for both lanes."""
+    def emit(self, stream: str, t_us: int, values: Mapping[str, Value], *, urgent: bool = False) -> None:
+        """Take a sample for both lanes; an ``urgent`` one waits for no slow rate of the live lane."""
         if stream == TYPES_STREAM:
             # The live lane shows no message types.
             self._keep_type(values)
@@ -50,7 +50,7 @@ class Streams:
             self._fields.setdefault(stream, values.keys())
             values = {name: values[name] for name in self.settings.fields[stream] if name in values}
         # First, because its delay counts.
-        self._live.offer(stream, t_us, values)
+        self._live.offer(stream, t_us, values, urgent=urgent)
         self.record(stream, t_us, values)
 
     def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:

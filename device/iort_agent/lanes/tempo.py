@@ -68,6 +68,8 @@ class Slot:
     # The newest sample, sent or not.
     newest: Mapping[str, Value] | None = None
     offered: float = 0.0
+    # Whether each sample waits for no slow rate, and goes to the broker.
+    urgent: bool = False
     offers: int = 0
     seq: int = 0
     payload_bytes: int = 0
@@ -76,9 +78,11 @@ class Slot:
     hz: float = 0.0
     marks: deque[_Mark] = field(default_factory=lambda: deque(maxlen=_SECONDS + 1))
 
-    def is_newfault_of(self, now: float) -> bool:
-        """Whether the waiting sample has another fault code than the last message, and may go."""
-        return self.values is not None and now >= self.fault_due and fault_of(self.values) != self.fault
+    def is_urgent(self, now: float) -> bool:
+        """Whether the waiting sample may go at once: it is urgent, or has another fault code."""
+        if self.values is None or now < self.fault_due:
+            return False
+        return self.urgent or fault_of(self.values) != self.fault
 
 
 class TempoMeter:

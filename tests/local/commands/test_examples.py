@@ -16,7 +16,7 @@ from iort_agent.sources.sim.circuit import HALL
 from iort_contract.messages.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
-from local.demo import DRIVE_COMMANDS
+from local.demo import DOWNLINK
 from tests.local.conftest import recorded
 from tests.local.robots.test_shadow import driving
 from tests.manual import COMMANDS, examples
@@ -33,7 +33,7 @@ OF_A_DRIVE = ("trace", "watch", "send", "config")
 @pytest.fixture(scope="module")
 def car7(embedded, tmp_path_factory):
     """The examples' robot, with a file."""
-    settings = {"sources": [{"type": "sim", "rate_hz": 50}], "downlink": {"cmd": DRIVE_COMMANDS}}
+    settings = {"sources": [{"type": "sim", "rate_hz": 50}], "downlink": DOWNLINK}
     car = robots.add(embedded.cloud, "car7", out=tmp_path_factory.mktemp("car7"), settings=settings)
     sha256 = hashlib.sha256(b"drive").hexdigest()
     file = File("drive.bag", "recording", "application/octet-stream", 5, sha256, time.time_ns() // 1000)

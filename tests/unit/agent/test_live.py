@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.tempo import Demand
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -234,6 +236,18 @@ def test_a_lost_broker_message_is_repeated() -> None:
     _drive(rig, 0.1, fault_code=5)
     rig.uplink.verdict = lambda _: None
     assert _drive(rig, 0.2, fault_code=5) == [BROKER, DIRECT]
+
+
+def test_an_urgent_stream_is_sent_to_the_broker_at_the_fastest_rate_however_slow_the_lane_is() -> None:
+    rig = Rig(rate_hz=0.1)
+    for i in range(100):
+        rig.lane.offer("drive", rig.clock.now_us(), {"seq": i}, urgent=True)
+        rig.clock.advance(0.05)
+    assert len(rig.sent("drive")) == pytest.approx(50, abs=1)
+    assert {message.topic for message in rig.uplink.published} == {"live/iort/car1/drive"}
+    rig.clock.advance(0.2)
+    rig.tick()
+    assert rig.sent("drive")[-1].sample == {"seq": 99}
 
 
 def test_a_fault_shorter_than_the_period_is_sent_and_the_rate_stays() -> None:
