@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -69,6 +69,9 @@ bench-analysis-cloud: setup ## analyse 50 robot-hours on an embedded cloud, with
 
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
+
+bench-look: setup ## look at cars in Chromium, and count at the broker what it costs: CARS=20 PICTURES=folder REPORT=figures.json
+	@$(BIN)/python -m bench.looking $(if $(CARS),--cars $(CARS)) $(if $(PICTURES),--pictures "$(PICTURES)") $(if $(REPORT),--json "$(REPORT)")
 
 screenshots: setup ## take the pictures of docs/images anew
 	@$(BIN)/python -m bench.screenshots

@@ -61,8 +61,8 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
     lines = [f"{drive.robot}: {finding.text}", ""]
     for label, estimate in (("effect", finding.effect), ("before", finding.baseline)):
         if estimate is not None:
-            low, high, unit = estimate.low, estimate.high, estimate.unit
-            lines.append(f"{label:9}{estimate.value:.4g} {unit}, 90 % sure between {low:.4g} and {high:.4g}")
+            low, high, unit = estimate.low, estimate.high, "" if estimate.unit == "1" else f" {estimate.unit}"
+            lines.append(f"{label:9}{estimate.value:.4g}{unit}, 90 % sure between {low:.4g} and {high:.4g}")
     if finding.q is not None:
         lines.append(f"{'chance':9}at most {finding.q:.2g} of such findings are false")
     lines += [

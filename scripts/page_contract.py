@@ -98,6 +98,7 @@ def _constants() -> Iterator[str]:
     yield f"export const REFUSALS = {json.dumps(driving.REFUSALS, indent=2)} as const;"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
+    yield f"export const ABSENT_FROM: Readonly<Record<string, number>> = {json.dumps(vesc.ABSENT_FROM)};"
     # The alarms that the page can see in a car's live values.
     cars = {name: metric.alarm for name, metric in METRICS.items() if metric.of_a_robot and metric.alarm}
     told = {name: {"meaning": alarm.meaning, "advice": alarm.advice} for name, alarm in cars.items()}

@@ -111,7 +111,7 @@ def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page
     assert states == {"idle", "stale"}
     assert page.evaluate("iort.robots['car-1'].silent_s") >= 5.4
     show(page, car.send(next_ms=100))
-    assert page.get_attribute("#car", "data-state") == "live"
+    until(lambda: page.get_attribute("#car", "data-state") == "live", "the car to be live")
     until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "the promise of ten a second", 3)
     car.send(next_ms=10**6)
     until(lambda: page.evaluate("iort.malformed") == 1, "a time that no car may say")

@@ -61,9 +61,10 @@ class Page {
     this.feed = new Feed(config, table, this.fleet, (state) => {
       this.bar.linked(state);
       this.clockAt = -Infinity;
+      if (state.kind === "live") this.viewing.renew();
     });
     this.registry = new Registry(config);
-    this.viewing = new Viewing(config);
+    this.viewing = new Viewing(config, (lease) => this.feed.lease(lease));
     this.waiting = new Waiting(config, this.registry);
     this.stops = new StopControl(config, byId("top"));
     const alarms = new Alarms(config, this.fleet, table);

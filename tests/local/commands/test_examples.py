@@ -22,8 +22,8 @@ from tests.local.robots.test_shadow import driving
 from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
-# Laps need minutes of driving.
-NOT_RUN = {"adopt", "dashboard", "files empty", "laps", "pubnub", "robots revoke-claims", "site"}
+# Laps need minutes of driving, and `iort drive` a terminal.
+NOT_RUN = {"adopt", "dashboard", "drive", "files empty", "laps", "pubnub", "robots revoke-claims", "site"}
 # Runs until Ctrl-C.
 ENDLESS = "iort watch"
 # These need a car that drives; audit counts what is still in a car.

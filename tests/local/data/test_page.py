@@ -45,7 +45,7 @@ def served(embedded: EmbeddedCloud) -> PageServer:
         namespace=embedded.namespace,
         **embedded.keys.reading(),
         answers=answers(embedded.cloud),
-        actions=actions(embedded.cloud),
+        open_actions=actions(embedded.cloud),
     )
 
 

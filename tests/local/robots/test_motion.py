@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+from typing import Any
+
 from iort_contract.messages.shadow import decode_reported
 from iort_station import data
+from iort_station.cloud import EMBEDDED
 from iort_station.operations import delivery
 from local.demo import DOWNLINK
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import Shadow, driving
 
+_KEY_S = 0.05
 FORWARDS = '{"drive": {"speed": 9.0}}'
 
 
@@ -38,3 +51,59 @@ def test_a_car_is_driven_stopped_and_released_and_the_stop_outlives_the_agent(em
     outcomes = list(told.columns["outcome"])
     assert {"accepted", "stopped", "emergency_stop"} <= set(outcomes)
     assert max(speed for speed in told.columns["speed"] if speed is not None) == 2.0, "car.yaml's limit"
+
+
+class Terminal:
+    """A command on a terminal of its own."""
+
+    def __init__(self, *command: object) -> None:
+        self._keys, theirs = os.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+        self.process = subprocess.Popen(
+            list(map(str, command)), stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
+        )
+        os.close(theirs)
+        self.shown = ""
+
+    def hold(self, key: str, text: str) -> bool:
+        """Press the key once more, as its repetition does; whether the text has been shown."""
+        os.write(self._keys, key.encode())
+        if select.select([self._keys], [], [], _KEY_S)[0]:
+            self.shown += os.read(self._keys, 65_536).decode(errors="replace")
+        assert self.process.poll() is None, self.shown
+        return text in self.shown
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._keys)
+
+
+def test_a_car_is_driven_by_keys_and_stops_when_the_terminal_freezes(embedded, bundle):
+    car = bundle(sources=[{"type": "sim", "rate_hz": 50}], downlink=DOWNLINK)
+    shadow = Shadow(embedded, car.robot)
+    iort = [Path(sys.executable).parent / "iort", "--embedded", embedded.folder / EMBEDDED.name]
+    with driving(car):
+        until(lambda: decode_reported(shadow.reported()).drive)
+        terminal = Terminal(*iort, "drive", car.robot, "--by", "anna", "--max-speed", "0.5")
+        try:
+            until(lambda: terminal.hold("w", "hold a key to drive"))
+            until(lambda: terminal.hold("w", "you drive"))
+            until(lambda: terminal.hold("w", "+0.50 m/s"))
+            terminal.process.send_signal(signal.SIGSTOP)
+            until(lambda: list(delivery.batches(embedded.cloud, car.robot, "drive")))
+            until(lambda: "stopped" in outcomes(embedded, car.robot))
+        finally:
+            terminal.close()
+    told = data.query(embedded.cloud, car.robot, "drive", "-1h", "now")
+    assert set(told.columns["by"]) == {"anna"}
+    passed = [i for i, outcome in enumerate(told.columns["outcome"]) if outcome == "accepted"]
+    assert told.columns["speed"][passed[0]] == 0, "a hold begins at a standstill"
+    assert told.columns["speed"][passed[-1]] == 0.5
+    last, after = passed[-1], passed[-1] + 1
+    assert told.columns["outcome"][after] == "stopped"
+    assert told.times_us[after] - told.times_us[last] < 550_000
+
+
+def outcomes(embedded: Any, robot: str) -> set[str]:
+    return set(data.query(embedded.cloud, robot, "drive", "-1h", "now").columns["outcome"])

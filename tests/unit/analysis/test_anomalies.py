@@ -133,6 +133,15 @@ def test_samples_that_come_again_are_an_intermittent_link() -> None:
     assert event.effect.value == pytest.approx(0.035, abs=0.01)
 
 
+def test_a_recording_that_is_replayed_quickly_has_no_intermittent_link() -> None:
+    """Its samples have the times of the replay, of which a few wait for a tenth of a millisecond."""
+    made = dict(streams(120))
+    times, columns = made["vesc"]
+    steps_us = np.where(np.arange(len(times)) % 40 == 0, 100, 10)
+    made["vesc"] = Block(times[0] + np.cumsum(steps_us), columns)
+    assert not anomalies.mine(build(KEY, made)).events
+
+
 def test_a_reported_fault_is_an_event_by_its_name() -> None:
     made = changed("fault_code", slice(1000, 1010), 2.0)
     made["vesc"].columns["fault_code"][2000] = 2.0

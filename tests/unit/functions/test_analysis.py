@@ -314,6 +314,8 @@ def test_a_serious_finding_is_mailed_once_with_a_link_to_its_evidence(cloud: Dep
         "&to=2023-11-14T22:13:40.000Z&fields=voltage_input,current_input\n"
     )
     assert link in text
+    share = replace(finding(), effect=Estimate(0.087, 0.005, 0.17, "1"))
+    assert "effect   0.087, 90 % sure" in present.mail(share, PAGE_URL)[1]
 
 
 def test_a_year_of_drives_with_one_fault_is_one_mail(cloud: Deployed) -> None:

@@ -15,6 +15,8 @@ from iort_contract.messages.analysis.findings import Estimate
 KIND = "can_intermittent"
 # A gap is longer than so many intervals between samples, and shorter than a pause.
 _INTERVALS, _PAUSE_S = 4.0, 3.0
+# No controller sends faster: the times of a recording that was replayed quickly are not those of its samples.
+_LEAST_STEP_S = 0.001
 # So many samples in a row are never equal in all their fields while the car moves.
 _REPEATED = 3
 # A link is intermittent with so many gaps, and with this share of the samples missing.
@@ -29,7 +31,7 @@ def mine_gaps(drive: Drive) -> Mined:
         return Mined()
     times = block.times_us
     steps = np.diff(times) / 1e6
-    usual = float(np.median(steps))
+    usual = max(float(np.median(steps)), _LEAST_STEP_S)
     gaps = (steps > _INTERVALS * usual) & (steps < max(_PAUSE_S, 2 * _INTERVALS * usual))
     gaps &= ~_others_pause(drive, times)
     repeated = _repeated(block)
@@ -40,7 +42,7 @@ def mine_gaps(drive: Drive) -> Mined:
         return Mined()
     longest = int(places[np.argmax(lost[places])])
     error = sides() * float(np.sqrt((lost[places] ** 2).sum())) / len(times)
-    effect = Estimate(share, max(0.0, share - error), share + error, "1")
+    effect = Estimate(share, max(0.0, share - error), min(1.0, share + error), "1")
     text = (
         f"{share:.1%} of the controller's samples are missing ({effect.low:.1%} to {effect.high:.1%}), in "
         f"{len(places)} gaps of {np.median(lost[places]) * usual:.2g} s on average; the longest one has "

@@ -82,7 +82,7 @@ def decode_request(content: Mapping[str, Any], now_us: int) -> AnalysisRequest:
     if not 0 < end_us - start_us <= MAX_RANGE_US:
         raise ContractError(
             f"the range must be longer than 0 and at most {MAX_RANGE_US // 86_400_000_000} days, "
-            f"got {(end_us - start_us) / 1e6:g} s"
+            f"got {(end_us - start_us) / 86_400_000_000:.4g} days"
         )
     again = content.get("again", False)
     if not isinstance(again, bool):

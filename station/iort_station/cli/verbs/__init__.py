@@ -31,6 +31,7 @@ VERBS = {
     "operations.replay_errors": "Process rejected recordings again.",
     "operations.adopt": "Copy batches of an old telemetry table.",
     "fleet.send": "Send a command and print the robot's answer.",
+    "fleet.drive": "Drive a car by the keys of this terminal.",
     "fleet.stop": "Stop robots in an emergency, until --release.",
     "fleet.ask": "Ask the cloud what a robot may ask.",
     "fleet.config": "Show or change a robot's settings.",

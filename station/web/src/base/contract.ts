@@ -47,6 +47,7 @@ export const REFUSALS = {
 } as const;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
 export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+export const ABSENT_FROM: Readonly<Record<string, number>> = {"temperature_pcb": -50.0, "temp_fet": -50.0, "temp_motor": -50.0, "ntc_temp_mos1": -50.0, "ntc_temp_mos2": -50.0, "ntc_temp_mos3": -50.0};
 export const CAR_ALARMS = {
   "FaultSamples": {
     "meaning": "a car reports a fault",

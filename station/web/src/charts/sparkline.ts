@@ -4,7 +4,7 @@ import { WINDOW_S } from "../live/bounds";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
 
-const HOLE_S = 1;
+const HOLE_S = 2.5;
 const seen = new WeakSet<Element>();
 const watcher = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) {

@@ -1,5 +1,6 @@
 // The delay by hop: a bar for each hop of a message, which begins at the end of the one before.
 
+import type { Config } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
 import { MEDIAN_S } from "../live/bounds";
 import { LEGS, type Delay, type Leg, type Robot } from "../live/robot";
@@ -10,10 +11,11 @@ const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
   toCloud: ["Broker and rule", "from the car to the topic rule, over the broker"],
   toLambda: ["Lambda", "from the rule to the function"],
   toPubNub: ["PubNub takes it", "from the function to PubNub"],
-  toPage: ["Page hears it", "from PubNub to this page"],
+  toPage: ["Page hears it", "from PubNub, or straight from the broker, to this page"],
   screen: ["Page shows it", "from its arrival to the next picture"],
 };
-const SHOWN = [...LEGS, "screen"] as const;
+type Shown = readonly (Leg | "screen")[];
+const SHOWN: Readonly<Record<Config["live"], Shown>> = { pubnub: [...LEGS, "screen"], iot: ["car", "toPage", "screen"] };
 // A smaller clock offset is normal for clocks that are not measured.
 const CLOCKS_MS = 5;
 
@@ -21,11 +23,13 @@ export class Waterfall {
   readonly node: HTMLElement;
   private readonly median = new Text("num", "span", { "data-value": "delay_median" });
   private readonly warning = new Text("warning", "p");
+  private readonly shown: Shown;
   private readonly rows = new Map<Leg | "screen", { readonly bar: HTMLElement; readonly text: Text }>();
 
-  constructor() {
+  constructor({ live }: Config) {
+    this.shown = SHOWN[live];
     const list = el("dl", { class: "falls" });
-    for (const leg of SHOWN) {
+    for (const leg of this.shown) {
       const [name, meaning] = NAMES[leg];
       const bar = el("span", { class: "fall-bar" });
       const text = new Text("num", "span", { "data-value": `leg_${leg}` });
@@ -54,10 +58,10 @@ export class Waterfall {
   refresh(robot: Robot, now: number, screen_ms: number): void {
     const delay = robot.medianDelay(now);
     this.median.set(delay ? milliseconds(delay.total) : NOTHING);
-    const parts = SHOWN.map((leg) => (leg === "screen" ? screen_ms : (delay?.[leg] ?? NaN)));
+    const parts = this.shown.map((leg) => (leg === "screen" ? screen_ms : (delay?.[leg] ?? NaN)));
     const whole = parts.reduce((sum, part) => sum + Math.max(0, part || 0), 0);
     let before = 0;
-    SHOWN.forEach((leg, i) => {
+    this.shown.forEach((leg, i) => {
       const part = Math.max(0, parts[i] || 0);
       const { bar, text } = this.rows.get(leg)!;
       text.set(milliseconds(parts[i]!));

@@ -3,6 +3,7 @@
 
 import { VIEW_LEASE_MS, VIEW_RENEW_S, type Config } from "../base/contract";
 import { act, AnswerError } from "../server/answers";
+import type { Lease } from "./worker_messages";
 
 /** The rate of a card among others, and of a value beside the past. */
 export const GLANCE_HZ = 1;
@@ -15,18 +16,27 @@ export const NONE: Looks = new Map();
 export class Viewing {
   /** Whether this page can ask cars for more than they send by themselves. */
   readonly able: boolean;
+  private readonly served: boolean;
+  private readonly connected: boolean;
   /** Why the newest lease was not sent. */
   error = "";
   private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
   private looks = NONE;
   private held = NONE;
 
-  constructor(config: Config) {
-    this.able = config.actions.includes("view");
+  /** `lease` asks over the page's own connection to the broker. */
+  constructor(
+    config: Config,
+    private readonly lease: (lease: Lease) => void,
+  ) {
+    this.served = config.actions.includes("view");
+    // A static site's identity may only listen.
+    this.connected = config.live === "iot" && config.identity === null;
+    this.able = this.served || this.connected;
     if (!this.able) return;
     document.addEventListener("visibilitychange", () => this.hold());
     window.addEventListener("pagehide", () => this.hold(NONE));
-    window.setInterval(() => this.hold(undefined, true), VIEW_RENEW_S * 1000);
+    window.setInterval(() => this.renew(), VIEW_RENEW_S * 1000);
   }
 
   /** The cars that this page holds awake. */
@@ -38,6 +48,11 @@ export class Viewing {
   look(looks: Looks): void {
     this.looks = looks;
     if (this.able) this.hold();
+  }
+
+  /** Ask for everything that is looked at again. */
+  renew(): void {
+    if (this.able) this.hold(undefined, true);
   }
 
   /** Ask for what is looked at and not held yet, or for all of it, and end the other leases. */
@@ -52,8 +67,13 @@ export class Viewing {
   }
 
   private send(robots: readonly string[], rate_hz: number, lease_ms: number): void {
-    const asked = { robots: robots.join(","), viewer: this.viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms) };
-    // The last request of a page that is closed must outlive it.
+    const { viewer } = this;
+    // The last word of a page that is closed must outlive it, and its connection does not.
+    if (this.connected && (lease_ms > 0 || !this.served)) {
+      this.lease({ robots, viewer, rate_hz, lease_ms });
+      return;
+    }
+    const asked = { robots: robots.join(","), viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms), ...(this.connected ? { broker: "yes" } : {}) };
     act("view", asked, lease_ms === 0)
       .then(() => (this.error = ""))
       .catch((error: unknown) => (this.error = error instanceof AnswerError ? error.message : String(error)));

@@ -1,5 +1,6 @@
 // The messages between the page and its worker.
 
+import type { Config } from "../base/contract";
 import type { Update } from "./update";
 
 export type LinkState =
@@ -9,19 +10,23 @@ export type LinkState =
   | { readonly kind: "lost"; readonly since: number; readonly retryAt: number; readonly reason: string };
 
 /** The settings of the subscription. */
-export interface Listening {
-  readonly namespace: string;
+export interface Listening extends Pick<Config, "namespace" | "live" | "identity" | "subscribe_key" | "origin" | "tls" | "token"> {
   readonly version: number;
-  readonly subscribe_key: string;
-  readonly origin: string;
-  readonly tls: boolean;
-  readonly token: string;
   readonly user: string;
+}
+
+/** A viewer's lease on the live lanes of robots; 0 ms ends it. */
+export interface Lease {
+  readonly robots: readonly string[];
+  readonly viewer: string;
+  readonly rate_hz: number;
+  readonly lease_ms: number;
 }
 
 export type ToWorker =
   | { readonly kind: "start"; readonly listening: Listening }
   | { readonly kind: "visible"; readonly visible: boolean }
+  | { readonly kind: "lease"; readonly lease: Lease }
   /** The page has processed the last handover, and is ready for the next. */
   | { readonly kind: "taken" };
 
@@ -30,8 +35,8 @@ export interface Arrival {
   readonly update: Update;
   readonly at: number;
   readonly wall_us: number;
-  /** The time at which PubNub took it, in microseconds since the epoch, by PubNub's clock. */
-  readonly pubnub_us: number;
+  /** When PubNub took it, in microseconds since the epoch, by PubNub's clock; undefined if it came otherwise. */
+  readonly pubnub_us: number | undefined;
 }
 
 export type FromWorker =

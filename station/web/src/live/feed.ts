@@ -4,7 +4,7 @@ import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
 import { keep, kept } from "../base/kept";
 import type { Fleet } from "./fleet";
-import type { FromWorker, LinkState, ToWorker } from "../link/worker_messages";
+import type { FromWorker, Lease, LinkState, ToWorker } from "../link/worker_messages";
 
 export class Feed {
   state: LinkState = { kind: "connecting" };
@@ -24,10 +24,15 @@ export class Feed {
       this.state = { kind: "lost", since: now(), retryAt: now(), reason: `the page's worker failed: ${event.message}` };
       onState(this.state);
     });
-    const { namespace, subscribe_key, origin, tls, token } = config;
+    const { namespace, live, identity, subscribe_key, origin, tls, token } = config;
     const { version } = table;
-    this.tell({ kind: "start", listening: { namespace, version, subscribe_key, origin, tls, token, user: userId() } });
+    this.tell({ kind: "start", listening: { namespace, live, identity, version, subscribe_key, origin, tls, token, user: userId() } });
     document.addEventListener("visibilitychange", () => this.tell({ kind: "visible", visible: !document.hidden }));
+  }
+
+  /** Ask cars for their live messages over the page's own connection. */
+  lease(lease: Lease): void {
+    this.tell({ kind: "lease", lease });
   }
 
   private tell(message: ToWorker): void {

@@ -57,9 +57,11 @@ export class Fleet {
     robot.heard(at);
     robot.logFault(stream, this.table, at);
     robot.logLine(stream);
-    const { received_ms, lambda_us, offset_us } = update.hops;
+    const { received_ms = NaN, lambda_us = NaN, offset_us } = update.hops;
     const sent_us = update.hops.sent_us + offset_us;
-    const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, pubnub_us - lambda_us, wall_us - pubnub_us];
+    // A message that came straight from the broker has one leg from the car to here.
+    const last_us = wall_us - (pubnub_us ?? sent_us);
+    const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, (pubnub_us ?? NaN) - lambda_us, last_us];
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 

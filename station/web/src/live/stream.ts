@@ -43,7 +43,7 @@ export class Stream {
   boot = "";
   seq = -1;
   t_us = 0;
-  hops: Hops = { sent_us: 0, received_ms: 0, lambda_us: 0, offset_us: 0, offset_known: false };
+  hops: Hops = { sent_us: 0, received_ms: undefined, lambda_us: undefined, offset_us: 0, offset_known: false };
   sample: ReadonlyMap<string, Value> = new Map();
   /** The newest sample's time on the page's clock, as if it were as fast as the fastest message. */
   takenAt = -Infinity;

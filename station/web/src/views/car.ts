@@ -43,7 +43,7 @@ export class CarView {
   private readonly log: AgentLog;
   private readonly notes: NotesPanel;
   private readonly streams = el("div", { class: "streams" });
-  private readonly waterfall = new Waterfall();
+  private readonly waterfall: Waterfall;
   private readonly faults = new FaultLog();
   private readonly sections = new Map<Stream, StreamSection>();
   private robot: Robot | undefined;
@@ -61,6 +61,7 @@ export class CarView {
     changed: () => void,
   ) {
     this.past = new Past(config);
+    this.waterfall = new Waterfall(config);
     this.log = new AgentLog(config);
     this.notes = new NotesPanel(config);
     this.gauges = GAUGES.map((each) => new Gauge(each));

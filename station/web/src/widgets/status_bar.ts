@@ -1,6 +1,6 @@
 // The bar above and the line below every view: the cars, the connection, the rejected messages.
 
-import type { Config, FieldTable } from "../base/contract";
+import { LIVE, type Config, type FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
 import type { Alarms } from "../live/alarms";
 import type { Viewing } from "../link/viewing";
@@ -23,9 +23,10 @@ export class StatusBar {
     private readonly viewing: Viewing,
     private readonly table: FieldTable,
   ) {
-    write("way", "live over PubNub");
-    write("empty-channel", `${config.namespace}.*`);
-    write("empty-origin", config.origin);
+    const { live, namespace, origin } = config;
+    write("way", `live over ${live === "iot" ? "AWS IoT" : "PubNub"}`);
+    write("empty-channel", live === "iot" ? `${LIVE}/${namespace}/+/+` : `${namespace}.*`);
+    write("empty-origin", live === "iot" ? "AWS IoT" : origin);
   }
 
   linked(state: LinkState): void {

@@ -61,7 +61,8 @@ def findings(
     if not found and robot is not None:
         registry.get(cloud, robot)
     if not found and not as_json:
-        errors.print("nothing was found in this range; `iort analyse` looks now")
+        what = "no drive in this range is analysed" if drives else "nothing was found in this range"
+        errors.print(f"{what}; `iort analyse` looks now")
 
 
 def _show(one: Finding) -> None:
@@ -88,7 +89,8 @@ def _show(one: Finding) -> None:
 
 
 def _interval(estimate: Estimate) -> str:
-    return f"{estimate.value:.4g} {estimate.unit} ({estimate.low:.4g} to {estimate.high:.4g})"
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{estimate.value:.4g}{unit} ({estimate.low:.4g} to {estimate.high:.4g})"
 
 
 def _show_drive(one: AnalysedDrive) -> None:
@@ -101,6 +103,9 @@ def _show_drive(one: AnalysedDrive) -> None:
         rows.add_row(name, _interval(estimate))
     for kind, samples in one.repairs.items():
         rows.add_row(f"repaired: {kind}", f"{samples:,} samples")
+    names_of: dict[str, list[str]] = {}
     for name, reason in one.missing.items():
-        rows.add_row(f"missing: {name}", reason, style="yellow")
+        names_of.setdefault(reason, []).append(name)
+    for reason, names in names_of.items():
+        rows.add_row("missing", f"{', '.join(names)}: {reason}", style="yellow")
     out.print(rows)

@@ -72,6 +72,8 @@ def analyse(
     )
     facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
+    if not done.drives:
+        text += "; a drive begins when the car moves: `iort runs` lists what was recorded"
     tell(facts, f"{text}, drives failed: {failed}" if failed else text, as_json=as_json)
     raise typer.Exit(1 if failed else 0)
 

@@ -1,0 +1,225 @@
+"""`iort drive`: drive a car by the keys of a terminal."""
+
+from __future__ import annotations
+
+import os
+import queue
+import secrets
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import typer
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from iort_contract.cloud import DRIVER
+from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
+from iort_contract.messages.commands import encode_command
+from iort_contract.messages.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, DriveLimits
+from iort_contract.messages.live import decode_live
+from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
+from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
+from iort_station.cli.console import out
+from iort_station.cli.keys import Keys, keys_of
+from iort_station.cli.options import Robot
+from iort_station.cli.words import examples
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError, UsageError
+from iort_station.fleet import registry, stopping
+from iort_station.fleet.broker import Broker
+from iort_station.fleet.commands import operator
+from iort_station.fleet.driving import Driver, Phase
+from iort_station.fleet.roles import Role
+
+commands = typer.Typer()
+_TICK_US = round(1e6 / DRIVE_RATE_HZ)
+_SHOWN_US = 100_000
+_USUAL_MPS = 1.0
+_FASTER = 1.25
+_HELP = "w s a d or arrows: drive   space: stop   + -: top speed   t: take over   e: emergency stop   q: quit"
+
+
+@commands.command("drive", epilog=examples("drive car7", "drive car7 --max-speed 0.5"))
+def drive(
+    context: typer.Context,
+    robot: Robot,
+    max_speed: Annotated[
+        float | None, typer.Option(min=0.01, help="The top speed in m/s; at most the car's own limit.")
+    ] = None,
+    by: Annotated[str | None, typer.Option(help="Who drives, as others see it. Default: the user.")] = None,
+) -> None:
+    """Drive a car by the keys of this terminal, until q.
+
+    The car moves while a key is held: by w a s d or the arrows. It stops when the key's repetitions stop, and
+    when round trip or newest sample are too old. It needs the right to drive (docs/how-to/drive.md).
+    """
+    if not (sys.stdin.isatty() and out.is_terminal):
+        raise UsageError("it needs a terminal with a keyboard")
+    cloud = context.obj.cloud()
+    limits = _limits(cloud, robot)
+    top_mps = min(max_speed or _USUAL_MPS, limits.max_speed_mps)
+    seat = _Seat(cloud, robot, Driver(limits, by or operator(), top_mps))
+    with seat.broker, _raw_keys(), Live(console=out, auto_refresh=False, transient=True) as live:
+        try:
+            seat.run(live)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            seat.leave()
+
+
+def _limits(cloud: Cloud, robot: str) -> DriveLimits:
+    registry.get(cloud, robot)
+    found = stopping.motion(cloud, [robot])[robot]
+    if found.drive is None:
+        raise StationError(
+            f"{robot} cannot be driven: its car.yaml has no downlink.drive, or it has not run since"
+        )
+    if found.asked:
+        raise StationError(f"{robot} is stopped: `iort stop {robot} --release` lets it move again")
+    return found.drive
+
+
+class _Seat:
+    """One driver, one car, and the broker between them."""
+
+    def __init__(self, cloud: Cloud, robot: str, driver: Driver) -> None:
+        self._cloud, self._robot, self._driver = cloud, robot, driver
+        self._keys = Keys()
+        self._heard: queue.SimpleQueue[tuple[str, bytes, int]] = queue.SimpleQueue()
+        self._topic = build_topic(CMD, robot, driver.limits.command, cloud.namespace)
+        self._lease = encode_lease(Lease(secrets.token_hex(8), LIVE_MAX_RATE_HZ, VIEW_LEASE_MS, broker=True))
+        self._viewed_us = -int(VIEW_RENEW_S * 1e6)
+        self.broker = Broker(
+            cloud,
+            Role(cloud, DRIVER),
+            filters=[f"{LIVE}/{cloud.namespace}/{robot}/+"],
+            on_message=lambda topic, message: self._heard.put((topic, message, _now_us())),
+        )
+
+    def run(self, live: Live) -> None:
+        """Drive until the driver quits."""
+        due_us = shown_us = _now_us()
+        while self._take_keys(max(0, due_us - _now_us()) / 1e6):
+            now_us = _now_us()
+            if now_us < due_us:
+                continue
+            # After a pause of this process, what was due is not made up for.
+            due_us = max(due_us + _TICK_US, now_us)
+            self._tick(now_us)
+            if now_us >= shown_us:
+                shown_us = now_us + _SHOWN_US
+                live.update(self._shown(now_us), refresh=True)
+
+    def leave(self) -> None:
+        """Have the car stop."""
+        self._keys.let_go()
+        self._driver.hold(held=False, now_us=_now_us())
+        while (command := self._driver.tick(_now_us())) is not None:
+            self.broker.publish(self._topic, encode_command(command))
+            time.sleep(_TICK_US / 1e6)
+
+    def _take_keys(self, wait_s: float) -> bool:
+        """Wait for keys, and take them; False to quit."""
+        readable, _, _ = select.select([sys.stdin], [], [], wait_s)
+        text = os.read(sys.stdin.fileno(), 1024).decode(errors="replace") if readable else ""
+        if readable and not text:
+            return False  # the terminal has closed
+        for key in keys_of(text):
+            if key == "q":
+                return False
+            self._press(key, _now_us())
+        return True
+
+    def _press(self, key: str, now_us: int) -> None:
+        driver = self._driver
+        if self._keys.press(key, now_us):
+            return
+        if key == " ":
+            self._keys.let_go()
+        elif key in "+=":
+            driver.top_mps = min(driver.top_mps * _FASTER, driver.limits.max_speed_mps)
+        elif key == "-":
+            driver.top_mps /= _FASTER
+        elif key == "t":
+            driver.takeover = not driver.takeover
+        elif key == "e":
+            self._keys.let_go()
+            stopping.stop(self._cloud, [self._robot], stopped=True)
+
+    def _tick(self, now_us: int) -> None:
+        while not self._heard.empty():
+            self._take(*self._heard.get())
+        if now_us - self._viewed_us >= VIEW_RENEW_S * 1e6:
+            self._viewed_us = now_us
+            self.broker.publish(lease_topic(self._robot, self._cloud.namespace), self._lease)
+        driver = self._driver
+        driver.hold(held=self._keys.held(now_us), now_us=now_us)
+        driver.stick = self._keys.stick(now_us)
+        command = driver.tick(now_us)
+        if command is not None:
+            self.broker.publish(self._topic, encode_command(command))
+
+    def _take(self, topic: str, message: bytes, now_us: int) -> None:
+        try:
+            self._driver.hear(parse_topic(topic).name, decode_live(message), now_us)
+        except ContractError:
+            return  # the rules quarantine it
+
+    def _shown(self, now_us: int) -> Table:
+        driver = self._driver
+        rows = Table(box=None, show_header=False, pad_edge=False)
+        rows.add_column(style="dim")
+        rows.add_column()
+        stick = driver.stick if driver.phase is Phase.DRIVING else None
+        speed = f"{stick.speed * driver.top_mps:+.2f}" if stick else "0"
+        steering = f"{stick.steering * driver.limits.max_steering_rad:+.2f}" if stick else "0"
+        rows.add_row(self._robot, _state(driver))
+        rows.add_row(
+            "speed",
+            f"{speed} m/s of {driver.top_mps:.2f}; the car's limit is {driver.limits.max_speed_mps:g}",
+        )
+        rows.add_row("steering", f"{steering} rad")
+        rows.add_row("round trip", _ms(driver.rtt_us, DRIVE_MAX_RTT_MS))
+        rows.add_row("newest sample", _ms(driver.age_us(now_us), DRIVE_MAX_AGE_MS))
+        rows.add_row("", Text(_HELP, style="dim"))
+        return rows
+
+
+def _state(driver: Driver) -> Text:
+    if driver.phase is Phase.OVER:
+        return Text(f"let go: {driver.reason}", style="red")
+    if driver.phase is Phase.DRIVING:
+        return Text("you drive", style="bold green")
+    if driver.phase is Phase.STARTING:
+        return Text("waiting for the car", style="yellow")
+    text = f"{driver.driver} drives" if driver.driver and not driver.mine else "hold a key to drive"
+    return Text(f"{text}; the next hold takes over" if driver.takeover else text)
+
+
+def _ms(us: int | None, most: int) -> Text:
+    if us is None:
+        return Text("-")
+    return Text(f"{us / 1000:.0f} ms", style="red" if us > most * 1000 else "")
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000
+
+
+@contextmanager
+def _raw_keys() -> Iterator[None]:
+    """Give each key at once, without showing it."""
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

@@ -1,0 +1,174 @@
+"""A driver's hold: when the car may move, and what ends it; and the keys of a terminal as a stick."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from iort_contract.messages.commands import Command, decode_command, encode_command
+from iort_contract.messages.driving import DriveLimits
+from iort_contract.messages.live import LiveSample
+from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
+from iort_station.fleet.driving import Driver, Phase, Stick
+
+LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
+CLOUD_US = 1_700_000_000_000_000
+TICK_US = 50_000
+SENT = LiveSample("0badcafe", 0, 0, 0, {}, offset_us=0)
+
+
+class Rig:
+    """A driver and a car that is ``way_us`` away. This computer's clock is CLOUD_US behind the cloud's."""
+
+    def __init__(self, *, way_us: int = 20_000) -> None:
+        self.now_us, self.way_us = 0, way_us
+        self.driver = Driver(LIMITS, "anna", top_mps=1.0)
+        self.sent: list[Command] = []
+        self.left_us: list[int] = []
+        self.answers = True
+
+    def hear(self, stream: str = "vesc", age_us: int = 0, **sample: Any) -> None:
+        """A sample that the car took and sent so long ago as its way takes."""
+        taken_us = CLOUD_US + self.now_us - self.way_us - age_us
+        self.driver.hear(stream, replace(SENT, t_us=taken_us, sent_us=taken_us, sample=sample), self.now_us)
+
+    def answer(self, command: Command, outcome: str = "accepted", **changes: Any) -> None:
+        mine = {"session": command.session, "seq": command.seq, "outcome": outcome, "lease_left_ms": 400}
+        drives = {"driver": command.session, "driver_by": "anna"} if outcome == "accepted" else {}
+        self.hear("drive", **{**mine, **drives, **changes})
+
+    def step(self, ticks: int = 1) -> None:
+        """Let time pass; the car answers what has had its way there and back."""
+        for _ in range(ticks):
+            self.now_us += TICK_US
+            self.hear()
+            due = [i for i, left_us in enumerate(self.left_us) if left_us + 2 * self.way_us <= self.now_us]
+            if due and self.answers:
+                self.answer(self.sent[due[-1]])
+            command = self.driver.tick(self.now_us)
+            if command is not None:
+                self.sent.append(decode_command(encode_command(command)))
+                self.left_us.append(self.now_us)
+
+    def begin(self) -> None:
+        self.step()
+        self.driver.stick = Stick(1.0, -1.0)
+        self.driver.hold(held=True, now_us=self.now_us)
+        self.step(20)
+
+
+def speeds(rig: Rig) -> list[float]:
+    return [command.message["drive"]["speed"] for command in rig.sent]
+
+
+def test_a_hold_begins_at_a_standstill_and_drives_within_both_limits_once_the_car_answers() -> None:
+    rig = Rig()
+    rig.begin()
+    assert rig.driver.phase is Phase.DRIVING
+    assert speeds(rig)[0] == 0
+    assert rig.sent[-1].message == {"drive": {"speed": 1.0, "steering_angle": -0.4}}
+    assert {(one.by, one.lease_ms, one.takeover) for one in rig.sent} == {("anna", 500, False)}
+    assert len({one.session for one in rig.sent}) == 1
+    assert rig.driver.rtt_us == pytest.approx(2 * rig.way_us, abs=TICK_US)
+    by_the_cloud_us = CLOUD_US + rig.now_us
+    assert rig.sent[-1].sent_us == pytest.approx(by_the_cloud_us, abs=rig.way_us)
+
+
+def test_letting_go_stops_the_car_and_the_next_hold_is_another_session() -> None:
+    rig = Rig()
+    rig.begin()
+    first = rig.sent[-1].session
+    rig.driver.hold(held=False, now_us=rig.now_us)
+    rig.step(10)
+    assert speeds(rig)[-4:] == [1.0, 0, 0, 0]
+    rig.driver.hold(held=True, now_us=rig.now_us)
+    rig.step(5)
+    assert rig.sent[-1].session != first
+
+
+@pytest.mark.parametrize(
+    ("outcome", "changes", "reason"),
+    [
+        ("driven_by_another", {"driver": "bbbbbbbb", "driver_by": "bert"}, "bert drives this car"),
+        ("emergency_stop", {}, "stopped until somebody releases it"),
+        ("no_ros", {}, "not in the ROS graph"),
+    ],
+)
+def test_a_refusal_ends_the_hold_until_the_driver_lets_go(outcome: str, changes: Any, reason: str) -> None:
+    rig = Rig()
+    rig.begin()
+    rig.answer(rig.sent[-1], outcome, **changes)
+    assert rig.driver.phase is Phase.OVER
+    assert reason in rig.driver.reason
+    rig.step(20)
+    assert speeds(rig)[-3:] == [0, 0, 0]
+    count = len(rig.sent)
+    rig.step(20)
+    assert len(rig.sent) == count, "still held, and nothing goes out"
+
+
+def test_another_who_takes_over_ends_the_hold_and_is_named() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.hear("drive", session="bbbbbbbb", seq=0, outcome="accepted", driver="bbbbbbbb", driver_by="bert",
+             lease_left_ms=400)  # fmt: skip
+    assert (rig.driver.phase, rig.driver.reason) == (Phase.OVER, "bert has taken over")
+    rig.driver.hold(held=False, now_us=rig.now_us)
+    rig.driver.takeover = True
+    rig.driver.hold(held=True, now_us=rig.now_us)
+    rig.answers = False
+    rig.step(2)
+    assert rig.sent[-1].takeover
+
+
+def test_a_car_that_no_longer_answers_is_not_driven_on() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.answers = False
+    rig.step(20)
+    assert rig.driver.phase is Phase.OVER
+    assert "500 ms are allowed" in rig.driver.reason
+
+
+def test_old_samples_and_a_long_round_trip_are_refused() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.driver.hold(held=False, now_us=rig.now_us)
+    rig.now_us += 1_200_000
+    rig.driver.hold(held=True, now_us=rig.now_us)
+    assert (rig.driver.phase, rig.sent[-1].message["drive"]["speed"]) == (Phase.OVER, 1.0)
+    assert "1000 ms are allowed" in rig.driver.reason
+    far = Rig(way_us=300_000)
+    far.begin()
+    assert far.driver.phase is Phase.OVER
+    assert set(speeds(far)) == {0}
+
+
+def test_a_terminals_arrows_and_letters_are_keys() -> None:
+    assert keys_of("wW\x1b[A\x1bOD \x1b[C\x1b") == ["w", "w", "up", "left", " ", "right", "\x1b"]
+
+
+def test_a_key_holds_the_stick_until_its_repetitions_fail_to_come() -> None:
+    keys = Keys()
+    assert keys.press("w", 0)
+    assert keys.stick(FIRST_US - 1) == Stick(1.0, 0.0)
+    for now_us in range(500_000, 1_000_000, 30_000):
+        assert keys.press("w", now_us)
+    assert keys.held(now_us + NEXT_US - 1)
+    assert not keys.held(now_us + NEXT_US)
+    assert keys.stick(now_us + NEXT_US) == Stick()
+
+
+def test_the_speed_stays_while_another_key_steers() -> None:
+    keys = Keys()
+    keys.press("w", 0)
+    for now_us in range(100_000, 1_000_000, 50_000):
+        keys.press("a", now_us)
+    assert keys.stick(now_us) == Stick(1.0, 1.0)
+    keys.press("w", now_us + 100_000)
+    assert keys.stick(now_us + NEXT_US) == Stick(1.0, 0.0)
+    keys.let_go()
+    assert keys.stick(now_us + NEXT_US) == Stick()
+    assert not keys.press("x", now_us)

@@ -1,0 +1,43 @@
+"""`iort findings`, on analysed drives."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_station.cli.cloud_options import CloudOptions
+from iort_station.cli.main import app
+from iort_station.data.analysis import findings
+from iort_station.fleet import registry
+
+TOO_SHORT = "the drive must last 240 s"
+
+
+@pytest.fixture
+def iort(monkeypatch):
+    def run(drives):
+        monkeypatch.setattr(CloudOptions, "cloud", lambda _self: None)
+        monkeypatch.setattr(registry, "get", lambda *_given: {})
+        monkeypatch.setattr(findings, "drives", lambda *_given, most: drives[:most])
+        done = CliRunner().invoke(app, ["findings", "car7", "--drives"], env={"COLUMNS": "120"})
+        assert done.exit_code == 0, done.output
+        return [" ".join(line.split()) for line in done.output.splitlines()]
+
+    return run
+
+
+def test_a_reason_that_many_share_is_said_once_and_a_share_has_no_unit(iort):
+    missing = {"temperature_drift_k": TOO_SHORT, "vesc": "no motor controller", "controller_lag_s": TOO_SHORT}
+    shares = {"style_standing_share": Estimate(0.14, 0.07, 0.26, "1")}
+    key = DriveKey("car7", 0, "0badcafe")
+
+    said = iort([AnalysedDrive(key, 60_000_000, "job", 3000, shares, missing, {})])
+
+    assert "style_standing_share 0.14 (0.07 to 0.26)" in said
+    assert f"missing temperature_drift_k, controller_lag_s: {TOO_SHORT}" in said
+
+
+def test_a_range_without_an_analysed_drive_says_so(iort):
+    assert "no drive in this range is analysed; `iort analyse` looks now" in iort([])
