@@ -103,7 +103,11 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
     robot, count = f"bench-{rate_hz}", rate_hz * (seconds + _WARM_UP_S)
     with tempfile.TemporaryDirectory() as name, RosGraph(python, Path(name)) as graph:
         topics = {live_lane.TOPIC: {"stream": VESC_STREAM, "time": "header"}}
-        settings = {"sources": [{"type": "ros1", "topics": topics}], "queue": {"path": "spool.db"}}
+        settings = {
+            "sources": [{"type": "ros1", "topics": topics}],
+            "queue": {"path": "spool.db"},
+            "live": {"when": "always"},
+        }
         bundle = robots.add(cloud, robot, out=Path(name), settings=settings)
         agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
         floor = graph.start("bench.floors.ros_floor", live_lane.TOPIC)

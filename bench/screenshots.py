@@ -154,7 +154,7 @@ def _scrub(page: Any) -> None:
 def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
     """Run the real agent and the other cars until the block ends."""
     source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3, "faults": [_FAULT]}
-    settings = {"sources": [source], "ping": {"rate_hz": 2}}
+    settings = {"sources": [source], "ping": {"rate_hz": 2}, "live": {"when": "always"}}
     bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
     pubnub = cloud.keys
     publisher = Publisher(

@@ -5,13 +5,13 @@ The findings go to the bucket, for `present`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.analysis.failures import failed_plans
+from functions.shared.analysis.failures import failed_plans, failure
 from functions.shared.analysis.kept import Kept
 from functions.shared.analysis.recordings import robots_of
 from functions.shared.environment import variables
@@ -23,11 +23,12 @@ from iort_contract.catalog.environments import EvaluateEnvironment
 from iort_contract.cloud import drive_prefix, findings_key, plan_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import DriveKey, Finding, encode_finding
-from iort_contract.messages.analysis.run import AnalysedDrive, decode_planned
+from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned, encode_planned
 
 # The newest drives of a robot before those of the run, and of each other robot up to its end, with which a
 # drive is compared.
 _OWN, _OTHERS = 300, 20
+_NO_ANSWER = {"Cause": "they ended without an answer"}
 
 
 class Drives:
@@ -36,10 +37,11 @@ class Drives:
     def __init__(self, table: FindingsTable, kept: Kept, robots: Sequence[str], end_us: int) -> None:
         self._table, self._kept, self._robots, self._end_us = table, kept, robots, end_us
         self._newest = cache(self._read)
+        self._plan = cache(self._read_plan)
 
     def of_run(self, job: str, robot: str) -> list[DriveResult]:
         """The results that a run of the analysis has made of a robot's drives."""
-        plan = [decode_planned(one) for one in self._kept.json(plan_key(job, robot)) or ()]
+        plan = self._plan(job, robot)
         if not plan:
             return []
         first_us = min(one.drive.start_us for one in plan)
@@ -52,14 +54,14 @@ class Drives:
 
     def made_good(self, job: str, robot: str, start_us: int, *, again: bool) -> list[DriveKey]:
         """What stands for the robot's failed plans whose range this run has planned."""
-        if self._kept.json(plan_key(job, robot)) is None:
+        if self._plan(job, robot) is None:
             return []
         return [one.drive for one in failed_plans(self._table, robot, start_us, self._end_us, again=again)]
 
     def replaced(self, job: str, robot: str, results: Sequence[DriveResult]) -> list[DriveKey]:
         """Drives of earlier runs of the analysis that are parts of ``results``: batches that came late move a
         drive's start, or join two drives."""
-        planned = {decode_planned(one).drive for one in self._kept.json(plan_key(job, robot)) or ()}
+        planned = {one.drive for one in self._plan(job, robot) or ()}
         first_us = max(0, min(one.drive.start_us for one in results) - 2 * LONGEST_US)
         last_us = max(one.end_us for one in results)
         before = {one.drive: one.end_us for one in self._table.drives(robot, first_us, last_us + 1)}
@@ -75,6 +77,17 @@ class Drives:
             )
         ]
 
+    def lost(
+        self, job: str, robot: str, made: Collection[DriveKey]
+    ) -> Iterator[tuple[DriveKey, list[Finding]]]:
+        """The planned drives that are neither among those ``made`` nor have failed with a finding, which then
+        could not be written; with the findings that they get."""
+        for one in self._plan(job, robot) or ():
+            if one.drive not in made:
+                found = self._table.of_drive(one.drive)
+                if ANALYSIS_FAILED not in {finding.kind for finding in found}:
+                    yield one.drive, [*found, failure(encode_planned(one), _NO_ANSWER)]
+
     def history(
         self, robot: str, results: Sequence[DriveResult], replaced: Collection[DriveKey]
     ) -> list[Measured]:
@@ -87,6 +100,11 @@ class Drives:
     def fleet(self, robot: str) -> list[Measured]:
         """The newest drives of the other robots."""
         return [one for other in self._robots if other != robot for one in self._newest(other)]
+
+    def _read_plan(self, job: str, robot: str) -> list[PlannedDrive] | None:
+        """The drives of a robot in a run; None if they could not be found."""
+        content = self._kept.json(plan_key(job, robot))
+        return None if content is None else [decode_planned(one) for one in content]
 
     def _read(self, robot: str) -> tuple[Measured, ...]:
         return tuple(_measured(one) for one in self._table.drives(robot, end_us=self._end_us, most=_OTHERS))
@@ -122,7 +140,7 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
         found, replaced = evaluated(drives, job, robot)
         made += [
             {"drive": vars(drive), "findings": [encode_finding(one) for one in some]}
-            for drive, some in found.items()
+            for drive, some in chain(found.items(), drives.lost(job, robot, found.keys()))
         ]
         gone += [vars(drive) for drive in replaced]
         gone += [

@@ -5,23 +5,21 @@ The state machine also calls it for a drive that could not be analysed, which be
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 from functions.shared import clients
+from functions.shared.analysis.failures import failure
 from functions.shared.analysis.kept import Kept
 from functions.shared.environment import variables
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS, SERIOUS
+from iort_contract.catalog.analysis.kinds import KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.cloud import drive_prefix, findings_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding, decode_finding
+from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]
-_MOST_REASON = 500
 
 
 def present(
@@ -74,33 +72,6 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
     return f"{drive.robot}: {kind.meaning}", "\n".join(lines) + "\n"
 
 
-def failure(event: Mapping[str, Any]) -> Finding:
-    """The finding about a drive that could not be analysed, or a robot whose drives could not be found."""
-    about = event["failed"]
-    drive = DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN))
-    what = "the drive could not be analysed" if "run" in about else "the drives could not be found"
-    return Finding(
-        drive=drive,
-        kind=ANALYSIS_FAILED,
-        severity=KINDS[ANALYSIS_FAILED].severity,
-        subject=ANALYSIS_FAILED,
-        from_us=about["start_us"],
-        to_us=about["end_us"],
-        stream=about.get("motion", ""),
-        fields=(),
-        text=f"{what} in three attempts: {reason(event['error'])}",
-    )
-
-
-def reason(error: Mapping[str, str]) -> str:
-    """What a failed state says: the function's own error, if it had time for one."""
-    cause = error.get("Cause", "")
-    with suppress(ValueError, TypeError, KeyError):
-        failed = json.loads(cause)
-        cause = f"{failed['errorType']}: {failed['errorMessage']}"
-    return f"{cause or error.get('Error', 'unknown')}"[:_MOST_REASON]
-
-
 def _notify(subject: str, text: str) -> None:
     # "Publish", SNS API: a subject is up to 100 ASCII characters.
     topic = variables(PresentEnvironment).alarm_topic
@@ -112,8 +83,7 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:
     given = variables(PresentEnvironment)
     table = FindingsTable(clients.dynamodb(), given.findings_table)
     if "failed" in event:
-        found = failure(event)
-        table.put_finding(found)
+        table.put_finding(failure(event["failed"], event["error"]))
         return {"findings": 1, "mails": 0}
     kept = Kept(clients.s3(), given.files_bucket)
     content = kept.json(findings_key(event["job"]))

@@ -27,6 +27,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
+from iort_station.fleet.viewing import Viewer
 from iort_station.operations import delivery
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
@@ -60,6 +61,7 @@ DOWNLINK = {
 }
 _CATCH_UP_S = 30.0
 _STATUS_S = 1.0
+_LOOK_S = 1.0
 
 
 def main() -> None:
@@ -161,7 +163,9 @@ class _Demo:
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
-        with _agent(embedded, bundle, "--report", str(report)) as agent:
+        # The figures are of a car that somebody looks at from its start.
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S)
+        with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
             began = time.monotonic()
             with self._console.status("starting the agent") as status:
                 while self._running(agent):

@@ -101,6 +101,8 @@ class Mosquitto:
             "root_ca": str(self.ca),
             "sources": [{"type": "ros1", "topics": {name: dict(one) for name, one in topics.items()}}],
             "queue": {"path": "spool.db"},
+            # Nobody holds a lease here.
+            "live": {"when": "always"},
         }
         config = self._folder / "car.yaml"
         config.write_text(yaml.safe_dump(settings))

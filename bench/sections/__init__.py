@@ -17,6 +17,7 @@ from bench.sections import (
     round_trips,
     scale,
     utilisation,
+    viewing,
 )
 from bench.target import Say, Target
 
@@ -25,6 +26,7 @@ Run = Callable[[Target, Say], Section]
 SECTIONS: dict[str, Run] = {
     "round_trips": round_trips.run,
     "dashboard": dashboard.run,
+    "viewing": viewing.run,
     "utilisation": utilisation.run,
     "query": query.run,
     "command": command.run,

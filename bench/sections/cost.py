@@ -37,7 +37,7 @@ def run(target: Target, say: Say) -> Section:
     thesis = line_items.total(model.thesis_bill(usage))
     rates = (10.0, 5.0, 2.0, 1.0, 0.0)
     # The thesis archives and analyses nothing, so neither counts here.
-    alike = replace(usage, archive_days=0, drive_minutes=0.0)
+    alike = replace(usage, archive_days=0, drive_minutes=0.0, watched_hours=None)
     ours = {rate: line_items.total(model.bill(replace(alike, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
     for what, rate in (

@@ -60,6 +60,7 @@ def run(target: Target, say: Say) -> Section:
         ROBOT,
         sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
         metrics={"every_s": 1},
+        live={"when": "always"},
         ping={"rate_hz": 1},
     )
     pubnub = keys.load(target.cloud)

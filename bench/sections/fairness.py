@@ -66,6 +66,7 @@ def run(target: Target, say: Say) -> Section:
         "bench-fair",
         sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
         metrics={"every_s": 1},
+        live={"when": "always"},
     )
     other = target.robot("bench-hostile")
     topic = build_topic(LIVE, other.robot, VESC_STREAM, target.cloud.namespace)

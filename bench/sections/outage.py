@@ -56,7 +56,7 @@ def run(target: Target, say: Say) -> Section:
     section = Section("outage", "Outage: no broker for 60 s at 50 Hz")
     seconds = BEFORE_S + CUT_S + AFTER_S
     source = {"type": "sim", "rate_hz": RATE_HZ, "duration_s": seconds, "pose": {"rate_hz": 0}}
-    bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
+    bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"}, live={"when": "always"})
     with (
         _way(target, bundle) as (cut, mend),
         target.listener(bundle.robot) as listener,

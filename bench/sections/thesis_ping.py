@@ -60,7 +60,7 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
 def _to_subscriber(target: Target, port: int) -> list[float]:
     """Return the delays in ms from the sample in a driving car to the subscriber, by one clock."""
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}
-    bundle = target.robot("bench-far", port=port, sources=[source])
+    bundle = target.robot("bench-far", port=port, sources=[source], live={"when": "always"})
     pubnub = keys.load(target.cloud).reading()
     host, _, its_port = pubnub.pop("origin").partition(":")
     delays_ms: list[float] = []

@@ -16,7 +16,7 @@ from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
 from iort_agent.lanes.attachment import make_attachments
 from iort_agent.lanes.clock_offset import OffsetEstimator
-from iort_agent.lanes.config import IOT, RuntimeSettings
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import RecordLane
@@ -30,6 +30,7 @@ from iort_agent.spool.interface import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
 from iort_contract.catalog.streams import DRIVE_STREAM
+from iort_contract.cloud import IOT
 from iort_contract.limits import Value
 
 

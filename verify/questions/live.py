@@ -14,10 +14,12 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, decode_lease, lease_topic
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import live_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
+from iort_station.fleet import viewing
 from iort_station.page import keys
 from verify.errors import CannotAskError
 from verify.question import Seen, question
@@ -109,4 +111,27 @@ def to_subscriber(target: Target) -> Seen:
         ),
         "note_heard": [one.seq for one in heard],
         "note_delay_ms": [round(one.delay_ms) for one in heard],
+    }
+
+
+@question(
+    "live.lease",
+    expected={"subscribed": "GRANTED_QOS_1", "heard": True, "to_another": "NOT_AUTHORIZED"},
+    relied_on_by=("device/iort_agent/lanes/viewers.py", "stacks/parts/documents.py"),
+)
+def lease(target: Target) -> Seen:
+    """A viewer's lease, published by the operator's HTTP request, reaches the robot, whose policy allows its
+    topic by the pattern ???w*; a robot may not publish another's."""
+    robot, other = target.robot("verify-looked-at"), target.name("verify-looks")
+    asked = Lease("0badcafe", 10, VIEW_LEASE_MS)
+    topic = lease_topic(robot.robot, target.cloud.namespace)
+    with Robot(robot.folder) as car:
+        subscribed = car.online().subscribe(topic)
+        viewing.view(target.cloud, [robot.robot], asked)
+        heard_on, payload = car.next_message()
+        to_another = car.attempt(lease_topic(other, target.cloud.namespace), payload)
+    return {
+        "subscribed": subscribed,
+        "heard": heard_on == topic and decode_lease(payload) == asked,
+        "to_another": to_another,
     }

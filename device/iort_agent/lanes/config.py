@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, Mapping
 
 from iort_agent.common.schema import allowed, choice, items, number, setting
+from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.settings import ALWAYS, FIELDS, SETTINGS
+from iort_contract.messages.settings import FIELDS, SETTINGS, WATCHED
 from iort_contract.topics import PING_PATHS
-
-# How live messages reach their viewers.
-PUBNUB, IOT = "pubnub", "iot"
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ class LiveConfig:
 
     enabled: bool = setting(allowed(SETTINGS["live.enabled"]), default=True)
     rate_hz: float = setting(allowed(SETTINGS["live.rate_hz"]), LIVE_MAX_RATE_HZ)
-    when: str = setting(allowed(SETTINGS["live.when"]), default=ALWAYS)
+    when: str = setting(allowed(SETTINGS["live.when"]), default=WATCHED)
     transport: str = setting(choice(PUBNUB, IOT), PUBNUB)
 
 
@@ -59,7 +57,7 @@ class RuntimeSettings:
     live_rate_hz: float
     ping_rate_hz: float
     log_level: str
-    live_when: str = ALWAYS
+    live_when: str = WATCHED
     motion_stopped: bool = False
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 

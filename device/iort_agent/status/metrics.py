@@ -27,7 +27,7 @@ class MetricsConfig:
     """The agent's own figures: one sample of the stream ``agent`` every ``every_s``."""
 
     enabled: bool = setting(flag(), default=True)
-    every_s: float = setting(number(1, 3600, unit="s"), 10.0)
+    every_s: float = setting(number(1, 3600, unit="s"), 60.0)
 
 
 class Rates:

@@ -1,12 +1,19 @@
-"""Plans that failed: ranges of a robot whose drives could not be found."""
+"""Findings about what failed: a drive, or the plan of a robot's range."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import NO_RUN, Finding
+from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding
 
 # A night plans what failed in the nights before it, up to a week.
 _PLANNED_AGAIN_US = 7 * 86_400 * 1_000_000
+_MOST_REASON = 500
 
 
 def failed_plans(
@@ -20,3 +27,29 @@ def failed_plans(
     from_us = start_us if again else max(0, start_us - _PLANNED_AGAIN_US)
     found = table.findings(robot, from_us, end_us)
     return [one for one in found if one.drive.run == NO_RUN and one.to_us <= end_us]
+
+
+def failure(about: Mapping[str, Any], error: Mapping[str, str]) -> Finding:
+    """The finding about a drive that could not be analysed, or a robot whose drives could not be found."""
+    drive = DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN))
+    what = "the drive could not be analysed" if "run" in about else "the drives could not be found"
+    return Finding(
+        drive=drive,
+        kind=ANALYSIS_FAILED,
+        severity=KINDS[ANALYSIS_FAILED].severity,
+        subject=ANALYSIS_FAILED,
+        from_us=about["start_us"],
+        to_us=about["end_us"],
+        stream=about.get("motion", ""),
+        fields=(),
+        text=f"{what} in three attempts: {_reason(error)}",
+    )
+
+
+def _reason(error: Mapping[str, str]) -> str:
+    """What a failed state says: the function's own error, if it had time for one."""
+    cause = error.get("Cause", "")
+    with suppress(ValueError, TypeError, KeyError):
+        failed = json.loads(cause)
+        cause = f"{failed['errorType']}: {failed['errorMessage']}"
+    return f"{cause or error.get('Error', 'unknown')}"[:_MOST_REASON]

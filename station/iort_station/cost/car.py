@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from iort_station.cost.usage import Usage
+from iort_contract.messages.settings import ALWAYS, WATCHED
+from iort_station.cost.usage import TRANSPORTS, Usage
 from iort_station.errors import StationError
 
 # Sources that take samples at a rate of their own, with its default; a test compares them with the agent's.
@@ -29,11 +30,15 @@ def as_configured(usage: Usage, file: Path) -> Usage:
     rates = [rate for source in car.items("sources") for rate in _rates_hz(source)]
     live, metrics = car.section("live"), car.section("metrics")
     live_hz = live.number("rate_hz", usage.live_hz)
+    when = live.choice("when", (WATCHED, ALWAYS), WATCHED)
+    transport = live.choice("transport", TRANSPORTS, usage.live_transport)
     return replace(
         usage,
         # The limit applies to each stream, which sends at most what its source delivers.
         live_hz=sum(min(live_hz, rate_hz or math.inf) for rate_hz in rates) if live.enabled() else 0.0,
         batch_s=car.section("record").number("batch_s", usage.batch_s),
+        watched_hours=None if when == ALWAYS else usage.watched_hours,
+        live_transport=transport if when == ALWAYS else usage.live_transport,
         ping_hz=car.section("ping").number("rate_hz", usage.ping_hz),
         agent_every_s=metrics.number("every_s", usage.agent_every_s) if metrics.enabled() else 0.0,
         streams=len(rates),
@@ -76,6 +81,12 @@ class _Section:
         if isinstance(found, bool) or not isinstance(found, (int, float)) or not 0 <= found < math.inf:
             raise self._error(key, "a number of at least 0", found)
         return float(found)
+
+    def choice(self, key: str, allowed: Sequence[str], default: str) -> str:
+        found = self.values.get(key, default)
+        if found not in allowed:
+            raise self._error(key, f"one of {', '.join(allowed)}", found)
+        return str(found)
 
     def enabled(self) -> bool:
         found = self.values.get("enabled", True)

@@ -11,6 +11,7 @@ from math import ceil
 from typing import Any
 
 from iort_contract.catalog.questions import QUESTIONS
+from iort_contract.cloud import IOT, PUBNUB
 from iort_station.cost import analysing, archiving
 from iort_station.cost.line_items import (
     METER,
@@ -40,9 +41,10 @@ _THESIS_POLLS_PER_S, _THESIS_RECORDS_A_CALL = 4.0, 100
 _GATHER_S, _MOST_VALUES, _LIVE_LINE, _LIVE_VALUES = 10.0, 100.0, 480, 24
 # Lambda 2 logs one line about itself, and one about each stream of its event.
 _SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 310, 300, 220, 230
-# A robot subscribes, with one filter a packet, to four answers of its shadow, three of its pings, and
-# commands. Then it fetches its shadow of less than 1 KB: a request, and an answer that it acknowledges.
-SUBSCRIPTIONS = 8
+# A robot subscribes, with one filter a packet, to four answers of its shadow, three of its pings, its
+# viewers and commands. Then it fetches its shadow of less than 1 KB: a request, and an answer that it
+# acknowledges.
+SUBSCRIPTIONS = 9
 _SHADOW_MESSAGES = 3
 # `iort send` publishes, the robot receives and acknowledges.
 _COMMAND_MESSAGES = 3
@@ -67,15 +69,24 @@ def _bill(usage: Usage) -> list[LineItem]:
     items = _connecting(usage)
     items += rules("record", batches, sizes.record)
     items += rules("agent, rtt", own, own_item)
-    live = usage.live_hz * hour
-    items += rules("live", live, sizes.live)
+    live = usage.live_per_s * hour
+    by_pubnub = live if usage.live_transport == PUBNUB else 0.0
+    items += rules("live", by_pubnub, sizes.live)
     # Some pass the broker, which evaluates two more rules for each.
     passing = usage.live_at_broker_per_s * hour * units(sizes.live, METER)
+    leases = usage.leases_per_s * hour
     items += [
+        LineItem("IoT Core", "live", "leases, sent and received", "message", 2 * leases),
         LineItem("IoT Core", "live", "messages", "message", passing),
         LineItem("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
         LineItem("IoT Core", "live", "their actions, at least one billed", "action", 2 * passing),
     ]
+    if usage.live_transport == IOT:
+        looking = usage.watched * usage.viewers
+        items += [
+            LineItem("IoT Core", "live", "received by viewers", "message", passing * usage.viewers),
+            LineItem("IoT Core", "live", "viewers' minutes", "connection", 60 * looking / usage.robots),
+        ]
     clock = usage.clock_pings_per_s * hour
     commands = usage.command_hz * hour
     items += [
@@ -129,10 +140,10 @@ def _bill(usage: Usage) -> list[LineItem]:
     items += function(
         "live",
         "Lambda 1",
-        live,
+        by_pubnub,
         memory_mb=usage.live_memory_mb,
         billed_ms=usage.live_ms,
-        logged=_live_lines_per_s(usage) * hour / usage.robots * _LIVE_LINE + live * _LIVE_VALUES,
+        logged=_live_lines_per_s(usage) * hour / usage.robots * _LIVE_LINE + by_pubnub * _LIVE_VALUES,
         all_lines=all_lines,
     )
     return [*items, *archiving.items(usage), *analysing.items(usage)]
@@ -178,7 +189,8 @@ def pubnub_bill(
     """PubNub's line items for a robot-hour on its plan by transactions."""
     usage.check()
     size = sizes_of(usage.rate_hz, usage.batch_s).update
-    messages = (usage.samples_per_s if thesis else usage.live_hz) * 3600 * units(size, PUBNUB_UNIT)
+    by_pubnub = usage.live_per_s if usage.live_transport == PUBNUB else 0.0
+    messages = (usage.samples_per_s if thesis else by_pubnub) * 3600 * units(size, PUBNUB_UNIT)
     items = [
         LineItem("PubNub", "live", "published", "pubnub_publish", messages),
         LineItem("PubNub", "live", "received by viewers", "pubnub_receive", messages * usage.viewers),
@@ -189,6 +201,8 @@ def pubnub_bill(
 def pubnub_mau_dollars_per_month(usage: Usage) -> float | None:
     """The price of PubNub's plan by monthly active users (viewers and Lambda 1); None above the listed
     plans."""
+    if usage.live_transport != PUBNUB:
+        return 0.0
     users = usage.viewers + 1
     return next((dollars for most, dollars in PUBNUB_MAU_PLANS if users <= most), None)
 
@@ -207,7 +221,7 @@ def _shards_of(usage: Usage) -> float:
 
 def _live_lines_per_s(usage: Usage) -> float:
     """Log lines a second of the whole fleet: each environment of Lambda 1 gathers its metrics."""
-    messages = usage.robots * usage.live_hz
+    messages = usage.robots * usage.live_per_s if usage.live_transport == PUBNUB else 0.0
     environments = max(1, ceil(messages * usage.live_ms / 1000))
     return min(messages, max(environments / _GATHER_S, messages / _MOST_VALUES))
 

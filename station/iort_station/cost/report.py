@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 from iort_station.cost import analysing, archiving, line_items, model
@@ -25,30 +26,37 @@ class Rows(NamedTuple):
 
 
 def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """Dollars per robot-hour by service and lane, in the thesis' layout and in ours."""
-    ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
-    pubnub = model.pubnub_bill(usage, prices), model.pubnub_bill(usage, prices, thesis=True)
+    """Dollars per robot-hour by service and lane, in the thesis' layout and in ours; ours also for an hour in
+    which nobody looks."""
+    alone = replace(usage, watched_hours=0.0)
+    ours, thesis, idle = (
+        model.bill(usage, prices),
+        model.thesis_bill(usage, prices),
+        model.bill(alone, prices),
+    )
+    columns = thesis, ours, idle
     body: list[tuple[str, ...]] = []
-    services = sorted({item.service for item in [*ours, *thesis]})
-    for service in services:
-        lanes: list[str] = []
-        for item in [*ours, *thesis]:
-            if item.service == service and item.lane not in lanes:
-                lanes.append(item.lane)
+    for service in sorted({item.service for items in columns for item in items}):
+        lanes = dict.fromkeys(item.lane for items in columns for item in items if item.service == service)
         body.extend(
-            (f"{service}, {lane}", *(_shown(items, service, lane) for items in (thesis, ours)), "")
+            (f"{service}, {lane}", *(_shown(items, service, lane) for items in columns), "")
             for lane in lanes
-            if max(_sum(thesis, service, lane), _sum(ours, service, lane)) >= _LEAST_DOLLARS
+            if max(_sum(items, service, lane) for items in columns) >= _LEAST_DOLLARS
         )
-    whole = line_items.total(thesis), line_items.total(ours)
-    body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
-    unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
-    body.append(("total AWS without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
-    alike = line_items.total(thesis), sum(i.dollars for i in ours if i.lane not in _NOT_IN_THE_THESIS)
-    body.append(("total AWS without archive and analysis", *map(_dollars, alike), _ratio(alike)))
-    both = line_items.total(pubnub[1]), line_items.total(pubnub[0])
-    body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
-    return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
+    for what, left_out in (
+        ("total AWS", lambda _: False),
+        ("total AWS without log lines", lambda item: item.price == "logs"),
+        ("total AWS without archive and analysis", lambda item: item.lane in _NOT_IN_THE_THESIS),
+    ):
+        sums = [sum(item.dollars for item in items if not left_out(item)) for items in columns]
+        body.append((what, *map(_dollars, sums), _ratio((sums[0], sums[1]))))
+    pubnub = [
+        line_items.total(model.pubnub_bill(usage, prices, thesis=True)),
+        *(line_items.total(model.pubnub_bill(one, prices)) for one in (usage, alone)),
+    ]
+    body.append(("PubNub, plan by transactions", *map(_dollars, pubnub), _ratio((pubnub[0], pubnub[1]))))
+    head = ("dollars a robot-hour", "a message a sample", "iort", "nobody looks", "ratio")
+    return Rows(head, body)
 
 
 def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:

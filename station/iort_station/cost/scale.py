@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from iort_contract.cloud import PUBNUB
 from iort_station.cost.line_items import dollars_per_month, total
 from iort_station.cost.model import SUBSCRIPTIONS, bill, pubnub_bill
 from iort_station.cost.prices import PRICES, QUOTAS, Price, Quota
@@ -66,7 +67,7 @@ def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
         needs,
         dollars_per_month(bill(usage, prices), usage),
         total(pubnub_bill(usage, prices)) * usage.robot_hours_per_month,
-        usage.live_hz * usage.robots,
+        usage.live_hz * usage.robots if usage.live_transport == PUBNUB else 0.0,
     )
 
 
@@ -88,11 +89,13 @@ def _per_robot(usage: Usage) -> dict[str, float]:
     telemetry = usage.batches_per_s * -(-sizes.telemetry_item // 1024) + usage.own_batches_per_s
     summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
     # The stream's shards limit Lambda 2, so only Lambda 1 and the pings count.
-    busy = usage.live_hz * usage.live_ms / 1000 + usage.ping_hz * 0.005
-    # Three rules evaluate each message that passes the broker.
-    live_rules = usage.live_hz + 2 * usage.live_at_broker_per_s
+    by_pubnub = usage.live_hz if usage.live_transport == PUBNUB else 0.0
+    busy = by_pubnub * usage.live_ms / 1000 + usage.ping_hz * 0.005
+    # Two more rules evaluate each message that passes the broker.
+    passing = usage.live_at_broker_per_s if usage.live_transport == PUBNUB else usage.live_hz
+    live_rules = by_pubnub + 2 * passing
     return {
-        _RESERVED: usage.live_hz * usage.live_ms / 1000,
+        _RESERVED: by_pubnub * usage.live_ms / 1000,
         "IoT Core: connections": 1,
         "IoT Core: connects in a minute after an outage": 1,
         "IoT Core: connects of one client id": 1 / SHORTEST_RECONNECT_S,

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
+from iort_contract.messages.viewing import VIEW_RENEW_S
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import UsageError
 
+TRANSPORTS = (PUBNUB, IOT)
 # A car without round-trip pings still pings for its clock offset; a test compares this with the agent.
 CLOCK_PING_S = 30.0
 
@@ -31,8 +34,12 @@ class Usage:
     the last. They are open on the live page for ``dashboard_hours`` a month. ``function_logs`` "all" adds
     Lambda's own log lines.
 
+    Somebody looks at a robot for ``watched_hours`` of its hours a day; at other times it sends a live message
+    of each stream every `LIVE_BROKER_EVERY_S`. None is for ``live.when: always``. Live messages reach their
+    viewers by ``live_transport``, PubNub or AWS IoT.
+
     Only AWS knows the billed milliseconds; ``live_ms``, ``summarize_ms`` and ``summarize_batch_ms`` (for each
-    batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet all the time.
+    batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet in those hours.
     """
 
     robots: int = 1
@@ -41,11 +48,13 @@ class Usage:
     live_hz: float = 10.0
     batch_s: float = 1.0
     ping_hz: float = 0.0
-    agent_every_s: float = 10.0
+    agent_every_s: float = 60.0
     connects_per_hour: float = 1.0
     command_hz: float = 0.0
     questions_per_hour: float = 0.0
     hours_per_day: float = 2.0
+    watched_hours: float | None = 2.0
+    live_transport: str = "pubnub"
     viewers: int = 1
     retention_days: int = DEFAULT_RETENTION_DAYS
     archive_days: int = 365
@@ -77,6 +86,7 @@ class Usage:
             ("rate_hz", 0 < self.rate_hz <= 2000, "more than 0 and at most 2000"),
             ("batch_s", self.batch_s <= 1, "0 to 1; 0 sends each sample by itself"),
             ("hours_per_day", 0 < self.hours_per_day <= 24, "more than 0 and at most 24"),
+            ("live_transport", self.live_transport in TRANSPORTS, f"one of {', '.join(TRANSPORTS)}"),
         ):
             if not holds:
                 raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
@@ -110,8 +120,29 @@ class Usage:
         return bool(self.agent_every_s) + 1 + bool(self.ping_hz)
 
     @property
+    def watched(self) -> float:
+        """The share of its hours that somebody looks at a robot, or that it sends as if."""
+        return 1.0 if self.watched_hours is None else min(1.0, self.watched_hours / self.hours_per_day)
+
+    @property
+    def live_per_s(self) -> float:
+        """A robot's live messages a second, on average."""
+        return self.watched * self.live_hz + (1 - self.watched) * self._idle_hz
+
+    @property
     def live_at_broker_per_s(self) -> float:
         """A robot's live messages a second that pass the broker while its fault code does not change."""
+        return self.live_per_s if self.live_transport == IOT else self._idle_hz
+
+    @property
+    def leases_per_s(self) -> float:
+        """The leases a second that a robot hears from its viewers."""
+        if self.watched_hours is None or not self.live_hz:
+            return 0.0
+        return self.watched * self.viewers / VIEW_RENEW_S
+
+    @property
+    def _idle_hz(self) -> float:
         return min(self.live_hz, self.streams / LIVE_BROKER_EVERY_S)
 
     @property
@@ -128,6 +159,9 @@ class Usage:
 def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
     """The usage with one setting changed at a time."""
     yield "as configured", usage
+    for share, name in ((0.0, "nobody looks"), (0.1, "somebody looks a tenth of the time")):
+        yield name, replace(usage, watched_hours=share * usage.hours_per_day)
+    yield "live messages by AWS IoT alone", replace(usage, live_transport=IOT)
     for live_hz in (5.0, 2.0, 1.0, 0.0):
         if live_hz != usage.live_hz:
             name = f"live lane at {live_hz:g} Hz" if live_hz else "no live lane"

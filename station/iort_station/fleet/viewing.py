@@ -44,7 +44,8 @@ class Viewer:
     """Holds a lease of each robot within a ``with`` block, in a thread of its own.
 
     ``robots`` are names, or a function that is asked at each renewal. ``broker`` says that the viewer listens
-    at the broker, not at PubNub. `problem` says why the last renewal failed, for who may look but not wake.
+    at the broker, not at PubNub. It renews ``every_s``, which also wakes a robot that has just come.
+    `problem` says why the last renewal failed, for who may look but not wake.
     """
 
     def __init__(
@@ -54,10 +55,12 @@ class Viewer:
         *,
         rate_hz: float = LIVE_MAX_RATE_HZ,
         broker: bool = False,
+        every_s: float = VIEW_RENEW_S,
     ) -> None:
         self._cloud = cloud
         self._robots = robots if callable(robots) else lambda names=tuple(robots): names
         self._lease = Lease(secrets.token_hex(8), rate_hz, VIEW_LEASE_MS, broker)
+        self._every_s = every_s
         self._held: set[str] = set()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
@@ -76,7 +79,7 @@ class Viewer:
         self._publish(self._held, 0)
 
     def _run(self) -> None:
-        while not self._end.wait(VIEW_RENEW_S):
+        while not self._end.wait(self._every_s):
             self._renew()
 
     def _renew(self) -> None:

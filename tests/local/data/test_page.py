@@ -51,7 +51,7 @@ def served(embedded: EmbeddedCloud) -> PageServer:
 
 def test_the_page_shows_the_cars_values_live_and_later(embedded, bundle, open_page):
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": DRIVE_S}
-    car = bundle(sources=[source])
+    car = bundle(sources=[source], live={"when": "always"})
     listener = Listener(
         robot=car.robot,
         namespace=embedded.namespace,
@@ -132,7 +132,7 @@ def _look_back(page, url, robot, samples, newest):
 def test_a_cameras_thumbnails_reach_the_page(embedded, bundle, open_page, tmp_path):
     recording = write_bag(tmp_path / "camera.bag", [jpeg(seed) for seed in range(4)])
     source = {"type": "bag", "path": str(recording), "topics": {TOPIC: "camera"}, "large": "upload"}
-    car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0})
+    car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0}, live={"when": "always"})
     with served(embedded) as server:
         page = open_page(f"{server.url}#/car/{car.robot}")
         run_agent(car)

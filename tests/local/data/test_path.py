@@ -39,6 +39,7 @@ def test_a_simulated_drive_arrives_completely_on_both_lanes(embedded, bundle):
     car = bundle(
         sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}],
         ping={"rate_hz": 5, "padding_bytes": 430},
+        live={"when": "always"},
     )
     with _listener(embedded, car.robot) as listener:
         agent = Agent(car)
@@ -114,7 +115,7 @@ def test_a_live_message_without_an_envelope_never_reaches_the_dashboard(embedded
 
 
 def test_messages_delayed_by_a_stalled_broker_are_not_shown(embedded, bundle):
-    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}], live={"when": "always"})
     with _listener(embedded, car.robot) as listener:
         agent = Agent(car)
         # The car knows its clock offset, and sends it in its messages.

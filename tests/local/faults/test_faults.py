@@ -124,7 +124,7 @@ def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, 
     from iort_station.page.listener import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
-    car = bundle(**_settings(log, proxy.port))
+    car = bundle(**_settings(log, proxy.port), live={"when": "always"})
     with Listener(
         robot=car.robot,
         namespace=embedded.namespace,

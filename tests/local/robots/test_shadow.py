@@ -48,9 +48,9 @@ def test_settings_take_effect_and_invalid_ones_are_rejected_with_the_reason(embe
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     shadow = Shadow(embedded, car.robot)
     with driving(car):
-        until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 10})
+        until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 10, "when": "watched"})
         shadow.request(live={"rate_hz": 2}, fields={"vesc": ["speed", "voltage_input"]}, log_level="debug")
-        until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 2})
+        until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 2, "when": "watched"})
         assert shadow.reported()["fields"] == {"vesc": ["speed", "voltage_input"]}
         assert shadow.reported()["log_level"] == "debug"
         until(

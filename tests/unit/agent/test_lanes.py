@@ -17,7 +17,7 @@ from iort_agent.agent import Agent
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.state import document
 from iort_agent.config import Config
-from iort_agent.lanes.config import PingConfig, RecordConfig
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
 from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -27,6 +27,7 @@ from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.text import render
 from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.settings import ALWAYS
 from iort_contract.topics import BROKER, LIVE
 from tests.agent_fakes import Loopback, ManualClock, Published
 
@@ -80,7 +81,8 @@ class Drive:
         self.uplink.hold = True
         self.uplink.verdict = self._sees
         self.spool = MemorySpool(max_bytes=10**9)
-        config = replace(Config("car1", "host", Path(), Path(), ()), **settings)
+        live = LiveConfig(when=ALWAYS)
+        config = replace(Config("car1", "host", Path(), Path(), (), live=live), **settings)
         self.agent = Agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
         self.runtime = Runtime(self.agent)
         self.sent: list[Sent] = []

@@ -92,7 +92,7 @@ def test_without_a_shadow_the_agent_creates_it() -> None:
 def test_an_earlier_desired_setting_is_applied() -> None:
     rig = Rig(live={"rate_hz": 2}, record={"enabled": False})
     assert rig.applied[-1].live_rate_hz == 2
-    assert rig.reported["live"] == {"enabled": True, "rate_hz": 2, "when": "always"}
+    assert rig.reported["live"] == {"enabled": True, "rate_hz": 2, "when": "watched"}
     assert rig.reported["record"] == {"enabled": False}
 
 

@@ -23,6 +23,7 @@ from bench.sections import (
     query,
     thesis_ping,
     utilisation,
+    viewing,
 )
 from bench.sections.utilisation import BATCHES
 from iort_contract.messages.batch import Batch, encode_batch
@@ -248,6 +249,18 @@ def test_the_fairness_target_is_twice_the_delay_of_a_car_alone():
     values = [(ratio.value, ratio.reached) for ratio in section.ratios]
     assert values == [(1.9, True), (1.0, True), (2.1, False), (0.5, False)]
     assert section.tables[0].rows[1][:2] == ["bad messages", "80"]
+
+
+def test_a_car_that_sends_while_nobody_looks_misses_the_target_and_so_does_a_late_one():
+    targets = {}
+    for idle, wake_ms in ((6, 100.0), (600, 1500.0)):
+        section = Section("viewing", "")
+        delays = {"iot": [9.0, 11.0], "pubnub": [20.0, 30.0]}
+        viewing.report(section, idle, dict.fromkeys(delays, [wake_ms] * 20), delays)
+        targets[idle] = [ratio.reached for ratio in section.ratios]
+        json.dumps(section.as_json())
+    assert targets == {6: [True] * 4, 600: [True, False, False, False]}
+    assert section.tables[1].rows[0][2].startswith("10.0 ms")
 
 
 def test_the_target_of_summaries_beside_worst_case_batches_is_twice_the_delay_of_a_car_alone():

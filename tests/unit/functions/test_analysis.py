@@ -368,6 +368,24 @@ def test_a_failed_plan_is_a_finding_until_its_range_is_planned(cloud: Deployed) 
         assert list(cloud.table.findings(CAR)) == left
 
 
+def test_a_drive_that_ends_without_an_answer_is_a_finding_too(cloud: Deployed) -> None:
+    """Its workflow took too long, or could not write the finding."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    run = plan.handler(
+        {"input": {"robots": [], "start_us": START_US, "end_us": START_US + S}, "job": JOB}, None
+    )
+    plan.handler({**run, "robot": CAR}, None)
+    cloud.table.put_finding(finding())
+
+    evaluate.handler(run, None)
+    present.handler({"job": JOB}, None)
+
+    failed, earlier = sorted(cloud.table.findings(CAR), key=lambda one: one.kind)
+    assert failed.text == "the drive could not be analysed in three attempts: they ended without an answer"
+    assert earlier == finding()
+
+
 def test_the_next_night_looks_for_the_drives_of_a_failed_plan(cloud: Deployed) -> None:
     """Nights overlap by a day only, so what failed may begin before the next range."""
     cloud.register(CAR)

@@ -46,14 +46,39 @@ def test_the_record_lane_costs_a_rule_an_action_and_write_units_a_batch():
 
 
 def test_the_live_lane_costs_a_rule_an_action_and_an_invocation_a_message():
-    items = model.bill(replace(_ONE, live_hz=4.0))
+    always = replace(_ONE, watched_hours=None)
+    items = model.bill(replace(always, live_hz=4.0))
     assert _units(items, "live", "invocation") == 4 * 3600
     assert _units(items, "live", "message") == 360
     # Messages through the broker also trigger two more rules.
     assert _units(items, "live", "rule") == _units(items, "live", "action") == 4 * 3600 + 2 * 360
-    throttled = model.bill(replace(_ONE, live_hz=0.05))
+    throttled = model.bill(replace(always, live_hz=0.05))
     assert _units(throttled, "live", "message") == _units(throttled, "live", "invocation") == 180
     assert _units(model.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
+
+
+def test_a_car_that_nobody_looks_at_sends_a_message_in_ten_seconds():
+    idle = replace(_ONE, watched_hours=0.0)
+    items = model.bill(idle)
+    assert _units(items, "live", "invocation") == _units(items, "live", "message") == 360
+    assert line_items.total(model.pubnub_bill(idle)) < line_items.total(model.pubnub_bill(_ONE)) / 99
+    # The goal, as the thesis is compared: it archives and analyses nothing.
+    assert line_items.total(model.bill(replace(idle, archive_days=0, drive_minutes=0.0))) < 0.014
+    half = replace(_ONE, hours_per_day=4.0, watched_hours=2.0)
+    assert half.live_per_s == pytest.approx((10 + 0.1) / 2)
+    # A lease every five seconds is sent and received.
+    assert _units(model.bill(half), "live", "message") == 360 + 2 * 720 / 2
+    assert replace(half, watched_hours=9.0).live_per_s == 10
+
+
+def test_by_aws_iot_alone_each_message_is_sent_to_each_viewer_and_no_function_runs():
+    usage = replace(_ONE, live_transport="iot", viewers=3)
+    items = model.bill(usage)
+    assert _units(items, "live", "invocation") == 0
+    assert _units(items, "live", "message") == 36_000 * (1 + 3) + 3 * 2 * 720
+    assert _units(items, "live", "rule") == 2 * 36_000, "a fault, and a low battery"
+    assert _units(items, "live", "connection") == 3 * 60
+    assert line_items.total(model.pubnub_bill(usage)) == model.pubnub_mau_dollars_per_month(usage) == 0
 
 
 def test_a_car_without_measured_pings_still_pings_for_the_clock_offset():

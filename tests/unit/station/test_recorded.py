@@ -9,6 +9,7 @@ import random
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from functions.shared.summary.processing import recompute
 from iort_analysis.samples.blocks import values
@@ -20,6 +21,8 @@ from iort_contract.ros1.message import Messages, RosType
 from iort_contract.tables import RECOMPUTE_FROM_S
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
+from iort_station.cli.cloud_options import CloudOptions
+from iort_station.cli.main import app
 from iort_station.data import archive as station_archive
 from iort_station.data.overview import overview
 from iort_station.data.recorded import Origin
@@ -242,6 +245,17 @@ def test_runs_and_streams_are_the_same_and_say_where_they_are_from(before, cloud
         assert (origins[0].told(), bool(origins[1].told())) == (None, cloud.state != "archived")
     for end_us in (START + HOUR, START + 100 * S):
         assert runs(cloud, "car", end_us=end_us) == runs(before, "car", end_us=end_us)
+
+
+@pytest.mark.parametrize("verb", ["runs", "streams"])
+def test_the_verb_says_what_came_from_the_archive(verb, before, monkeypatch):
+    said = []
+    for one in (before, later("expired")):
+        monkeypatch.setattr(CloudOptions, "cloud", lambda _self, one=one: one)
+        done = CliRunner().invoke(app, [verb, "car"])
+        told = json.loads(CliRunner().invoke(app, [verb, "car", "--json"]).stdout)
+        said.append(("from the archive, 2023-11-14T22:00:00Z to" in done.stderr, told["archive"] is not None))
+    assert said == [(False, False), (True, True)]
 
 
 def test_the_page_gets_the_same_and_says_where_it_is_from(before, cloud):

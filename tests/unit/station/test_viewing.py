@@ -44,10 +44,9 @@ class Cloud:
         self.renewed.release()
 
 
-def test_a_viewer_renews_its_leases_and_ends_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewing, "VIEW_RENEW_S", 0.01)
+def test_a_viewer_renews_its_leases_and_ends_them() -> None:
     cloud: Any = Cloud()
-    with viewing.Viewer(cloud, ["a", "b"], rate_hz=2, broker=True) as viewer:
+    with viewing.Viewer(cloud, ["a", "b"], rate_hz=2, broker=True, every_s=0.01) as viewer:
         assert set(cloud.heard) == {"a", "b"}, "awake at once"
         for _ in range(6):
             assert cloud.renewed.acquire(timeout=10)
@@ -61,11 +60,10 @@ def test_a_viewer_renews_its_leases_and_ends_them(monkeypatch: pytest.MonkeyPatc
         assert ended.lease_ms == 0
 
 
-def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewing, "VIEW_RENEW_S", 0.01)
+def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go() -> None:
     cloud: Any = Cloud()
     online = ["a"]
-    with viewing.Viewer(cloud, lambda: online):
+    with viewing.Viewer(cloud, lambda: online, every_s=0.01):
         online[:] = ["b"]
         while not cloud.heard["b"]:
             assert cloud.renewed.acquire(timeout=10)

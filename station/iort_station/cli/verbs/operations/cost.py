@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_contract.cloud import PUBNUB
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
@@ -21,7 +22,7 @@ from iort_station.cost.deployed import as_deployed
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
 from iort_station.cost.prices import AS_OF, PRICES, REGION
-from iort_station.cost.usage import Usage
+from iort_station.cost.usage import TRANSPORTS, Usage
 
 commands = typer.Typer()
 _DEFAULT = Usage()
@@ -52,6 +53,14 @@ def cost_(
     hours_per_day: Annotated[
         float, typer.Option(help="Hours a robot drives a day.")
     ] = _DEFAULT.hours_per_day,
+    watched_hours: Annotated[
+        float | None,
+        typer.Option(help="Hours of them that somebody looks at a robot live. Default: all of them."),
+    ] = None,
+    live_transport: Annotated[
+        str | None,
+        typer.Option(help=f"How live messages reach viewers: {' or '.join(TRANSPORTS)}. Default: {PUBNUB}."),
+    ] = None,
     viewers: Annotated[int, typer.Option(help="People who watch the fleet.")] = _DEFAULT.viewers,
     retention_days: Annotated[int, typer.Option(help="Days that items are kept.")] = _DEFAULT.retention_days,
     archive_days: Annotated[
@@ -105,6 +114,8 @@ def cost_(
         "live_hz": live_hz,
         "batch_s": batch_s,
         "ping_hz": ping_hz,
+        "live_transport": live_transport,
+        **_watched(usage, watched_hours, hours_per_day),
     }
     rates: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     usage = replace(
@@ -134,7 +145,8 @@ def cost_(
         f"{_dated(listed)}: "
         f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
         f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
-        f"live {usage.live_hz:g} Hz, {usage.hours_per_day:g} h a day, kept {usage.retention_days} days.\n"
+        f"live {usage.live_hz:g} Hz {_looking(usage)}, {usage.hours_per_day:g} h a day, "
+        f"kept {usage.retention_days} days.\n"
     )
     for title, rows in (
         ("A robot-hour", report.robot_hour(usage, prices)),
@@ -144,6 +156,15 @@ def cost_(
         ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
     ):
         out.print(_table(title, rows))
+
+
+def _watched(usage: Usage, hours: float | None, of_hours: float) -> dict[str, float]:
+    """The hours that somebody looks; a car.yaml that sends always needs nobody."""
+    return (
+        {}
+        if hours is None and usage.watched_hours is None
+        else {"watched_hours": of_hours if hours is None else hours}
+    )
 
 
 def _prices(options: CloudOptions, *, refresh: bool) -> Listed | None:
@@ -157,6 +178,13 @@ def _prices(options: CloudOptions, *, refresh: bool) -> Listed | None:
     )
     keep(listed, path)
     return listed
+
+
+def _looking(usage: Usage) -> str:
+    """When the live lane sends at its rate."""
+    return (
+        "always" if usage.watched_hours is None else f"while somebody looks, {usage.watched:.0%} of the time"
+    )
 
 
 def _dated(listed: Listed | None) -> str:

@@ -1,0 +1,47 @@
+"""A car that nobody looks at says little; a lease wakes it, and it sleeps again when the lease ends."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.fleet.viewing import Viewer
+from iort_station.page.listener import Listener
+from tests.local.conftest import until
+from tests.local.data.drives import Agent
+
+_FULL_MS, _IDLE_MS = 100, 10_000
+
+
+def test_a_lease_wakes_a_car_and_its_end_lets_it_sleep(embedded, bundle):
+    car = bundle(sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}])
+    heard: list[tuple[float, dict[str, Any]]] = []
+
+    def periods() -> list[int]:
+        return [update["next_ms"] for _, update in list(heard)]
+
+    listener = Listener(
+        robot=car.robot,
+        namespace=embedded.namespace,
+        on_update=lambda update, *_: heard.append((time.monotonic(), update)),
+        **embedded.keys.reading(),
+    )
+    with listener:
+        agent = Agent(car)
+        try:
+            until(heard.__len__)
+            assert set(periods()) == {_IDLE_MS}
+            began = time.monotonic()
+            with Viewer(embedded.cloud, [car.robot]):
+                until(lambda: periods().count(_FULL_MS) >= 20)
+            woken = next(at for at, update in heard if update["next_ms"] == _FULL_MS)
+            assert woken - began < 5, "the first renewal has woken it"
+            until(lambda: periods()[-1] == _IDLE_MS, seconds=5)
+            count = len(heard)
+            assert agent.status()["lanes"]["live"]["viewers"] == 0
+            until(lambda: len(heard) > count, seconds=30)
+            assert periods()[count:] == [_IDLE_MS]
+        finally:
+            agent.stop()
+            agent.report()
