@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -56,6 +56,9 @@ bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=
 bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 REPORT=figures.json
 	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
 		$(if $(REPORT),--json "$(REPORT)")
+
+bench-drive: setup ## measure driving by hand from the page, with ROS 1: TRIES=50 ONLY="tab hidden" REPORT=figures.json
+	@$(BIN)/python -m bench.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")
 
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
 	@$(BIN)/python -m bench.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")

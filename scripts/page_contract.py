@@ -77,7 +77,7 @@ def _constants() -> Iterator[str]:
             "GONE_S",
             "LIVE_MAX_RATE_HZ",
         ),
-        topics: ("NAME", "LIVE", "VIEW"),
+        topics: ("NAME", "LIVE", "VIEW", "CMD"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
         kinds: ("ANALYSIS_FAILED",),

@@ -16,7 +16,12 @@ from aws_cdk import aws_sns as sns
 from aws_cdk import aws_stepfunctions as stepfunctions
 
 from iort_contract.archive import ARCHIVE_PREFIX
-from iort_contract.catalog.environments import EvaluateEnvironment, PlanEnvironment, PresentEnvironment
+from iort_contract.catalog.environments import (
+    Environment,
+    EvaluateEnvironment,
+    PlanEnvironment,
+    PresentEnvironment,
+)
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import allow, function
@@ -57,15 +62,7 @@ class Analysis(PlatformStack):
             self._nightly()
 
     def _plan(self) -> lambda_.Function:
-        plan = function(
-            self,
-            "Plan",
-            self._reading(),
-            memory_mb=_CORE_MB,
-            timeout_s=_PLAN_S,
-            layers=self._layers,
-            arrays=True,
-        )
+        plan = self._computing("Plan", self._reading(), _PLAN_S)
         self._may_read(plan)
         self._storage.robots.grant(plan, "dynamodb:Scan")
         self._storage.findings.grant(plan, "dynamodb:Query")
@@ -73,15 +70,7 @@ class Analysis(PlatformStack):
         return plan
 
     def _analyse(self) -> lambda_.Function:
-        analyse = function(
-            self,
-            "Analyse",
-            self._reading(),
-            memory_mb=_CORE_MB,
-            timeout_s=_ANALYSE_S,
-            layers=self._layers,
-            arrays=True,
-        )
+        analyse = self._computing("Analyse", self._reading(), _ANALYSE_S)
         self._may_read(analyse)
         self._storage.findings.grant(analyse, "dynamodb:PutItem")
         allow(analyse, ["s3:PutObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
@@ -94,15 +83,7 @@ class Analysis(PlatformStack):
             findings_table=self._storage.findings.table_name,
             files_bucket=self._storage.files.bucket_name,
         )
-        evaluate = function(
-            self,
-            "Evaluate",
-            environment,
-            memory_mb=_CORE_MB,
-            timeout_s=_EVALUATE_S,
-            layers=self._layers,
-            arrays=True,
-        )
+        evaluate = self._computing("Evaluate", environment, _EVALUATE_S)
         self._storage.robots.grant(evaluate, "dynamodb:Scan")
         self._storage.findings.grant(evaluate, "dynamodb:Query")
         allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))
@@ -127,6 +108,18 @@ class Analysis(PlatformStack):
         allow(present, ["s3:DeleteObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
         allow(present, ["sns:Publish"], self._alarms.topic_arn)
         return present
+
+    def _computing(self, name: str, environment: Environment, timeout_s: int) -> lambda_.Function:
+        """A function with numpy and a core of its own."""
+        return function(
+            self,
+            name,
+            environment,
+            memory_mb=_CORE_MB,
+            timeout_s=timeout_s,
+            layers=self._layers,
+            arrays=True,
+        )
 
     def _reading(self) -> PlanEnvironment:
         return PlanEnvironment(

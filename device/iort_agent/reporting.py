@@ -111,5 +111,6 @@ def _alarms(agent: Agent) -> list[str]:
     waits = [source.waits() for source in agent.sources]
     if agent.downlink is not None:
         waits.append(agent.downlink.waits())
+        alarms += agent.downlink.alarms()
     # Without repetitions: sources and commands may share a ROS node.
     return alarms + [f"source waits: {why}" for why in dict.fromkeys(waits) if why]

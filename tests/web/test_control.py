@@ -213,6 +213,7 @@ def test_only_a_browser_that_was_invited_may_act(
     commands = page.get_by_role("heading", name="Commands")
     assert "open the address in the server's terminal" in page.inner_text(".aside")
     assert not commands.is_visible()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     # In the same tab, only what follows the # is another.
     with page.expect_event("load"):
         page.goto(address)

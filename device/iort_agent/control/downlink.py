@@ -112,6 +112,10 @@ class Downlink:
             "waits": self.waits(),
         }
 
+    def alarms(self) -> list[str]:
+        """Why the robot takes no motion."""
+        return self._commands.alarms()
+
     def waits(self) -> str | None:
         """What the ROS graph waits for; None if it does not wait."""
         return self._graph.waits()

@@ -30,7 +30,8 @@ from iort_contract.topics import ACCEPTED, SHADOW
 
 _log = logging.getLogger(__name__)
 
-_AGAIN_S = 30.0
+# Between two reports, and between two fetches: no motion passes before the first has been answered.
+_AGAIN_S, _FETCH_AGAIN_S = 30.0, 5.0
 # AWS limits a shadow document to 8 KB. A rejected value is quoted up to this length.
 _MAX_VALUE_CHARS = 200
 _NOT_FOUND = 404
@@ -84,7 +85,7 @@ class Shadow:
         now = self._clock.monotonic()
         if self._fetch_at is not None and now >= self._fetch_at:
             if all(self._uplink.subscribed(topic_filter) for topic_filter in self._filters):
-                self._fetch_at = now + _AGAIN_S
+                self._fetch_at = now + _FETCH_AGAIN_S
                 self._publish(self._get, b"")
         elif self._report_at is not None and self._reported is not None and now >= self._report_at:
             self._report_at = now + _AGAIN_S

@@ -15,6 +15,7 @@ import { readRoute, route, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
+import { DrivePanel } from "./drive/panel";
 import { StopControl } from "./drive/stop_control";
 import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
@@ -46,6 +47,7 @@ class Page {
   private readonly cloudWatchView: CloudWatchView;
   private readonly alarmsView: AlarmsView;
   private readonly stops: StopControl;
+  private readonly drive: DrivePanel;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
   private route: Route = { view: "fleet" };
@@ -66,11 +68,12 @@ class Page {
     this.registry = new Registry(config);
     this.viewing = new Viewing(config, (lease) => this.feed.lease(lease));
     this.waiting = new Waiting(config, this.registry);
-    this.stops = new StopControl(config, byId("top"));
+    this.stops = new StopControl(config, byId("top"), () => this.drive.show());
+    this.drive = new DrivePanel(config, this.stops.stops);
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
     this.fleetView = new FleetView(config, this.fleet, table, this.registry);
-    this.carView = new CarView(config, this.fleet, table, this.tools, () => this.arrange());
+    this.carView = new CarView(config, this.fleet, table, this.tools, this.drive.node, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
     this.insightsView = new InsightsView(config);
     this.compareView = new CompareView(config, table, this.fleet);
@@ -107,6 +110,7 @@ class Page {
     else this.insightsView.leave();
     this.cloudWatchView.show(view === "cloudwatch");
     this.stops.of(view === "car" ? robot : undefined);
+    this.drive.of(view === "car" ? robot : undefined);
     this.viewing.look(this.looks());
     this.registry.watch(view === "fleet" || view === "car");
     if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
@@ -185,7 +189,10 @@ class Page {
     this.bar.clock(at, this.feed.state);
     if (document.body.dataset["empty"] === "true") this.waiting.show("robot" in this.route ? this.route.robot : undefined);
     if (view === "fleet") this.fleetView.clock(at, linked);
-    if (view === "car") this.carView.clock(at, linked);
+    if (view === "car") {
+      this.carView.clock(at, linked);
+      this.drive.driven(this.carView.driver(at));
+    }
     if (view === "history") this.historyView.clock(at);
     if (view === "alarms") this.alarmsView.clock(at);
   };

@@ -98,6 +98,7 @@ def test_the_emergency_stop_stops_at_once_and_refuses_until_it_is_released() -> 
         rig.clock.advance(0.1)
         rig.downlink.tick()
     assert len(rig.graph.published) == pytest.approx(52, abs=2), "it holds its place on the topic"
+    assert rig.downlink.alarms() == ["emergency stop: no motion until an operator releases it"]
     rig.send({"data": 2.5}, session=B, takeover=True)
     rig.send({"data": "hello"}, name="say", lease_ms=None)
     rig.clock.advance(0.1)
@@ -115,6 +116,7 @@ def test_the_emergency_stop_stops_at_once_and_refuses_until_it_is_released() -> 
     ]
     rig.send({"data": 1.5}, session="cccccccc")
     assert rig.graph.published[-1] == ("/commands/motor/speed", doubles(1.5))
+    assert rig.downlink.alarms() == []
 
 
 def test_a_stopped_robot_ends_in_good_order() -> None:

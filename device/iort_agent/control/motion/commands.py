@@ -181,6 +181,15 @@ class Commands:
         """The passed and the limited commands and the published stops, by name."""
         return {one.name: one.report() for one in self._commands.values()}
 
+    def alarms(self) -> list[str]:
+        """Why no motion may pass."""
+        found = []
+        if any(command.leases.held for command in self._commands.values()):
+            found.append("emergency stop: no motion until an operator releases it")
+        if self.guarded() is False:
+            found.append("the guard does not run yet: no motion until it does")
+        return found
+
     def guarded(self) -> bool | None:
         """Whether the guard would stop the robot; None if it needs none."""
         with self._lock:

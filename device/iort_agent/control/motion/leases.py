@@ -76,7 +76,7 @@ class Leases(Stops):
 
     def why_stopped(self) -> str:
         """Why a stop begins, for a person."""
-        if self._held:
+        if self.held:
             return "emergency stop"
         return "the agent ends" if self._closed else "nobody renews it"
 
@@ -110,7 +110,7 @@ class Leases(Stops):
         """Why a motion that is in time may not pass beside another driver or an emergency stop."""
         driver = self.driver(now)
         reason = None
-        if self._held:
+        if self.held:
             reason = EMERGENCY_STOP
         elif driver is not None and driver.session != command.session and not command.takeover:
             reason = DRIVEN_BY_ANOTHER

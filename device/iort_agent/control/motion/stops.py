@@ -23,7 +23,8 @@ class Stops:
     def __init__(self) -> None:
         # The end of the current lease.
         self.ends: float | None = None
-        self._held = False
+        # Whether an emergency stop holds.
+        self.held = False
         # The stops still to publish: infinitely many in an emergency stop.
         self._stops = 0.0
         self._next_stop = 0.0
@@ -40,7 +41,7 @@ class Stops:
         if not self._stops or now < self._next_stop:
             return False
         self._stops -= 1
-        self._next_stop = now + (STOP_HOLD_S if self._held else STOP_REPEAT_S)
+        self._next_stop = now + (STOP_HOLD_S if self.held else STOP_REPEAT_S)
         return True
 
     def next_due(self) -> float | None:
@@ -56,11 +57,11 @@ class Stops:
 
     def hold(self, now: float) -> None:
         """End the lease, and repeat the stop until `free`."""
-        if not self._held:
-            self._held, self.ends = True, None
+        if not self.held:
+            self.held, self.ends = True, None
             self._stops, self._next_stop = math.inf, now
 
     def free(self) -> None:
         """Repeat the stop a few times more."""
-        if self._held:
-            self._held, self._stops = False, STOP_REPEATS
+        if self.held:
+            self.held, self._stops = False, STOP_REPEATS

@@ -10,6 +10,7 @@ export const LIVE_MAX_RATE_HZ = 10.0;
 export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
 export const LIVE = "live";
 export const VIEW = "view";
+export const CMD = "cmd";
 export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TACHOMETER_COUNTS = 6;

@@ -40,6 +40,8 @@ export class Driver {
   private stops = 0;
   private takeover = false;
   private obstacle = "";
+  private halted = false;
+  private ticked_ms = Infinity;
   private taken_ms = -Infinity;
   private next_ms = 1000 / LIVE_MAX_RATE_HZ;
   private clockless = false;
@@ -68,10 +70,16 @@ export class Driver {
     return { by: driverBy || "somebody", mine: driver === this.session?.name };
   }
 
-  /** What stands against driving, apart from what the car's messages say; an empty text if nothing does. */
+  /** Why the connection does not work; an empty text if it does. */
   block(obstacle: string): void {
     this.obstacle = obstacle;
     if (obstacle !== "") this.end(obstacle);
+  }
+
+  /** Whether an emergency stop is asked for. */
+  halt(stopped: boolean): void {
+    this.halted = stopped;
+    if (stopped) this.end(inWords("emergency_stop"));
   }
 
   /** The viewer holds the dead-man button, or not. */
@@ -91,7 +99,7 @@ export class Driver {
 
   /** The next hold takes over from whoever drives. */
   askTakeover(): void {
-    this.takeover = true;
+    [this.takeover, this.other] = [true, false];
   }
 
   hear(message: LiveMessage, now_ms: number): void {
@@ -105,8 +113,12 @@ export class Driver {
 
   /** The command to send now, if any. */
   tick(now_ms: number): Command | undefined {
+    const still_ms = now_ms - this.ticked_ms;
+    this.ticked_ms = now_ms;
     if (this.phase === "starting" || this.phase === "driving") {
-      const against = this.against(now_ms) || this.unanswered(now_ms);
+      // A key may have been let go meanwhile.
+      const frozen = still_ms > this.limits.lease_ms ? `This page stood still for ${Math.round(still_ms)} ms` : "";
+      const against = frozen || this.against(now_ms) || this.unanswered(now_ms);
       if (against !== "") this.end(against);
     }
     if (this.phase === "starting") return this.command(STANDING, now_ms);
@@ -135,9 +147,10 @@ export class Driver {
     this.takeover = false;
   }
 
-  /** Why the car must not be driven now. */
-  private against(now_ms: number): string {
+  /** Why the car must not be driven now; an empty text if nothing is against it. */
+  against(now_ms: number): string {
     if (this.obstacle !== "") return this.obstacle;
+    if (this.halted) return inWords("emergency_stop");
     if (this.clockless) return inWords("clock_offset_unknown");
     const age = this.age_ms(now_ms);
     if (age === undefined) return "Nothing has been heard of the car yet";

@@ -17,8 +17,12 @@ export class StopControl {
   private robot: string | undefined;
   private sure = false;
 
-  constructor(config: Config, header: HTMLElement) {
-    this.stops = new Stops(config, () => this.show());
+  /** `changed` is called when the cars' stops or limits may be others. */
+  constructor(config: Config, header: HTMLElement, changed: () => void) {
+    this.stops = new Stops(config, () => {
+      this.show();
+      changed();
+    });
     this.strip = el("div", { class: "stop-strip", hidden: "" }, this.words.node, this.release);
     header.after(this.strip);
     this.press.hidden = this.release.hidden = !this.stops.able;
@@ -49,8 +53,6 @@ export class StopControl {
   }
 
   private show(): void {
-    // While it is made, nothing is known yet.
-    if (!this.strip) return;
     const { stand, pending } = this.stops.stopped;
     const refused = this.robot === undefined ? "" : (this.stops.of(this.robot)?.reason ?? "");
     const texts = [

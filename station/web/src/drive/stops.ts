@@ -14,6 +14,8 @@ export class Stops {
   error = "";
   /** Whether this browser may stop cars, and release them. */
   readonly able: boolean;
+  /** Who drives, unless the viewer gives a name. */
+  user = "";
   private robots: Readonly<Record<string, MotionEntry>> = {};
   private timer: number | undefined;
   private soonUntil_ms = 0;
@@ -44,7 +46,7 @@ export class Stops {
     this.error = "";
     try {
       const answer = await act<MotionAnswer>("stop", { stopped: String(stopped), ...(robot === undefined ? {} : { robot }) });
-      this.take(answer.robots);
+      this.take(answer);
       const failed = Object.entries(answer.failed).map(([name, reason]) => `${name}: ${reason}`);
       if (failed.length > 0) this.error = `Not ${stopped ? "stopped" : "released"}: ${failed.join("; ")}`;
     } catch (error) {
@@ -60,7 +62,7 @@ export class Stops {
     window.clearTimeout(this.timer);
     if (document.hidden) return;
     try {
-      this.take((await ask<MotionAnswer>("motion", {})).robots);
+      this.take(await ask<MotionAnswer>("motion", {}));
       this.changed();
     } catch (error) {
       // What was known stays; an older server does not answer at all.
@@ -74,8 +76,9 @@ export class Stops {
     this.timer = window.setTimeout(() => void this.poll(), wait_ms);
   }
 
-  private take(robots: Readonly<Record<string, MotionEntry>>): void {
+  private take({ robots, user }: MotionAnswer): void {
     this.robots = { ...this.robots, ...robots };
+    this.user = user;
   }
 }
 

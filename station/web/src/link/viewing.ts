@@ -13,8 +13,13 @@ export type Looks = ReadonlyMap<string, number>;
 
 export const NONE: Looks = new Map();
 
+/** Whether the page has its own connection to the broker; a static site's may only listen. */
+const connected = ({ live, identity }: Config): boolean => live === "iot" && identity === null;
+
+/** Whether the page can ask cars for more than they send by themselves. */
+export const asks = (config: Config): boolean => config.actions.includes("view") || connected(config);
+
 export class Viewing {
-  /** Whether this page can ask cars for more than they send by themselves. */
   readonly able: boolean;
   private readonly served: boolean;
   private readonly connected: boolean;
@@ -30,9 +35,8 @@ export class Viewing {
     private readonly lease: (lease: Lease) => void,
   ) {
     this.served = config.actions.includes("view");
-    // A static site's identity may only listen.
-    this.connected = config.live === "iot" && config.identity === null;
-    this.able = this.served || this.connected;
+    this.connected = connected(config);
+    this.able = asks(config);
     if (!this.able) return;
     document.addEventListener("visibilitychange", () => this.hold());
     window.addEventListener("pagehide", () => this.hold(NONE));

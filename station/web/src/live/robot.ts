@@ -1,6 +1,6 @@
 // One car: its streams, the delays and the faults. Nothing here touches the page; times are those of base/clock.ts.
 
-import { GONE_S, LOG_STREAM, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
+import { DRIVE_STREAM, GONE_S, LOG_STREAM, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
 import { BOUNDS, DEEP_S, deepRows, MEDIAN_S, WINDOW_S } from "./bounds";
 import { lineOf, type Line } from "./lines";
 import { Ring } from "./ring";
@@ -86,6 +86,15 @@ export class Robot {
       if (name !== undefined) return name;
     }
     return undefined;
+  }
+
+  /** Who drives the car by hand, as it says. */
+  driver(now: number): string | undefined {
+    const stream = this.streams.get(DRIVE_STREAM);
+    const left_ms = stream?.sample.get("lease_left_ms");
+    if (!stream?.sample.get("driver") || typeof left_ms !== "number" || now > stream.heardAt + left_ms / 1000) return undefined;
+    const by = stream.sample.get("driver_by");
+    return typeof by === "string" ? by : "somebody";
   }
 
   newestDelay(): Delay | undefined {

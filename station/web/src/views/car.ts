@@ -20,6 +20,7 @@ import { Commands } from "../car/commands";
 import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
+import { asks } from "../link/viewing";
 import { barred, may } from "../server/admission";
 import { StreamSection } from "../car/field_tiles";
 
@@ -32,6 +33,7 @@ export class CarView {
   readonly node: HTMLElement;
   private readonly title = new Text("car-name", "h2");
   private readonly state = new Text("car-state");
+  private readonly asks: boolean;
   private readonly fault = el("p", { class: "fault", role: "alert", hidden: "" });
   private readonly gauges: readonly Gauge[];
   private readonly gaugeRow = el("div", { class: "gauges" });
@@ -57,9 +59,11 @@ export class CarView {
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
     links: HTMLElement,
+    drive: HTMLElement,
     /** Called when the address is another one. */
     changed: () => void,
   ) {
+    this.asks = asks(config);
     this.past = new Past(config);
     this.waterfall = new Waterfall(config);
     this.log = new AgentLog(config);
@@ -77,8 +81,9 @@ export class CarView {
       { class: "car", id: "car" },
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
       this.gaugeRow,
+      drive,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note" }, ONLY_LOOK)] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note only-look" }, ONLY_LOOK)] : []))),
       this.streams,
     );
   }
@@ -146,8 +151,9 @@ export class CarView {
   values(now: number): void {
     const { robot, table } = this;
     if (!robot || robot.version === this.drawn) return;
+    // What is drawn first was heard before the viewer came.
+    if (this.drawn >= 0) this.screens.push([now, (now - robot.heardAt) * 1000]);
     this.drawn = robot.version;
-    this.screens.push([now, (now - robot.heardAt) * 1000]);
     const vesc = robot.vesc(table);
     const speed = this.fleet.speed(robot.name);
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
@@ -179,11 +185,16 @@ export class CarView {
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
     const texts = {
       live: "live",
-      idle: `idle: newest values are ${age(now - robot.takenAt)} old`,
+      idle: `idle: newest values are ${age(now - robot.takenAt)} old${this.asks ? "" : ", and this page cannot ask for more"}`,
       stale: `stale: newest values are ${age(now - robot.takenAt)} old`,
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };
     this.state.set(linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`);
+  }
+
+  /** Who drives the car. */
+  driver(now: number): string | undefined {
+    return this.robot?.driver(now);
   }
 
   draw(now: number): void {

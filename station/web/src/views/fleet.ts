@@ -15,7 +15,7 @@ const FOLD_S = 60;
 // Cards change places at most this often, and never under the viewer's pointer or keyboard.
 const PLACE_S = 2;
 // A car that is asked sends its newest sample at once, and then has a card.
-const MOST_UNHEARD = 50;
+const MOST_COMING = 50;
 
 export class FleetView {
   readonly node: HTMLElement;
@@ -25,6 +25,8 @@ export class FleetView {
   private readonly cards = new Map<string, Card>();
   private readonly headings = new Map<string, { readonly node: HTMLElement; readonly count: Text }>();
   private readonly seen = new Set<string>();
+  /** The cars of whose cards it is known whether they are on the screen. */
+  private readonly judged = new Set<string>();
   private readonly nothing = el("p", { class: "note", role: "status", hidden: "" }, "No car has this name or tag.");
   private placedAt = -Infinity;
   private known = -1;
@@ -33,6 +35,7 @@ export class FleetView {
     (entries) => {
       for (const { target, isIntersecting } of entries) {
         const name = (target as HTMLElement).dataset["robot"]!;
+        this.judged.add(name);
         if (isIntersecting) this.seen.add(name);
         else this.seen.delete(name);
       }
@@ -82,10 +85,11 @@ export class FleetView {
     this.refresh();
   }
 
-  /** The cars whose cards are on the screen; and those that are connected and have not been heard yet. */
+  /** The cars whose cards are on the screen, and those whose cards are still to come. */
   get looked(): string[] {
-    const unheard = Object.entries(this.registry.robots ?? {}).filter(([name, { online }]) => online && !this.fleet.robots.has(name));
-    return [...this.seen, ...unheard.slice(0, MOST_UNHEARD).map(([name]) => name)];
+    const online = Object.entries(this.registry.robots ?? {}).flatMap(([name, presence]) => (presence.online ? [name] : []));
+    const coming = [...new Set([...this.fleet.robots.keys(), ...online])].filter((name) => !this.judged.has(name) && this.tools.finds(name));
+    return [...this.seen, ...coming.slice(0, MOST_COMING)];
   }
 
   /** Arrow keys move between the cards, which are links: Enter opens one. A slash searches. */
@@ -161,6 +165,7 @@ export class FleetView {
     card.node.remove();
     this.cards.delete(card.name);
     this.seen.delete(card.name);
+    this.judged.delete(card.name);
   }
 }
 

@@ -30,7 +30,8 @@ export class Card {
     const fresh = robot.freshness(now);
     const shown = linked || fresh === "live" ? fresh : "unlinked";
     setAttribute(this.node, "data-state", shown);
-    this.state.set({ live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
+    const driver = robot.driver(now);
+    this.state.set(driver !== undefined ? `${driver} drives` : { live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
     setAttribute(this.node, "data-fault", String(robot.fault(table) !== undefined));
     this.inside.update(robot, fleet, table, now);
   }
