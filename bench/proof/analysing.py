@@ -19,6 +19,7 @@ import iort_contract
 from bench import ROOT
 from bench.proof.cars import DriveSpec
 from bench.proof.drives import digest, simulated
+from iort_agent.sources.sim.parameters import VehicleConfig
 from iort_agent.sources.sim.sensors import ALL
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, Measured
@@ -52,9 +53,15 @@ def analysed(spec: DriveSpec) -> Analysed:
         return found
     streams, truth = simulated(spec)
     began = time.process_time()
-    # What the owner of a car knows: its weight, cells and pole pairs, and the gain of its vesc.yaml.
+    # What the owner of a car knows: its weight, cells and pole pairs, the rated capacity, and the gain of its
+    # vesc.yaml.
     car = spec.vehicle
-    known = {"mass_kg": car.mass_kg, "cells": float(car.cells), "pole_pairs": float(car.pole_pairs)}
+    known = {
+        "mass_kg": car.mass_kg,
+        "cells": float(car.cells),
+        "capacity_ah": VehicleConfig().capacity_ah,
+        "pole_pairs": float(car.pole_pairs),
+    }
     result = analyse(spec.key, streams, F1TENTH, known)
     cpu_s = time.process_time() - began
     truth = {**truth, "seconds": spec.seconds, "motor_sensor": float(spec.fields == ALL)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bench.proof.cars import DRIVE_S, DriveSpec, drive_of, fault_of
+from bench.proof.cars import ANY_CARS, DRIVE_S, DriveSpec, drive_of, fault_of
 from iort_agent.sources.sim.faults import KINDS, STRENGTHS
 
 # Numbers of drives and cars, apart from those of the healthy drives.
@@ -44,7 +44,8 @@ class Plan:
 
     def covered_drives(self) -> list[DriveSpec]:
         """A drive of each of the cars whose truth is held against the intervals."""
-        return [drive_of(_COVERED_FROM + i, 0, seconds=self.seconds) for i in range(self.covered)]
+        cars = range(_COVERED_FROM, _COVERED_FROM + self.covered)
+        return [drive_of(car, 0, seconds=self.seconds, cars=ANY_CARS) for car in cars]
 
     def all_drives(self) -> Iterator[DriveSpec]:
         """Every drive."""
@@ -60,5 +61,5 @@ class Plan:
         return self.cars * self.healthy * self.seconds / 3600
 
 
-FULL = Plan(cars=20, baseline=8, healthy=8, covered=200)
+FULL = Plan(cars=20, baseline=8, healthy=8, covered=270)
 QUICK = Plan(cars=4, baseline=6, healthy=3, covered=16)

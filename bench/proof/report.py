@@ -8,13 +8,13 @@ from statistics import median
 from bench.proof.judging import RIGHT, Case, Coverage, Detected, Judged
 from bench.proof.plan import Plan
 from bench.proof.speed import Bill, Hour
-from bench.proof.truths import INDICATORS
+from bench.proof.truths import INDICATORS, SPANNING
 from bench.report import plots
 from bench.report.result import Section
 from iort_agent.sources.sim.faults import KINDS, STRENGTHS
 
 _TARGETS = {"middle": 80.0, "strong": 95.0}
-_FALSE_ALARMS_HOURS, _COVERED = 24.0, (85.0, 95.0)
+_FALSE_ALARMS_HOURS, _COVERED, _LEAST_SPANNED = 24.0, (85.0, 95.0), 90.0
 # Other kinds of finding are named that come with this share of the strong faults.
 _OFTEN = 0.2
 
@@ -91,13 +91,21 @@ def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) 
     """How often the intervals hold the truth."""
     section = Section("coverage", "Intervals that hold the truth")
     head = ["parameter", "drives", "held", "width, median", "off, median"]
-    parameters = {name: one for name, one in sorted(found.items()) if name not in INDICATORS}
+    found = dict(sorted(found.items()))
+    others = INDICATORS | SPANNING
+    parameters = {name: one for name, one in found.items() if name not in others}
+    spanning = {name: one for name, one in found.items() if name in SPANNING}
+    indicators = {name: one for name, one in found.items() if name in INDICATORS}
     section.table(
         f"90 % intervals of {drives} healthy cars with a drive each",
         head,
         [_coverage(name, one, good=_covers(one)) for name, one in parameters.items()],
     )
-    indicators = {name: one for name, one in sorted(found.items()) if name in INDICATORS}
+    section.table(
+        "Intervals that span the makes and ages of battery cells, which no owner tells",
+        head,
+        [_coverage(name, one, good=100 * one.share >= _LEAST_SPANNED) for name, one in spanning.items()],
+    )
     section.table(
         "Indicators: only compared with the car's own earlier drives",
         head,
@@ -110,6 +118,14 @@ def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) 
         0.0,
         unit="parameters",
         tolerance=1.0,
+    )
+    section.ratio(
+        "intervals of a battery's charge and range that hold the truth",
+        round(100 * min(one.share for one in spanning.values()), 1),
+        _LEAST_SPANNED,
+        unit="%",
+        at_least=True,
+        tolerance=1.05,
     )
     section.notes.append(
         "Widths and errors are in % of the truth. An indicator's interval says how well a drive repeats; "

@@ -19,6 +19,9 @@ INDICATORS = frozenset(
         "temperature_drift_k",
     }
 )
+# Estimates whose interval spans what nobody tells: the make and the age of a battery's cells. The simulated
+# cars have one make, so they must hold more often than nine times in ten.
+SPANNING = frozenset({"battery_drawn_share", "battery_charge_left", "battery_range_left_km"})
 Truth = Callable[[Mapping[str, float]], float]
 
 
@@ -28,6 +31,10 @@ def _same(name: str) -> Truth:
 
 def _nothing(_truth: Mapping[str, float]) -> float:
     return 0.0
+
+
+def _drawn(truth: Mapping[str, float]) -> float:
+    return truth["charge"] - truth["charge_left"]
 
 
 def _moved_kg(truth: Mapping[str, float]) -> float:
@@ -74,6 +81,9 @@ TRUTHS: dict[str, Truth] = {
     "battery_slow_resistance_ohm": _same("battery_slow_resistance_ohm"),
     "battery_open_voltage_v": _same("open_voltage_v"),
     "battery_voltage_per_ah": _same("voltage_per_ah"),
+    "battery_drawn_share": _drawn,
+    "battery_charge_left": _same("charge_left"),
+    "battery_range_left_km": lambda truth: truth["distance_m"] / 1000 / _drawn(truth) * truth["charge_left"],
     "motor_resistance_25_ohm": _phase_ohm,
     "motor_resistance_ohm": _same("motor_resistance_now_ohm"),
     "motor_flux_linkage_wb": _same("flux_linkage_wb"),

@@ -31,7 +31,7 @@ _FIELDS = (VOLTAGE_FIELD, _CURRENT)
 _STEP_S = 0.2
 # The times of the slow resistances, and their size as a share of R0.
 _LAGS_S = (10.0, 30.0, 90.0)
-_SLOW, _SLOW_DEVIATION = 0.15, 0.09
+_SLOW, _SLOW_DEVIATION = 1 / 6, 0.1
 _PIECE_S = 450.0
 # Shorter drives, and such with a steadier current, say too little.
 _LEAST_S, _LEAST_A = 60.0, 0.5

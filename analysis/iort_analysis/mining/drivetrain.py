@@ -33,8 +33,12 @@ _LEAST_MPS = 0.3
 # The motor brakes with more than this; a brake that drags lets go in this time.
 _BRAKES_A, _RELEASE_S = 2.0, 4.0
 _LEAST_A = 1.0
+# Places of coefficients of the motion: the drag, and the first of the four of the slip.
+_DRAG, _SLIPS = 3, 5
 # The share of the friction that the tyres carry, a bit more than half: no field tells. Mean and variance.
 _BEYOND = (np.array([0.57]), np.array([[0.08**2]]))
+# The mass that the motor moves, for that which does not turn.
+_TURNING = 1.1
 _GAIN = "speed_to_erpm_gain"
 _FORCES = (
     "motor_force_n_per_a",
@@ -76,18 +80,21 @@ def _ratios(drive: Drive, motion: Fit, gain: float) -> dict[str, Estimate]:
     speed2, moved = _mean_square(drive, gain), (motion.coefficients, motion.covariance)
 
     def per_amp(c: Array) -> Any:
-        return math.sqrt(max(c[0] * c[1], 0.0)) * (1 + _slipped(c) * (1 - c[3] * speed2 / c[2]))
+        return math.sqrt(max(c[0] * c[1], 0.0)) * _coasting(c, speed2)
 
     return {
         "acceleration_per_a_mps2": propagated(per_amp, moved, unit="m/s2/A"),
-        "friction_per_mass_mps2": propagated(lambda c: c[2] * (1 + _slipped(c)), moved, unit="m/s2"),
+        "friction_per_mass_mps2": propagated(lambda c: c[2] * _coasting(c, speed2), moved, unit="m/s2"),
     }
 
 
 def _mean_square(drive: Drive, gain: float) -> float:
-    """The mean square of the speed in m2/s2."""
+    """The mean square of the speed over the way, in m2/s2."""
     speed = drive.of(drive.vesc, "speed")
-    return 0.0 if speed is None else float(np.nanmean((speed / gain) ** 2))
+    if speed is None:
+        return 0.0
+    speed = np.abs(speed / gain)
+    return float(np.nansum(speed**3) / max(float(np.nansum(speed)), 1e-12))
 
 
 def _fit_motion(drive: Drive, gain: float) -> Fit | str:
@@ -114,10 +121,20 @@ def _fit_motion(drive: Drive, gain: float) -> Fit | str:
     columns = [np.where(whole, _integrals(seconds, rate, edges), np.nan) for rate in rates]
     # Tyres slip in proportion to their force, so the wheels are faster than the car while it accelerates.
     slips = [speed * np.where(drives, current, 0.0), speed * np.where(drives, 0.0, current)]
-    columns += [np.diff(slip[edges]) for slip in (*slips, *(slip * current for slip in slips))]
+    slips += [slip * current for slip in slips]
+    columns += [np.diff(slip[edges]) for slip in slips]
     # Speed and current are not measured at quite the same time.
     columns += [np.diff(np.where(way, current, 0.0)[edges]) for way in (drives, ~drives)]
-    found = fit(columns, np.where(whole, np.diff(speed[edges]), np.nan))
+    wanted = np.where(whole, np.diff(speed[edges]), np.nan)
+    found = fit(columns, wanted)
+    if found is not None and found.coefficients[0] > 0:
+        c = found.coefficients
+        # The air feels the car's speed, not the wheels'.
+        car = speed - np.einsum("i,ij->j", c[_SLIPS : _SLIPS + 4], np.stack(slips))
+        columns[_DRAG] = np.where(whole, _integrals(seconds, -car * np.abs(car), edges), np.nan)
+        # With the drag the parts that turn take less of the tyres' force.
+        wanted = wanted - (_TURNING - 1) * c[_SLIPS] / c[0] * c[_DRAG] * np.diff(speed[edges] ** 3)
+        found = fit(columns, wanted)
     if found is None or min(found.coefficients[:2]) <= 0:
         return "the drive's accelerations do not tell mass from friction"
     return found
@@ -136,26 +153,31 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
     def per_amp(flux_wb: float, erpm_per_mps: float) -> float:
         return 1.5 * flux_wb * RAD_S_PER_ERPM * erpm_per_mps
 
+    speed2 = _mean_square(drive, used_gain)
+
+    def rolling(c: Array) -> float:
+        """The wheels' speed for the car's, over the drive: tyres carry friction and drag."""
+        return 1 + _slipped(c[2:]) * (float(c[-1]) + _dragged(c[2:], speed2))
+
     def mass_kg(c: Array) -> Any:
         # The accelerations were found with the gain, too. Both are of wheels that slip.
         seen = per_amp(c[0], c[1]) / math.sqrt(max(c[2] * c[3], 1e-12)) * c[1] / used_gain
-        return seen / (1 + _slipped(c[2:]) * (1 + c[-1]))
+        return seen / rolling(c) / _coasting(c[2:], speed2)
 
     def force_n(c: Array, index: int) -> Any:
-        return mass_kg(c) * c[index] * (1 + _slipped(c[2:]))
+        return mass_kg(c) * c[index] * _coasting(c[2:], speed2)
 
     parts = (flux, gains, moved, _BEYOND)
-    speed2 = _mean_square(drive, used_gain)
     estimates = {
-        "motor_force_n_per_a": propagated(
-            # Rolling wheels carry the air's drag too.
-            lambda c: per_amp(c[0], c[1]) / (1 + _slipped(c[2:]) * (c[-1] + c[5] * speed2 / c[4])),
-            *parts,
-            unit="N/A",
-        ),
+        "motor_force_n_per_a": propagated(lambda c: per_amp(c[0], c[1]) / rolling(c), *parts, unit="N/A"),
         "effective_mass_kg": propagated(mass_kg, *parts, unit="kg"),
         "friction_n": propagated(lambda c: force_n(c, 4), *parts, unit="N"),
-        "drag_n_s2_per_m2": propagated(lambda c: force_n(c, 5), *parts, unit="N s2/m2"),
+        "drag_n_s2_per_m2": propagated(
+            # A force for the square of a speed that is too high by so much.
+            lambda c: mass_kg(c) * c[5] / _coasting(c[2:], speed2),
+            *parts,
+            unit="N s2/m2",
+        ),
         "drivetrain_efficiency": propagated(lambda c: math.sqrt(max(c[0] / c[1], 0.0)), moved, unit="1"),
         "brake_drag_n": propagated(lambda c: force_n(c, 6), *parts, unit="N"),
     }
@@ -172,8 +194,18 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
 
 
 def _slipped(motion: Array) -> float:
-    """How much the wheels are faster than the car while they roll, compared with coasting."""
-    return float(motion[5] * motion[2] / max(motion[0], 1e-12))
+    """How much faster the wheels are under the force that holds the car against its friction."""
+    return float(motion[_SLIPS] * motion[2] / max(motion[0], 1e-12))
+
+
+def _dragged(motion: Array, speed2: float) -> float:
+    """The drag's share in what the tyres carry, for the friction."""
+    return float(_TURNING * motion[_DRAG] * speed2 / max(motion[2], 1e-12))
+
+
+def _coasting(motion: Array, speed2: float) -> float:
+    """The car's speed for that of the motion: of wheels without a current, by the drive's mean gain."""
+    return 1 + _slipped(motion) * (1 + _dragged(motion, speed2))
 
 
 def _dragging(seconds: Array, brakes: NDArray[np.bool_]) -> Array:

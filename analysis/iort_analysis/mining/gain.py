@@ -17,15 +17,15 @@ Array = NDArray[np.float64]
 
 # Windows in which motor and car are compared, and the distance that both need at least.
 _WINDOW_S, _LEAST_M, _LEAST_DRIVE_M = 1.0, 0.3, 20.0
+# An error of a position between two blocks is in both, with different signs: a jackknife that takes them for
+# independent is too wide, and the less so the fewer blocks there are.
+_BLOCKS = 10
 # A position that is this close to the motor's distance was calculated from it.
 _SAME_M = 5e-4
 
 
 def fit_gain(drive: Drive) -> Fit | str:
-    """The fit whose first coefficient is the gain in erpm per m/s, over the drive; or the reason for none.
-
-    The second one is its growth with the car's acceleration in m/s2: the tyres' slip.
-    """
+    """The fit whose only coefficient is the gain in erpm per m/s, over the drive; or the reason for none."""
     speed = drive.of(drive.vesc, "speed")
     if drive.pose is None or speed is None:
         return "needs the motor's speed and a second source of speed, such as a stream with the car's pose"
@@ -37,25 +37,31 @@ def fit_gain(drive: Drive) -> Fit | str:
     if len(times_us) < 2:
         return f"the stream {drive.pose} has no positions"
     steps_m = _steps(*(pose.columns[name][known] for name in ("x", "y", "heading")))
-    # The motor's way in erpm seconds: what the gain turns metres into.
-    turned = _turned(drive, speed, times_us)
     steps_m[np.diff(times_us) > pause_us(times_us)] = np.nan
     window = (times_us[:-1] - times_us[0]) // round(_WINDOW_S * 1e6)
     starts = np.flatnonzero(np.append(True, window[1:] != window[:-1]))
-    way_m = np.add.reduceat(steps_m, starts)
-    motor = np.add.reduceat(turned, starts)
-    took_s = np.add.reduceat(np.diff(times_us), starts) / 1e6
+    way_m, took_s = np.add.reduceat(steps_m, starts), np.add.reduceat(np.diff(times_us), starts) / 1e6
     way_m[(np.abs(way_m) < _LEAST_M) | (took_s < _WINDOW_S / 2)] = np.nan
     if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
         return f"needs {_LEAST_DRIVE_M:g} m of driving with a pose"
-    acceleration = _slope(way_m / took_s, took_s)
-    acceleration -= np.nansum(way_m * acceleration) / np.nansum(np.where(np.isfinite(acceleration), way_m, 0))
-    found = fit([way_m, way_m * acceleration], motor)
-    if found is None:
+    # The motor's way in erpm seconds: what the gain turns metres into. It has next to no noise, and the
+    # positions have: the way is fitted to the motor's, so that the noise makes nothing smaller.
+    turned, cubes = (
+        np.add.reduceat(_integral(drive, column, times_us), starts) for column in (speed, speed**3)
+    )
+    # Tyres slip by their force: what accelerates the car, and what the air takes.
+    squares = np.interp(times_us, drive.samples.times_us, speed * np.abs(speed))
+    slips = (np.diff(squares[np.append(starts, len(times_us) - 1)]), cubes)
+    usable = np.isfinite(way_m + turned + cubes + slips[0])
+    found = fit(
+        [turned, *(slip - turned * slip[usable].sum() / turned[usable].sum() for slip in slips)], way_m
+    )
+    if found is None or not found.coefficients[0]:
         return "the drive is too short for the gain"
-    if found.sigma < _SAME_M * abs(float(found.coefficients[0])):
+    if found.sigma < _SAME_M:
         return f"the positions of {drive.pose} are calculated from the motor's speed, so they say nothing new"
-    return found
+    gain = 1 / found.coefficients[:1]
+    return found._replace(coefficients=gain, covariance=found.covariance[:1, :1] * gain**4)
 
 
 def _steps(x: Array, y: Array, heading: Array) -> Array:
@@ -66,21 +72,14 @@ def _steps(x: Array, y: Array, heading: Array) -> Array:
     return np.asarray(chord / np.sinc(turn / (2 * np.pi)), dtype=np.float64)
 
 
-def _turned(drive: Drive, speed: Array, times_us: NDArray[np.int64]) -> Array:
-    """The integral of the motor's speed between each two times; NaN where it is not known."""
+def _integral(drive: Drive, values: Array, times_us: NDArray[np.int64]) -> Array:
+    """The integral of values of the drive's samples between each two times; NaN where they are not known."""
     samples_us = drive.samples.times_us
     took_s = np.diff(samples_us) / 1e6
-    parts = (speed[1:] + speed[:-1]) / 2 * took_s
+    parts = (values[1:] + values[:-1]) / 2 * took_s
     parts[np.diff(samples_us) > pause_us(samples_us)] = np.nan
     unknown = np.append(0.0, np.cumsum(np.isnan(parts)))
     total = np.append(0.0, np.cumsum(np.nan_to_num(parts)))
     since = times_us - samples_us[0]
     at, lost = (np.interp(since, samples_us - samples_us[0], column) for column in (total, unknown))
     return np.where(np.diff(lost) > 0, np.nan, np.diff(at))
-
-
-def _slope(speeds: Array, took_s: Array) -> Array:
-    """The acceleration in each window, from the windows before and after it."""
-    made = np.full(len(speeds), np.nan)
-    made[1:-1] = (speeds[2:] - speeds[:-2]) / (took_s[1:-1] * 2)
-    return made

@@ -40,23 +40,25 @@ class Prior(NamedTuple):
 class Fit(NamedTuple):
     """The coefficients of a linear model with their covariance; and the residuals, NaN where none is known.
 
-    ``sigma`` is the deviation of a single value from the model, without outliers.
+    ``sigma`` is the deviation of a single value from the model, without outliers. ``blocks`` is how many
+    blocks' spread the covariance is of.
     """
 
     coefficients: Array
     covariance: Array
     residuals: Array
     sigma: float
+    blocks: int = BLOCKS
 
     def estimate(self, weights: Array, unit: str) -> Estimate:
         """A weighted sum of the coefficients."""
         deviation = float(np.sqrt(weights @ self.covariance @ weights))
-        return estimate(float(weights @ self.coefficients), deviation, unit)
+        return estimate(float(weights @ self.coefficients), deviation, unit, self.blocks)
 
     def of(self, index: int, unit: str) -> Estimate:
         """One coefficient."""
         deviation = float(np.sqrt(self.covariance[index, index]))
-        return estimate(float(self.coefficients[index]), deviation, unit)
+        return estimate(float(self.coefficients[index]), deviation, unit, self.blocks)
 
 
 def fit(
@@ -65,6 +67,7 @@ def fit(
     *,
     priors: Mapping[int, Prior] | None = None,
     resolution: float = 0.0,
+    blocks: int = BLOCKS,
 ) -> Fit | None:
     """Fit ``wanted`` as a sum of columns; None if the drive does not tell the columns apart.
 
@@ -76,20 +79,20 @@ def fit(
     design = np.stack(columns)
     known = np.isfinite(design).all(axis=0) & np.isfinite(wanted)
     design, y = design[:, known], wanted[known]
-    if len(y) < 2 * BLOCKS or len(y) < 4 * len(design):
+    if len(y) < 2 * blocks or len(y) < 4 * len(design):
         return None
     scale = np.sqrt(np.einsum("ij,ij->i", design, design) / len(y))
     if not scale.all():
         return None
     design /= scale[:, None]
-    problem = _Problem(design, y, resolution, *_scaled(priors or {}, scale), _starts(len(y)))
+    problem = _Problem(design, y, resolution, *_scaled(priors or {}, scale), _starts(len(y), blocks))
     solved = problem.solve()
     if solved is None:
         return None
     coefficients, covariance, sigma = solved
     residuals = np.full(len(wanted), np.nan)
     residuals[known] = y - coefficients @ design
-    return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma)
+    return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma, blocks)
 
 
 def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], unit: str) -> Estimate:
@@ -106,9 +109,9 @@ def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], un
     return estimate(float(function(at)), float(np.sqrt(variance)), unit)
 
 
-def estimate(value: float, deviation: float, unit: str) -> Estimate:
+def estimate(value: float, deviation: float, unit: str, blocks: int = BLOCKS) -> Estimate:
     """The estimate with its interval."""
-    half = sides(BLOCKS - 1) * deviation
+    half = sides(blocks - 1) * deviation
     return Estimate(value, value - half, value + half, unit)
 
 
@@ -193,8 +196,8 @@ def _scaled(priors: Mapping[int, Prior], scale: Array) -> tuple[Array, Array]:
     return np.diag(precision), mean
 
 
-def _starts(rows: int) -> NDArray[np.int64]:
-    return np.linspace(0, rows, BLOCKS + 1)[:-1].astype(np.int64)
+def _starts(rows: int, blocks: int) -> NDArray[np.int64]:
+    return np.linspace(0, rows, blocks + 1)[:-1].astype(np.int64)
 
 
 def _median(known: Array) -> float:
