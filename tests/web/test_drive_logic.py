@@ -195,7 +195,7 @@ def test_one_drives_and_another_may_take_over_when_asked() -> None:
     other = {"outcome": "driven_by_another", "driver": "ffff", "by": "bob"}
     refused = [8, {"hold": True, **AHEAD, "link": other}]
     told = drive([4], refused)
-    assert (told["reason"], told["other"]) == ("bob drives this car", True)
+    assert (told["reason"], told["other"]) == ("bob drives this car", "bob")
     assert set(speeds(told)) == {0}
     assert not any("takeover" in one for one in told["sent"])
     assert told["driving"] == {"by": "bob", "mine": False}

@@ -26,8 +26,8 @@ export class Driver {
   /** Why the hold is over, or why none can begin; for the viewer. */
   reason = "";
   rtt_ms: number | undefined;
-  /** Whether the last hold ended because another drives, so that taking over may be offered. */
-  other = false;
+  /** Who drives instead, if that has ended the last hold: taking over may be offered. */
+  other = "";
   /** The viewer's own top speed. */
   top_mps: number;
   stick: Stick = CENTRE;
@@ -91,7 +91,7 @@ export class Driver {
       [this.phase, this.reason] = ["free", ""];
       return;
     }
-    [this.other, this.corrections] = [false, 0];
+    [this.other, this.corrections] = ["", 0];
     const against = this.against(now_ms);
     if (against === "") this.begin(now_ms);
     else [this.phase, this.reason] = ["over", against];
@@ -99,7 +99,7 @@ export class Driver {
 
   /** The next hold takes over from whoever drives. */
   askTakeover(): void {
-    [this.takeover, this.other] = [true, false];
+    [this.takeover, this.other] = [true, ""];
   }
 
   hear(message: LiveMessage, now_ms: number): void {
@@ -197,9 +197,8 @@ export class Driver {
   }
 
   private lose(driven: Driven): void {
-    const was = this.phase;
-    this.end(`${driven.driverBy || "Somebody"} ${was === "driving" ? "has taken over" : "drives this car"}`);
-    this.other = true;
+    this.other = driven.driverBy || "Somebody";
+    this.end(`${this.other} ${this.phase === "driving" ? "has taken over" : "drives this car"}`);
   }
 
   private command(motion: Motion, now_ms: number): Command | undefined {

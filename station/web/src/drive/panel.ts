@@ -173,8 +173,8 @@ export class DrivePanel {
     this.who.set(who ? (who.mine ? "you drive" : `${who.by} drives`) : "nobody drives");
     const against = phase === "free" ? driver.against(at_ms) : "";
     this.say(phase === "over" ? `${driver.reason}. Let go to begin again.` : against || WORDS[phase]);
-    this.over.hidden = !driver.other;
-    if (driver.other && !this.sure) this.over.textContent = `Take over from ${who && !who.mine ? who.by : "the other driver"}`;
+    this.over.hidden = driver.other === "";
+    if (!this.sure) this.over.textContent = `Take over from ${driver.other}`;
   }
 
   private takeOver(): void {
