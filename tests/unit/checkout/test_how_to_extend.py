@@ -206,6 +206,23 @@ def test_the_way_to_add_a_function_works(copy: Copy) -> None:
     assert copy.show("callable(handler)", "from functions.count import handler") is True
 
 
+def test_the_way_to_add_a_miner_works(copy: Copy) -> None:
+    assert len(set(copy.follow("A miner"))) == 3
+    found = copy.show(
+        "analyse(KEY, {'vesc': Block(times, columns)}).mined.estimates['reversing_share']",
+        "import numpy as np",
+        "from iort_analysis.process import analyse",
+        "from iort_analysis.samples.blocks import Block",
+        "from tests.unit.analysis.simulated import KEY, START_US",
+        "times = START_US + 20_000 * np.arange(6000)",
+        "speed = np.where(np.arange(6000) % 2000 < 500, -3000.0, 9000.0)",
+        "columns = {'speed': speed, 'voltage_input': speed * 0 + 12, 'current_motor': speed / 1000}",
+    )
+    value, low, high, unit = found
+    assert (value, unit) == (0.25, "1")
+    assert low < 0.25 < high
+
+
 def test_the_way_to_add_a_verb_works(copy: Copy) -> None:
     assert len(set(copy.follow("A verb"))) == 2
     iort = "from iort_station.cli.main import main; main()"
