@@ -24,6 +24,7 @@ from iort_agent.sources.sim.circuit import HALL
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
@@ -164,7 +165,7 @@ class _Demo:
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
         # The figures are of a car that somebody looks at from its start.
-        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S)
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=embedded.live == IOT)
         with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
             began = time.monotonic()
             with self._console.status("starting the agent") as status:

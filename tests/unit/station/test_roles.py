@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, timezone
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -14,6 +15,8 @@ from iort_contract.cloud import DRIVER, PUBNUB, VIEWER
 from iort_station.errors import StationError
 from iort_station.fleet import roles
 from iort_station.fleet.roles import Role, has_drivers, signed_url, transport
+from iort_station.page.page import config
+from iort_station.page.socket import actions, everybody, reaching
 
 BROKER = "wss://abc-ats.iot.eu-west-1.amazonaws.com/mqtt"
 KEY = ReadOnlyCredentials("AKIA", "secret", "a/token+")
@@ -26,6 +29,12 @@ class Cloud:
 
     def __init__(self, **outputs: str) -> None:
         self.outputs, self.assumed = outputs, 0
+
+    websocket = None
+    meta = SimpleNamespace(endpoint_url="")
+
+    def output(self, _noun: str, name: str) -> str:
+        return self.outputs[name]
 
     def find_output(self, _noun: str, name: str) -> str | None:
         return self.outputs.get(name)
@@ -56,6 +65,26 @@ def test_the_token_follows_the_signature_and_is_not_in_it(monkeypatch):
 
 def _signature(url: str) -> str:
     return parse_qs(urlsplit(url).query)["X-Amz-Signature"][0]
+
+
+def test_a_page_is_told_where_it_listens_and_may_connect_there():
+    cloud: Any = Cloud(
+        LiveTransport="iot", DriverRole="d", PublicPoolId="eu-west-1:1", PublicRobots="car1,car2"
+    )
+    told = everybody(cloud)
+    assert told["live"] == "iot"
+    assert told["identity"] | {"endpoint": ""} == {
+        "pool": "eu-west-1:1",
+        "region": "eu-west-1",
+        "endpoint": "",
+        "socket": BROKER,
+        "client_prefix": "iort-viewer-",
+        "robots": ["car1", "car2"],
+    }
+    assert "sub-c-" not in str(config(namespace="iort", **told))
+    assert reaching(cloud, "iot") == {"live": "iot", "broker": "wss://abc-ats.iot.eu-west-1.amazonaws.com"}
+    assert actions(cloud).keys() == {"drive"}
+    assert not actions(Cloud())  # type: ignore[arg-type]  # a fake
 
 
 def test_a_role_is_assumed_again_before_its_credentials_end(monkeypatch):
