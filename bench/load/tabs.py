@@ -60,9 +60,13 @@ class Tabs:
         """Close a tab that covers another one."""
         self._ask("GET", f"/json/close/{tab}")
 
+    def processes(self) -> list[int]:
+        """Every process of the browser."""
+        return [self._process.pid, *usage.descendants(self._process.pid)]
+
     def signal(self, number: int) -> None:
         """Send a signal to every process of the browser."""
-        for pid in (self._process.pid, *usage.descendants(self._process.pid)):
+        for pid in self.processes():
             os.kill(pid, number)
 
     def _ask(self, method: str, path: str) -> Any:

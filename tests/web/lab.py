@@ -138,7 +138,12 @@ class Lab:
 
     def motion(self, asked: Mapping[str, str]) -> dict[str, Any]:
         cars = {
-            name: {"asked": told, "stopped": stands, "reason": "", "drive": LIMITS if name == "car-1" else None}
+            name: {
+                "asked": told,
+                "stopped": stands,
+                "reason": "",
+                "drive": LIMITS if name == "car-1" else None,
+            }
             for name, (told, stands) in self.cars.items()
             if asked.get("robot", name) == name
         }
