@@ -165,8 +165,8 @@ class _Demo:
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
-        # The figures are of a car that somebody looks at from its start.
-        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S)
+        # The figures are of a car that somebody looks at from its start, by either way to the page.
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=True)
         with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
             began = time.monotonic()
             with self._console.status("starting the agent") as status:
