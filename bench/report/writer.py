@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.report.result import Section, Table
+from bench.report.result import Plot, Ratio, Section, Table
 
 
 class Report(NamedTuple):
@@ -71,3 +71,16 @@ def write(
     (folder / f"{report.name}.md").write_text(markdown(sections, machine, target, report))
     found = {"target": target, "machine": machine, "sections": [section.as_json() for section in sections]}
     (folder / f"{report.name}.json").write_text(json.dumps(found, indent=1, default=str) + "\n")
+
+
+def read(folder: Path, report: Report = BENCH) -> tuple[list[Section], dict[str, Any]]:
+    """The sections of a report that `write` wrote, and its machine."""
+    found = json.loads((folder / f"{report.name}.json").read_text())
+    for section in found["sections"]:
+        section["tables"] = [Table(**one) for one in section["tables"]]
+        section["ratios"] = [Ratio(**one) for one in section["ratios"]]
+        section["plots"] = [
+            Plot(**one, svg=(folder / f"{report.name}-{one['name']}.svg").read_text())
+            for one in section["plots"]
+        ]
+    return [Section(**section) for section in found["sections"]], found["machine"]

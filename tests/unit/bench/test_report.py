@@ -90,6 +90,7 @@ def test_a_written_report_is_complete_and_old_pictures_are_deleted(tmp_path):
     kept = json.loads((tmp_path / "report.json").read_text())
     assert kept["sections"][0]["raw"] == {"values": [1, 2]}
     assert guard.ratios(kept)["r"].value == 1
+    assert writer.read(tmp_path) == ([_section(Ratio("r", 1, 2))], MACHINE)
 
 
 def _report(*ratios, cpu="A processor", key="query"):

@@ -22,7 +22,7 @@ from iort_contract.tables import RECEIVED_MS
 from iort_station.page.answers import history
 from tests.fakes import TELEMETRY, item_of_message, record_of
 from tests.ros1_types import Message, header
-from tests.unit.functions.summarizing import Stream
+from tests.unit.functions.summary.summarizing import Stream
 from tests.unit.station.test_data import cloud_of
 
 ROOT = Path(__file__).resolve().parents[3]

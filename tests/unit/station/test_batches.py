@@ -27,7 +27,7 @@ from tests.fakes import TELEMETRY, item_of_message
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import text, u32
 from tests.unit.contract.test_columns import BOOT, WRONG, columns, message_of, plain_message
-from tests.unit.functions.summarizing import drive_of
+from tests.unit.functions.summary.summarizing import drive_of
 from tests.unit.station.test_data import cloud_of
 
 

@@ -36,7 +36,7 @@ from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
 from tests.fakes import ARCHIVE, TELEMETRY, item_of, item_of_message
 from tests.unit.contract.ros1_messages import text, u32
-from tests.unit.functions.summarizing import Stream
+from tests.unit.functions.summary.summarizing import Stream
 from tests.unit.station.test_data import FakeCloud, cloud_of
 
 HOUR = 3_600_000_000

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from iort_analysis.drives.finding import LONGEST_US
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.run import (
@@ -65,10 +66,12 @@ def analyse(
         return
     done = _watched(cloud, run)
     asked: list[str | None] = list(robots) if robots else [None]
+    # A drive that goes on in the range may have begun before.
+    from_us = max(0, request.start_us - 2 * LONGEST_US)
     failed = sum(
-        finding.kind == ANALYSIS_FAILED
+        finding.kind == ANALYSIS_FAILED and finding.to_us >= request.start_us
         for robot in asked
-        for finding in findings.findings(cloud, robot, request.start_us, request.end_us)
+        for finding in findings.findings(cloud, robot, from_us, request.end_us)
     )
     facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"

@@ -17,7 +17,7 @@ from tests.fakes import (
     SUMMARY,
 )
 from tests.recordings import recording
-from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch, counted, drive_of
+from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, counted, drive_of
 
 
 def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys):

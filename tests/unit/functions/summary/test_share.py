@@ -18,7 +18,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import TableError
 from iort_contract.tables import OVER_SHARE, PUT_OFF
 from iort_contract.topics import RECORD, SHADOW, build_topic
-from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
+from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, counted
 
 GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))
 

@@ -16,7 +16,7 @@ from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,
 )
-from tests.unit.functions.summarizing import T0, S, Stream, batch, clean
+from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, clean
 
 
 @st.composite

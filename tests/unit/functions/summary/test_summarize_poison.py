@@ -20,7 +20,7 @@ from tests.fakes import (
     FakeDynamoDB,
     item_of_message,
 )
-from tests.unit.functions.summarizing import T0, S, Stream, batch, clean, counted
+from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, clean, counted
 
 
 def poison(**changes):

@@ -8,7 +8,7 @@ from functions.shared.summary.processing import process
 from functions.shared.summary.stored import SECOND_BATCHES, Reader
 from iort_contract.messages.batch import Batch
 from tests.fakes import TOPIC_OF_CAR
-from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch
+from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch
 
 MANY = 3 * SECOND_BATCHES
 

@@ -16,7 +16,7 @@ from tests.fakes import (
     item_of,
     record_of,
 )
-from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch, clean, counted
+from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, clean, counted
 
 
 def test_a_late_batch_fills_the_gap_that_its_successor_reported(stream, capsys):
