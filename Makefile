@@ -14,9 +14,10 @@ help: ## show this
 setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py
 
-demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong REPORT=report.json PORT=8080
+demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong LIVE=pubnub REPORT=report.json PORT=8080
 	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
-		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT))
+		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT)) \
+		$(if $(LIVE),--live $(LIVE))
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder

@@ -45,6 +45,8 @@ _STREAM = "vesc"
 _WATCHED = "car1"
 # Two messages of an idle car.
 _COUNTED_S = 20.0
+# A watched car is never silent for so long.
+_SILENT_S = 2.0
 _FAR_S, _LATENCY_S, _DROPS_S = 65.0, 0.2, 20.0
 _LAPTOP = {"width": 1440, "height": 900}
 
@@ -169,11 +171,8 @@ class _Looking:
             with self._page(f"#/car/{_WATCHED}") as second:
                 first.goto(f"{self._url}#/alarms")
                 yield self._count("one car, and the first of two viewers leaves", second)
-        began = time.monotonic()
-        _sleeps(self._counted)
-        yield self._count(
-            "the second one closes its page", None, f"idle after {time.monotonic() - began:.1f} s"
-        )
+        slept_s = _sleeps(self._counted)
+        yield self._count("the second one closes its page", None, f"idle after {slept_s:.1f} s")
 
     def killed(self) -> Look:
         """Kill the process of a page that looks at the car."""
@@ -184,9 +183,7 @@ class _Looking:
             for process in processes:
                 if process["type"] == "renderer":
                     os.kill(process["id"], signal.SIGKILL)
-            began = time.monotonic()
-            _sleeps(self._counted)
-            slept_s = time.monotonic() - began
+            slept_s = _sleeps(self._counted)
         if slept_s > VIEW_LEASE_MS / 1000 + 2:
             raise BenchError(f"a killed page held its car awake for {slept_s:.1f} s")
         return self._count("its process is killed", None, f"idle after {slept_s:.1f} s")
@@ -235,9 +232,11 @@ def _far(browser: Any, cloud: Cloud) -> Look:
     return Look("200 ms and a drop every 20 s", heard, 0.0, f"{note}, median delay {delay:.0f} ms")
 
 
-def _sleeps(counted: Counted) -> None:
-    """Wait until the watched car sends no more than an idle one."""
-    _until(lambda: counted.silent_s(_WATCHED) > 2, "the car to sleep", 60)
+def _sleeps(counted: Counted) -> float:
+    """Wait until the watched car sends no more than an idle one; return how long it went on, in seconds."""
+    began = time.monotonic()
+    _until(lambda: counted.silent_s(_WATCHED) > _SILENT_S, "the car to sleep", 60)
+    return max(0.0, time.monotonic() - began - counted.silent_s(_WATCHED))
 
 
 def _until(true: Callable[[], bool], what: str, seconds: float) -> None:

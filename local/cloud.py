@@ -27,6 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from urllib.parse import urlsplit
 
 from typing_extensions import Self
 
@@ -129,6 +130,12 @@ class EmbeddedCloud:
         self._warm_up()
         self.cloud.save(self.folder / EMBEDDED.name)
         self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
+
+    @property
+    def page_ports(self) -> list[int]:
+        """The ports that a page connects to, beside its server's."""
+        relay = urlsplit(self.cloud.websocket_url).port or 0
+        return [relay, self.pubnub.port] if self.live == PUBNUB else [relay]
 
     def _start_pubnub(self, port: int) -> None:
         self._progress("PubNub stand-in")

@@ -24,6 +24,7 @@ from iort_agent.sources.sim.circuit import HALL
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
@@ -32,8 +33,9 @@ from iort_station.operations import delivery
 from iort_station.page import control
 from iort_station.page.answers import actions, answers
 from iort_station.page.downloads import downloads
-from iort_station.page.listener import Listener
+from iort_station.page.listening import Listening, listening
 from iort_station.page.server import PageServer
+from iort_station.page.socket import reaching
 from local import demo_options
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
@@ -100,12 +102,15 @@ class _Demo:
 
     def run(self) -> Figures:
         with ExitStack() as stack:
-            embedded = stack.enter_context(EmbeddedCloud(self._options.folder, progress=self._step))
+            live = self._options.live
+            embedded = stack.enter_context(
+                EmbeddedCloud(self._options.folder, live=live, progress=self._step)
+            )
             vehicles = {ROBOT: dict(robots.F1TENTH)}
             page = stack.enter_context(
                 PageServer(
                     namespace=embedded.namespace,
-                    **embedded.keys.reading(),
+                    **reaching(embedded.cloud, live),
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
                     downloads=downloads(embedded.cloud),
@@ -115,13 +120,7 @@ class _Demo:
                     port=self._options.port,
                 )
             )
-            listener = stack.enter_context(
-                Listener(
-                    robot=ROBOT,
-                    namespace=embedded.namespace,
-                    **embedded.keys.reading(),
-                )
-            )
+            listener = stack.enter_context(listening(embedded.cloud, live, robot=ROBOT))
             self._step("car")
             bundle = robots.add(
                 embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
@@ -131,7 +130,7 @@ class _Demo:
                 highlight=False,
                 soft_wrap=True,
             )
-            ports = (page.port, embedded.pubnub.port)
+            ports = (page.port, *embedded.page_ports)
             forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
             self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", highlight=False)
             report = self._drive(embedded, bundle, listener)
@@ -163,10 +162,10 @@ class _Demo:
         settings = {"sources": [source], "ping": _PING}
         return settings if self._options.bag is not None else {**settings, "downlink": DOWNLINK}
 
-    def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
+    def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
-        # The figures are of a car that somebody looks at from its start, by either way to the page.
-        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=True)
+        # The figures are of a car that somebody looks at from its start.
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=embedded.live == IOT)
         with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
             began = time.monotonic()
             with self._console.status("starting the agent") as status:
@@ -188,7 +187,7 @@ class _Demo:
             raise KeyboardInterrupt
         return agent.wait(_STATUS_S) is None
 
-    def _status_line(self, embedded: EmbeddedCloud, listener: Listener, seconds: float) -> str:
+    def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
         stored = sum(len(b.times_us) for b in delivery.batches(embedded.cloud, ROBOT, VESC_STREAM))
         heard = list(listener.heard)
         delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
@@ -196,7 +195,7 @@ class _Demo:
             f"driving {seconds:3.0f} s, stored {stored:,} samples, live {len(heard):,} updates, delay {delay}"
         )
 
-    def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listener) -> Figures:
+    def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:
         """Read the tables until Lambda 2 has summarised every sample, for at most 30 s."""
         streams = [name for name in report["streams"] if name not in OWN_STREAMS]
         sent = sum(report["streams"][name]["samples"] for name in streams)

@@ -13,6 +13,7 @@ from iort_agent.common.schema import Place
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.recording.bag import BagConfig, BagSource
 from iort_agent.sources.sim.faults import fault_rule
+from iort_contract.cloud import IOT, PUBNUB
 from local.cloud import FOLDER
 
 
@@ -20,7 +21,8 @@ def read() -> argparse.Namespace:
     """The options; ends the process with an error if one is wrong."""
     parser = argparse.ArgumentParser(
         prog="make demo",
-        usage="make demo [DURATION=20] [BAG=drive.bag] [FAULTS=kind:strength] [REPORT=r.json] [PORT=8080]",
+        usage="make demo [DURATION=20] [BAG=drive.bag] [FAULTS=kind:strength] [LIVE=pubnub] [REPORT=r.json] "
+        "[PORT=8080]",
         description="A car drives through the embedded cloud, and the demo counts the samples that arrive.",
     )
     parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
@@ -29,6 +31,12 @@ def read() -> argparse.Namespace:
     )
     parser.add_argument(
         "--faults", type=_faults, default=[], metavar="KIND:STRENGTH,...", help="of the simulated car"
+    )
+    parser.add_argument(
+        "--live",
+        choices=[IOT, PUBNUB],
+        default=IOT,
+        help="the way of live messages: AWS IoT's own, or PubNub's with a stand-in (default: %(default)s)",
     )
     parser.add_argument("--report", type=Path, metavar="FILE", help="write the figures as JSON")
     parser.add_argument("--port", type=int, default=0, help="the page's port (default: a free one)")

@@ -44,6 +44,7 @@ STAGES: dict[str, dict[str, Any]] = {
     "dev": {},
     "prod": {
         "stage": "prod",
+        "drivers": True,
         "customer_key": True,
         "budget_usd": 50,
         "alarm_email": "lab@example.org",

@@ -131,6 +131,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
 
     files = f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03"
+    every_robot = "who may watch or drive may do so with every robot of the fleet"
     a_robot = "the wildcard is the robot, which is known when the message arrives"
     to_a_queue = {
         "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
@@ -177,6 +178,18 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         },
         "fleet/Provisioning": {"W3005": "RegisterThing tests role and policy, which must exist first"},
         "fleet/PresenceRole/DefaultPolicy": {**to_a_queue},
+        **{
+            f"fleet/{person}/DefaultPolicy": {
+                wide(
+                    f"{iot}:client/{settings.namespace}-{person.lower()}-*"
+                ): "every connection has its own id",
+                **{wide(f"{iot}:{what}/{settings.namespace}/*"): every_robot for what in topics},
+            }
+            for person, topics in {
+                "Viewer": ("topicfilter/live", "topic/live", "topic/view"),
+                "Driver": ("topicfilter/live", "topic/live", "topic/view", "topic/cmd"),
+            }.items()
+        },
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
             wide(f"{iot}:topic/pong/{settings.namespace}/*/lambda"): a_robot,

@@ -68,5 +68,14 @@ def test_the_site_uses_tls_and_the_headers_of_the_pages_own_server(site):
     }
 
 
+def test_without_pubnub_the_page_connects_to_aws_iot_and_cognito_of_its_region_only(deployment, reader):
+    template = deployment(live_transport="iot", drivers=True, site=True).templates["iort-site"]
+    (headers,) = of(template, "AWS::CloudFront::ResponseHeadersPolicy")
+    security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
+    aws = "${AWS::Region}.${AWS::URLSuffix}"
+    wanted = security_policy(f"https://cognito-identity.{aws}", f"wss://*.iot.{aws}")
+    assert reader.text(security["ContentSecurityPolicy"]["ContentSecurityPolicy"]) == wanted
+
+
 def test_the_site_is_optional(synthesized):
     assert "site" not in synthesized.templates

@@ -221,8 +221,9 @@ def test_only_a_browser_that_was_invited_may_act(
     show(page, car.send())
     assert commands.is_visible()
     assert page.url == address.partition("?")[0]
+    # The address was used, and this browser keeps the key.
     again = page.context.new_page()
-    again.goto(page.url)
+    again.goto(address)
     until(lambda: again.evaluate("window.iort?.link") == "live", "another tab to connect")
     show(again, car.send())
     assert again.get_by_role("heading", name="Commands").is_visible()

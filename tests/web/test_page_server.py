@@ -320,6 +320,16 @@ def test_a_server_that_others_reach_may_not_move_a_robot(host: str) -> None:
     assert not on_loopback(host)
 
 
+def test_without_pubnub_the_page_may_connect_to_the_broker_only(built: Path) -> None:
+    broker = "wss://abc-ats.iot.eu-west-1.amazonaws.com"
+    drive: Any = {"drive": lambda _asked: {}}
+    with PageServer(namespace="iort", live="iot", broker=broker, actions=drive, built=built) as page:
+        answer, body = ask(page, "/config.json")
+    assert f"connect-src 'self' {broker};" in answer.headers["Content-Security-Policy"]
+    told = json.loads(body)
+    assert (told["live"], told["drivers"], told["subscribe_key"]) == ("iot", True, "")
+
+
 def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:

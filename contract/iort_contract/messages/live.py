@@ -106,11 +106,17 @@ def _next_entry(next_ms: Any) -> dict[str, int]:
 
 
 def live_update(
-    robot: str, stream: str, live: LiveSample, received_ms: int, lambda_us: int
+    robot: str,
+    stream: str,
+    live: LiveSample,
+    received_ms: int | None = None,
+    lambda_us: int | None = None,
 ) -> dict[str, Any]:
     """Lambda 1's message to PubNub: the sample, the time of every hop so far and, if the car knows it, the
-    clock offset that converts the car's times to the cloud's."""
-    hops = {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us}
+    clock offset that converts the car's times to the cloud's. A sample from the broker has no hop before."""
+    hops = {"sent_us": live.sent_us}
+    if received_ms is not None and lambda_us is not None:
+        hops |= {RECEIVED_MS: received_ms, "lambda_us": lambda_us}
     return {
         "v": SCHEMA_VERSION,
         ROBOT: robot,
@@ -125,13 +131,14 @@ def live_update(
 
 
 class LiveUpdate(NamedTuple):
-    """A live sample as PubNub's subscribers receive it, with the cloud's times of receipt and of sending."""
+    """A live sample as a subscriber receives it. From PubNub it has the cloud's times of receipt and of
+    sending; from the broker it has none."""
 
     robot: str
     stream: str
     live: LiveSample
-    received_ms: int
-    lambda_us: int
+    received_ms: int | None
+    lambda_us: int | None
 
 
 def decode_live_update(message: Any) -> LiveUpdate:
@@ -141,12 +148,13 @@ def decode_live_update(message: Any) -> LiveUpdate:
     hops = message["hops"]
     times = {name: hops[name] for name in ("sent_us", "offset_us") if name in hops}
     live = decode_live({**message, NONFINITE: 0, **times})
+    by_lambda = RECEIVED_MS in hops or "lambda_us" in hops
     return LiveUpdate(
         robot=check_robot(text(message, ROBOT)),
         stream=check_stream(text(message, "stream")),
         live=live,
-        received_ms=integer(hops, RECEIVED_MS),
-        lambda_us=check_time(integer(hops, "lambda_us"), "lambda_us"),
+        received_ms=integer(hops, RECEIVED_MS) if by_lambda else None,
+        lambda_us=check_time(integer(hops, "lambda_us"), "lambda_us") if by_lambda else None,
     )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -51,6 +51,12 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. A script must give it.")]
 Token = Annotated[
     str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
+]
+LiveWay = Annotated[
+    Literal["pubnub", "iot"] | None,
+    typer.Option(
+        "--live", help="The way of live messages: PubNub, or AWS IoT's own. Default: the deployment's."
+    ),
 ]
 TrackFile = Annotated[
     Path | None,

@@ -34,12 +34,13 @@ class ClockOffset(NamedTuple):
 
 
 class Times(NamedTuple):
-    """The times of one update at each place, in microseconds since the epoch by the place's clock."""
+    """The times of one update at each place, in microseconds since the epoch by the place's clock. An update
+    from the broker was at neither rule nor Lambda 1, and PubNub's time is 0."""
 
     sample_us: int
     sent_us: int
-    rule_us: int
-    lambda_us: int
+    rule_us: int | None
+    lambda_us: int | None
     pubnub_us: int
     here_us: int
     car_to_cloud_us: int | None
@@ -72,6 +73,7 @@ CAR, RULE, LAMBDA, PUBNUB, HERE = (
     "Lambda 1 to PubNub",
     "PubNub to this subscriber",
 )
+BROKER = "car to this subscriber, by the broker"
 
 
 def times(update: Mapping[str, Any], pubnub_us: int, here_us: int) -> Times:
@@ -80,7 +82,7 @@ def times(update: Mapping[str, Any], pubnub_us: int, here_us: int) -> Times:
     return Times(
         sample_us=heard.live.t_us,
         sent_us=heard.live.sent_us,
-        rule_us=heard.received_ms * 1000 + _STAMP_US,
+        rule_us=None if heard.received_ms is None else heard.received_ms * 1000 + _STAMP_US,
         lambda_us=heard.lambda_us,
         pubnub_us=pubnub_us,
         here_us=here_us,
@@ -119,39 +121,50 @@ def pubnub_clock(origin: str, *, tls: bool) -> Iterator[Callable[[], int]]:
 def trace(
     updates: Sequence[Times],
     *,
-    here_to_pubnub: ClockOffset,
+    here_to_pubnub: ClockOffset | None,
     car_uncertainty_ms: float | None,
     newest_rtt: Batch | None = None,
 ) -> Trace:
-    """Summarise at least one update; ``car_uncertainty_ms`` is the agent's own metric."""
+    """Summarise at least one update, from PubNub or, without ``here_to_pubnub``, from the broker.
+
+    ``car_uncertainty_ms`` is the agent's own metric.
+    """
     known = all(one.car_to_cloud_us is not None for one in updates)
     here = here_to_pubnub
-    delays: dict[str, list[float]] = {
-        CAR: [one.sent_us - one.sample_us for one in updates],
-        RULE: [one.rule_us - one.sent_us - (one.car_to_cloud_us or 0) for one in updates],
-        LAMBDA: [one.lambda_us - one.rule_us for one in updates],
-        PUBNUB: [one.pubnub_us - one.lambda_us for one in updates],
-        HERE: [one.here_us + here.offset_us - one.pubnub_us for one in updates],
-    }
-    uncertain: dict[str, float | None] = {
-        CAR: 0.0,
-        RULE: car_uncertainty_ms if known else None,
-        LAMBDA: _STAMP_US / 1000,
-        # Nobody compares the clocks of AWS and PubNub, which are both set by NTP.
-        PUBNUB: None,
-        HERE: here.uncertainty_us / 1000,
-    }
+    delays: dict[str, list[float]] = {CAR: [one.sent_us - one.sample_us for one in updates]}
+    uncertain: dict[str, float | None] = {CAR: 0.0}
+    if here is None:
+        delays[BROKER] = [one.here_us - one.sent_us - (one.car_to_cloud_us or 0) for one in updates]
+        # Nobody compares this machine's clock with AWS'; both are set by NTP.
+        uncertain[BROKER] = None
+    else:
+        _by_pubnub(updates, here, delays)
+        uncertain |= {
+            RULE: car_uncertainty_ms if known else None,
+            LAMBDA: _STAMP_US / 1000,
+            # Nobody compares the clocks of AWS and PubNub, which are both set by NTP.
+            PUBNUB: None,
+            HERE: here.uncertainty_us / 1000,
+        }
     whole = [sum(parts) for parts in zip(*delays.values(), strict=True)]
     # In the sum, only the offsets of the car's clock and of ours remain.
-    ends = (
-        None if not known or car_uncertainty_ms is None else car_uncertainty_ms + here.uncertainty_us / 1000
-    )
+    compared = known and car_uncertainty_ms is not None and here is not None
+    ends = (car_uncertainty_ms or 0.0) + here.uncertainty_us / 1000 if compared and here else None
     return Trace(
         updates=len(updates),
         hops=[_hop(name, values, uncertain[name]) for name, values in delays.items()],
         whole=_hop("sample to this subscriber", whole, ends),
         round_trips_ms=round_trips_ms(newest_rtt),
     )
+
+
+def _by_pubnub(updates: Sequence[Times], here: ClockOffset, delays: dict[str, list[float]]) -> None:
+    for one in updates:
+        rule_us, lambda_us = one.rule_us or 0, one.lambda_us or 0
+        delays.setdefault(RULE, []).append(rule_us - one.sent_us - (one.car_to_cloud_us or 0))
+        delays.setdefault(LAMBDA, []).append(lambda_us - rule_us)
+        delays.setdefault(PUBNUB, []).append(one.pubnub_us - lambda_us)
+        delays.setdefault(HERE, []).append(one.here_us + here.offset_us - one.pubnub_us)
 
 
 def round_trips_ms(newest: Batch | None) -> dict[str, float]:

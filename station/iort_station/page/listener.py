@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 from pubnub.callbacks import SubscribeCallback
 from pubnub.enums import PNReconnectionPolicy, PNStatusCategory
@@ -16,28 +15,11 @@ from typing_extensions import Self
 
 from iort_contract.cloud import channel
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.tables import ROBOT, T_US
 from iort_contract.topics import check_namespace
 from iort_station.errors import StationError
+from iort_station.page.heard import Heard, OnUpdate, heard_of
 
 _CONNECT_S = 15.0
-
-
-class Heard(NamedTuple):
-    """One update: its delay from the car to this machine, its sample's time in microseconds, and the hops."""
-
-    robot: str
-    stream: str
-    boot: str
-    seq: int
-    delay_ms: float
-    t_us: int
-    hops: Mapping[str, int]
-
-
-# Takes an update, the time at which PubNub took it and the time of its arrival here, in microseconds. It is
-# called in the listener's own thread.
-OnUpdate = Callable[[dict[str, Any], int, int], None]
 
 
 class Listener:
@@ -110,15 +92,4 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
         if self._on_update is not None:
             self._on_update(update, int(message.timetoken) // 10, now_us)
             return
-        hops = update["hops"]
-        self.heard.append(
-            Heard(
-                robot=update[ROBOT],
-                stream=update["stream"],
-                boot=update["boot"],
-                seq=update["seq"],
-                delay_ms=(now_us - hops["sent_us"]) / 1000,
-                t_us=update[T_US],
-                hops=hops,
-            )
-        )
+        self.heard.append(heard_of(update, now_us))

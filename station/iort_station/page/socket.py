@@ -25,13 +25,11 @@ def actions(cloud: Cloud) -> dict[str, Answer]:
     return {DRIVE: _addresses(cloud, DRIVER)} if has_drivers(cloud) else {}
 
 
-def reaching(cloud: Cloud, live: str = "") -> dict[str, Any]:
-    """Keyword arguments for a page's server: its way to live messages, the deployment's own if ``live`` is
-    empty.
+def reaching(cloud: Cloud, live: str) -> dict[str, Any]:
+    """Keyword arguments for a page's server: the way ``live`` of live messages, and the broker's address.
 
     Raises `StationError` if that way cannot be used.
     """
-    live = live or transport(cloud)
     pubnub = keys.load(cloud).reading() if live == PUBNUB else {}
     # A driver's commands go to the broker, whichever way the page listens.
     broker = {"broker": _origin(cloud)} if live == IOT or has_drivers(cloud) else {}

@@ -10,6 +10,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.messages.live import LiveSample, live_update
 from iort_station.cli.verbs.operations.trace import bar
 from iort_station.operations.trace import (
+    BROKER,
     CAR,
     HERE,
     LAMBDA,
@@ -52,6 +53,17 @@ def test_hops_are_right_with_wrong_clocks(car_off_us, here_off_us):
     uncertain = {hop.name: hop.uncertainty_ms for hop in found.hops}
     assert uncertain == {CAR: 0.0, RULE: 1.5, LAMBDA: 0.5, PUBNUB: None, HERE: 0.4}
     assert found.whole.uncertainty_ms == pytest.approx(1.9)
+
+
+def test_an_update_from_the_broker_has_two_hops():
+    live = LiveSample("0badcafe", 1, T_US - 90_000, T_US - 89_300, {"speed": 1}, 0, 90_000)
+    here_us = T_US + TRUE[CAR] + 25_000
+    found = trace(
+        [times(live_update("car7", "vesc", live), 0, here_us)], here_to_pubnub=None, car_uncertainty_ms=1.5
+    )
+    assert {hop.name: hop.p50_ms for hop in found.hops} == {CAR: 0.7, BROKER: 25.0}
+    assert found.whole.p50_ms == pytest.approx(25.7)
+    assert found.whole.uncertainty_ms is None
 
 
 def test_a_car_without_a_clock_offset_has_no_uncertainty():

@@ -11,18 +11,21 @@ let admitted = false;
 /** Whether an address has a token. */
 export const invited = (hash: string): boolean => IN_ADDRESS.test(hash);
 
-/** Take the token out of the address, or see if the kept key is still the server's. */
+/** Take the token out of the address; without a good one, see if the kept key is still the server's. */
 export async function enter(config: Config): Promise<void> {
-  const token = IN_ADDRESS.exec(location.hash)?.[1] ?? kept(KEPT_KEY);
+  const tokens = [IN_ADDRESS.exec(location.hash)?.[1], kept(KEPT_KEY)];
   history.replaceState(null, "", location.hash.replace(IN_ADDRESS, ""));
-  if (config.keyed.length === 0 || !token) return;
-  try {
-    const { key } = await act<Admitted>("key", { token });
-    keep(KEPT_KEY, key);
-    admitted = true;
-  } catch (error) {
-    // The page is for looking, then, and says where the address is.
-    if (!(error instanceof AnswerError)) throw error;
+  if (config.keyed.length === 0) return;
+  for (const token of tokens) {
+    if (!token || admitted) continue;
+    try {
+      const { key } = await act<Admitted>("key", { token });
+      keep(KEPT_KEY, key);
+      admitted = true;
+    } catch (error) {
+      // The page is for looking, then, and says where the address is.
+      if (!(error instanceof AnswerError)) throw error;
+    }
   }
 }
 

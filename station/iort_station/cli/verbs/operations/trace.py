@@ -12,17 +12,20 @@ from rich.table import Table
 
 from iort_contract.catalog.streams import RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, Robot
+from iort_station.cli.options import AsJson, LiveWay, Robot
 from iort_station.cli.words import examples
+from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+from iort_station.fleet.roles import transport
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations import audit, trace
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.listening import listening
 
 commands = typer.Typer()
 # Characters of the other columns, and of the longest and shortest whole bar.
@@ -38,6 +41,7 @@ def trace_(
     ] = VESC_STREAM,
     updates: Annotated[int, typer.Option(min=1, help="How many updates to wait for.")] = 50,
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for them at most.")] = 15.0,
+    live: LiveWay = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the delay of a robot's live updates, hop by hop, from the sample in the car to this machine."""
@@ -52,12 +56,14 @@ def trace_(
             if len(found) >= updates:
                 enough.set()
 
-    pubnub = keys.load(cloud)
-    listener = Listener(robot=robot, namespace=cloud.namespace, on_update=take, **pubnub.reading())
-    viewer = Viewer(cloud, [robot])
-    with listener, viewer, errors.status(f"listening to {robot}"):
-        with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
-            here_to_pubnub = trace.clock_of(ask, lambda: time.time_ns() // 1000)
+    way = live or transport(cloud)
+    viewer = Viewer(cloud, [robot], broker=way == IOT)
+    with (
+        listening(cloud, way, robot=robot, on_update=take),
+        viewer,
+        errors.status(f"listening to {robot}"),
+    ):
+        here_to_pubnub = _pubnub_clock(cloud) if way == PUBNUB else None
         enough.wait(seconds)
     if not found:
         raise StationError(
@@ -74,6 +80,12 @@ def trace_(
         print_json(asdict(result))
     else:
         _show(robot, result)
+
+
+def _pubnub_clock(cloud: Cloud) -> trace.ClockOffset:
+    pubnub = keys.load(cloud)
+    with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
+        return trace.clock_of(ask, lambda: time.time_ns() // 1000)
 
 
 def _show(robot: str, result: trace.Trace) -> None:

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import tell
-from iort_station.cli.options import AsJson, Token, TrackFile
+from iort_station.cli.options import AsJson, LiveWay, Token, TrackFile
 from iort_station.cli.words import examples, say
 from iort_station.fleet import registry
-from iort_station.page import keys
+from iort_station.fleet.roles import transport
 
 commands = typer.Typer()
 
@@ -31,6 +31,7 @@ def dashboard(
         list[str] | None,
         typer.Option(help="Another name of this server than localhost; may be repeated."),
     ] = None,
+    live: LiveWay = None,
     token: Token = "",
     track: TrackFile = None,
     as_json: AsJson = False,
@@ -42,6 +43,7 @@ def dashboard(
     from iort_station.page.downloads import downloads  # noqa: PLC0415 - as above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
+    from iort_station.page.socket import reaching  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
     with PageServer(
@@ -58,7 +60,7 @@ def dashboard(
         host=host,
         port=port,
         names=name or (),
-        **keys.load(cloud).reading(),
+        **reaching(cloud, live or transport(cloud)),
     ) as page:
         address = page.invitation()
         tell({"url": page.url, "address": address}, f"{address}  (Ctrl-C stops)", as_json=as_json)

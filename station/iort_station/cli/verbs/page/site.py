@@ -10,9 +10,9 @@ from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
 from iort_station.cli.words import examples
 from iort_station.fleet import registry
-from iort_station.page import keys
 from iort_station.page.page import config, load_track
 from iort_station.page.site import publish, upload
+from iort_station.page.socket import everybody
 
 commands = typer.Typer()
 
@@ -41,13 +41,12 @@ def site(
         gone = upload(cloud.client("s3"), cloud.output("site", "PageBucket"), {})
         tell({"deleted": len(gone)}, f"{len(gone)} files deleted", as_json=as_json)
         return
-    vehicles, pubnub = registry.vehicles(cloud), keys.load(cloud).reading()
     told = config(
         namespace=cloud.namespace,
-        vehicles=vehicles,
+        vehicles=registry.vehicles(cloud),
         token=token,
         track=None if track is None else load_track(track),
-        **pubnub,
+        **everybody(cloud),
     )
     url = publish(cloud, told)
     tell({"url": url}, url, as_json=as_json)

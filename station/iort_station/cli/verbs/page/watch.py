@@ -15,15 +15,16 @@ from rich.live import Live
 from rich.text import Text
 
 from iort_contract.catalog.derived import Vehicle
+from iort_contract.cloud import IOT
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
 from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import out
-from iort_station.cli.options import Token
+from iort_station.cli.options import LiveWay, Token
 from iort_station.cli.words import examples, say
 from iort_station.fleet import registry, viewing
-from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.fleet.roles import transport
+from iort_station.page.listening import listening
 from iort_station.page.watch import FleetWatch
 from iort_station.times import iso
 
@@ -46,20 +47,21 @@ def watch(
             min=LIVE_MIN_RATE_HZ, max=LIVE_MAX_RATE_HZ, help="Updates a second to ask of each stream."
         ),
     ] = _RATE_HZ,
+    live: LiveWay = None,
     token: Token = "",
 ) -> None:
     """Show every car in the terminal, live, until Ctrl-C. The cars send at the rate asked for until then."""
     cloud = context.obj.cloud()
     vehicles = {robot: Vehicle(**car) for robot, car in registry.vehicles(cloud).items()}
     fleet, done = FleetWatch(vehicles), threading.Event()
-    listener = Listener(
-        robot=None,
-        namespace=cloud.namespace,
+    way = live or transport(cloud)
+    listener = listening(
+        cloud,
+        way,
         on_update=(lambda update, _, now_us: _print_line(update, now_us, done)) if as_json else fleet.take,
         token=token,
-        **keys.load(cloud).reading(),
     )
-    viewer = viewing.Viewer(cloud, lambda: viewing.online(cloud), rate_hz=rate)
+    viewer = viewing.Viewer(cloud, lambda: viewing.online(cloud), rate_hz=rate, broker=way == IOT)
     try:
         with listener, viewer:
             if as_json:
