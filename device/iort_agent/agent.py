@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from dataclasses import replace
 from typing import Callable, Mapping
 
 from iort_agent.clock import Clock
@@ -11,6 +12,7 @@ from iort_agent.common.version import agent_version
 from iort_agent.config import Config
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.motion.commands import Operator
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.upload import make_uploader
 from iort_agent.files.uploads import make_uploads
@@ -53,6 +55,8 @@ class Agent:
             live_when=config.live.when,
             motion_stopped=config.motion.stopped,
         )
+        self.kept_stop = KeptStop(config.queue.path if config.downlink.moves() else None)
+        in_force = replace(base, motion_stopped=base.motion_stopped or self.kept_stop.stopped)
         self.record = RecordLane(
             robot=config.robot,
             namespace=config.namespace,
@@ -78,6 +82,7 @@ class Agent:
         self.shadow = Shadow(
             link,
             base=base,
+            in_force=in_force,
             apply=self.apply,
             known_fields=self.streams.known_fields,
             version=agent_version(),
@@ -120,18 +125,20 @@ class Agent:
             clock=clock, spool=spool, uplink=uplink, offset=self.offset, uploads=self.uploads
         )
         self.rates = Rates(clock)
-        self.apply(base)
+        self.apply(in_force)
 
     def apply(self, settings: RuntimeSettings) -> None:
         """Apply other settings to all parts, at once and from any thread."""
+        # First, because nothing may delay or prevent it.
+        if self.downlink is not None:
+            self.downlink.set_stopped(settings.motion_stopped)
+            self.kept_stop.keep(stopped=settings.motion_stopped)
         if settings.log_level != self.streams.settings.log_level:
             set_level(settings.log_level)
         self.live.enabled = settings.live_enabled
         self.viewers.apply(settings)
         self.pings.set_rate(settings.ping_rate_hz)
         self.streams.apply(settings)
-        if self.downlink is not None:
-            self.downlink.set_stopped(settings.motion_stopped)
 
     def _drove(self, config: Config) -> Callable[[Mapping[str, Value]], None]:
         """Takes the samples of who drove; a source with a stream of this name goes first."""

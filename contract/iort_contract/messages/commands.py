@@ -34,7 +34,8 @@ class Command:
     which began at ``started_us``; ``seq`` numbers its commands, and ``by`` is who sends them. The command is
     stale ``valid_ms`` after ``sent_us``, by the cloud's clock. ``lease_ms`` limits a motion, also from
     ``sent_us``; a motion without it is refused. While the lease of one session holds, motions of another are
-    refused, unless it is later and says ``takeover``. A session that was refused so stays refused.
+    refused, unless it is later and says ``takeover``. A session that was refused so stays refused. A motion
+    that ``ends`` its lease stops the robot at once, and lets others drive.
     ``message`` is the ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`,
     name, ``session``, ``seq`` and ``outcome``, which is `ACCEPTED` or the reason.
     """
@@ -49,6 +50,7 @@ class Command:
     answer: bool = False
     by: str | None = None
     takeover: bool = False
+    ends: bool = False
 
     @property
     def order(self) -> tuple[int, str, int]:
@@ -111,7 +113,7 @@ def check_by(by: Any) -> str:
 def _check_command(command: Command) -> None:
     checked(BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
     check_header(command.session, command.seq, 0)
-    for name, flag in (("answer", command.answer), ("takeover", command.takeover)):
+    for name, flag in (("answer", command.answer), ("takeover", command.takeover), ("ends", command.ends)):
         if not isinstance(flag, bool):
             raise ContractError(f"{name} must be true or false, got {shown(flag)}")
     if command.by is not None:

@@ -39,7 +39,8 @@ _NOT_FOUND = 404
 
 class Shadow:
     """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
-    the cloud's last report of batches that it put off. ``drive`` is reported; ``moves`` tells whether the
+    the cloud's last report of batches that it put off. ``in_force`` are the
+    settings until the shadow is known, if not the file's. ``drive`` is reported; ``moves`` tells whether the
     robot has a motion that can be stopped."""
 
     def __init__(
@@ -47,13 +48,14 @@ class Shadow:
         link: Link,
         *,
         base: RuntimeSettings,
+        in_force: RuntimeSettings | None = None,
         apply: Callable[[RuntimeSettings], None],
         known_fields: Callable[[], Mapping[str, Any]],
         version: str,
         drive: DriveLimits | None = None,
         moves: bool = False,
     ) -> None:
-        self._base = self.settings = base
+        self._base, self.settings = base, in_force or base
         self._apply = apply
         self._known_fields = known_fields
         self._agent_version, self._drive, self._moves = version, drive, moves

@@ -166,7 +166,7 @@ class Driver:
         if not self._stops:
             return None
         self._stops -= 1
-        return self._command(Stick(), now_us)
+        return self._command(Stick(), now_us, ends=True)
 
     def _begin(self, now_us: int) -> None:
         self._session, self._started_us = secrets.token_hex(8), self._cloud_us(now_us)
@@ -237,7 +237,7 @@ class Driver:
         else:
             self._end(REFUSALS.get(outcome, outcome))
 
-    def _command(self, stick: Stick, now_us: int) -> Command:
+    def _command(self, stick: Stick, now_us: int, *, ends: bool = False) -> Command:
         seq, limits = self._seq, self.limits
         self._seq += 1
         self._waiting[seq] = now_us
@@ -252,6 +252,7 @@ class Driver:
             lease_ms=DRIVE_LEASE_MS,
             by=self._by,
             takeover=self.takeover,
+            ends=ends,
         )
 
     def _cloud_us(self, now_us: int) -> int:

@@ -13,8 +13,10 @@ import pytest
 from iort_agent.agent import Agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
+from iort_agent.common.schema import Place, load
 from iort_agent.common.state import Status, document, read
 from iort_agent.config import Config
+from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -23,6 +25,9 @@ from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.sim.graph import DRIVE_TYPE
+from iort_agent.sources.sim.source import SimConfig
+from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.interface import REJECT_NEW
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.metrics import MetricsConfig
@@ -33,6 +38,12 @@ from iort_contract.messages.message_type import MessageType, message_type
 from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000
+
+
+DOWNLINK = {
+    "cmd": {"drive": {"topic": "/drive", "type": DRIVE_TYPE, "partial": True, "motion": {"stop": {}}}},
+    "drive": {},
+}
 
 
 class Script:
@@ -83,6 +94,22 @@ class Rig:
         batches = [decode_batch(m.payload) for m in self.uplink.published if m.topic == topic]
         self.seqs = [batch.seq for batch in batches]
         return [value for batch in batches for value in batch.columns["speed"]]
+
+
+def test_an_emergency_stop_outlives_the_agent_also_without_a_connection(tmp_path: Path) -> None:
+    downlink = load(DownlinkConfig, DOWNLINK, Place(tmp_path))
+    settings = {"sources": (SimConfig(),), "downlink": downlink, "queue": QueueConfig(tmp_path / "queue.db")}
+
+    def run() -> Agent:
+        return Rig(connected=False, **settings).agent
+
+    first = run()
+    first.apply(replace(first.shadow.settings, motion_stopped=True))
+    second = run()
+    assert second.shadow.settings.motion_stopped
+    assert "emergency stop: no motion until an operator releases it" in make_status(second).alarms
+    second.apply(replace(second.shadow.settings, motion_stopped=False))
+    assert not run().shadow.settings.motion_stopped
 
 
 def test_every_sample_is_recorded_and_the_report_says_so() -> None:

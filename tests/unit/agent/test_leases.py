@@ -105,6 +105,16 @@ def test_a_stick_held_while_another_drove_moves_nothing_when_that_one_lets_go() 
     assert offered(leases, C, 0.4, seq=0) is None, "the next press of the same driver"
 
 
+def test_a_motion_that_ends_its_lease_stops_the_robot_and_lets_others_drive() -> None:
+    leases = Leases(LIMITS)
+    assert offered(leases, A, seq=0) is None
+    assert offered(leases, A, 0.1, seq=1, ends=True) is None
+    assert leases.driver(0.1) is None
+    assert offered(leases, B, 0.1, seq=0) is None
+    assert offered(leases, A, 0.1, seq=2, ends=True) == SUPERSEDED
+    assert not leases.stop_due(0.1)
+
+
 def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -> None:
     leases = Leases(LIMITS)
     assert offered(leases, A, seq=0) is None

@@ -56,7 +56,7 @@ def test_a_fleet_message_is_decoded_as_it_was_encoded(seq: int, sent: int, messa
         {"session": "x"}, {"session": None}, {"seq": -1}, {"seq": True}, {"started_us": T0 + 1},
         {"sent_us": 1.5}, {"sent_us": 2**60}, {"valid_ms": 0}, {"valid_ms": 60_001}, {"lease_ms": 0},
         {"lease_ms": 10_001}, {"message": []}, {"message": None}, {"message": {"a": float("nan")}},
-        {"takeover": 1}, {"by": ""}, {"by": "a" * 65}, {"by": "a\nb"},
+        {"takeover": 1}, {"ends": None}, {"by": ""}, {"by": "a" * 65}, {"by": "a\nb"},
         {"message": {"a": "x" * 200_000}}, {"message": {"a": {1, 2}}},
     ],
 )  # fmt: skip

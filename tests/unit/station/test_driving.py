@@ -83,6 +83,7 @@ def test_letting_go_stops_the_car_and_the_next_hold_is_another_session() -> None
     rig.driver.hold(held=False, now_us=rig.now_us)
     rig.step(10)
     assert speeds(rig)[-4:] == [1.0, 0, 0, 0]
+    assert [command.ends for command in rig.sent][-4:] == [False, True, True, True]
     rig.driver.hold(held=True, now_us=rig.now_us)
     rig.step(5)
     assert rig.sent[-1].session != first

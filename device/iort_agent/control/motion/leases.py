@@ -71,7 +71,7 @@ class Leases(Stops):
             return reason
         self.last = command
         if lease_s is not None:
-            self.move(now + lease_s)
+            self.move(now if command.ends else now + lease_s)
         return None
 
     def why_stopped(self) -> str:

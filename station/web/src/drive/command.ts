@@ -14,6 +14,8 @@ export interface Command {
   readonly message: Readonly<Record<string, unknown>>;
   readonly by: string;
   readonly takeover?: true;
+  /** It ends the lease at once, so that others may drive. */
+  readonly ends?: true;
 }
 
 /** One hold of the stick. */
@@ -23,7 +25,7 @@ export interface Session {
   readonly by: string;
 }
 
-export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean }): Command {
+export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
   const lease_ms = Math.min(DRIVE_LEASE_MS, limits.lease_ms);
   return {
     v: SCHEMA_VERSION,
@@ -37,6 +39,7 @@ export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sen
     message: messageOf(limits, motion),
     by: session.by,
     ...(takeover ? { takeover } : {}),
+    ...(ends ? { ends } : {}),
   };
 }
 

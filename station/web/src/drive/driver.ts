@@ -125,7 +125,7 @@ export class Driver {
     if (this.phase === "driving") return this.command(meant(this.stick, { top_mps: this.top_mps, ...this.limits }), now_ms);
     if (this.stops === 0) return undefined;
     this.stops -= 1;
-    return this.command(STANDING, now_ms);
+    return this.command(STANDING, now_ms, true);
   }
 
   private begin(now_ms: number): void {
@@ -201,13 +201,13 @@ export class Driver {
     this.end(`${this.other} ${this.phase === "driving" ? "has taken over" : "drives this car"}`);
   }
 
-  private command(motion: Motion, now_ms: number): Command | undefined {
+  private command(motion: Motion, now_ms: number, ends = false): Command | undefined {
     if (!this.session) return undefined;
     const { seq } = this;
     this.seq += 1;
     this.waiting.push({ seq, left_ms: now_ms });
     this.waiting = this.waiting.filter(({ left_ms }) => now_ms - left_ms < ANSWER_MS + DRIVE_LEASE_MS);
-    return commandOf(this.session, this.limits, { seq, sent_us: this.cloud_us(now_ms), motion, takeover: this.takeover });
+    return commandOf(this.session, this.limits, { seq, sent_us: this.cloud_us(now_ms), motion, takeover: this.takeover, ends });
   }
 
   private cloud_ms(now_ms: number): number | undefined {

@@ -11,8 +11,9 @@ import type { Lease, LinkState, Listening } from "./worker_messages";
 declare function importScripts(...urls: string[]): void;
 declare const mqtt: { readonly connect: typeof import("mqtt").connect };
 
-// An address takes several requests to AWS.
+// An address takes several requests to AWS, and the connection several round trips.
 const OPEN_S = 15;
+const CONNECT_S = 10;
 // The least that AWS IoT allows; the probe finds a dead connection sooner.
 const KEEPALIVE_S = 30;
 // A reason code of MQTT 5 from this on is a failure.
@@ -71,7 +72,7 @@ export class IotLink extends Link {
     try {
       const { url, client_id } = await socketAddress(identity);
       if (opened !== this.opened) return;
-      client = mqtt.connect(url, { protocolVersion: 5, clientId: client_id, clean: true, reconnectPeriod: 0, resubscribe: false, keepalive: KEEPALIVE_S, connectTimeout: ANSWER_S * 1000, timerVariant: "native" });
+      client = mqtt.connect(url, { protocolVersion: 5, clientId: client_id, clean: true, reconnectPeriod: 0, resubscribe: false, keepalive: KEEPALIVE_S, connectTimeout: CONNECT_S * 1000, timerVariant: "native" });
     } catch (error) {
       if (opened !== this.opened) return;
       if (error instanceof AnswerError) this.lose(error.message);

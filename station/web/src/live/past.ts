@@ -11,6 +11,8 @@ const LEAST_S = 300;
 const ROWS = 3000;
 // The newest second was not recorded yet when the page asked first.
 const RECORDED_S = 4;
+// Values further apart are not those of a car that is looked at closely.
+const HOLE_S = 0.9;
 
 export class Past {
   private robot: Robot | undefined;
@@ -32,14 +34,20 @@ export class Past {
     for (const stream of robot.streams.values()) {
       // Its lines are texts: car/agent_log.ts.
       if (stream.name === LOG_STREAM) continue;
-      const heard = stream.history.start;
+      const heard = heardSince(stream);
       const to = this.asked.get(stream) ?? heard;
       if (!(from < to - 1)) continue;
       const first = !this.asked.has(stream);
       this.asked.set(stream, from);
       this.ask(robot, stream, from, to);
-      if (first) window.setTimeout(() => this.robot === robot && this.ask(robot, stream, heard - RECORDED_S, heard), RECORDED_S * 1000);
+      if (first) window.setTimeout(() => this.robot === robot && this.join(robot, stream, heard), RECORDED_S * 1000);
     }
+  }
+
+  /** Ask for what was not recorded when the page asked first, up to what it hears since the car is awake. */
+  private join(robot: Robot, stream: Stream, heard: number): void {
+    const awake = Math.max(heard, heardSince(stream));
+    this.ask(robot, stream, heard - RECORDED_S, awake);
   }
 
   /** Add what was recorded in a range, one question after the other. */
@@ -60,6 +68,14 @@ export class Past {
       }
     });
   }
+}
+
+/** Since when a stream has been heard without a hole: an idle car's values, or those of a card, are far apart. */
+function heardSince({ history }: Stream): number {
+  const times = history.column(0);
+  let at = times.length - 1;
+  while (at > 0 && times[at]! - times[at - 1]! <= HOLE_S) at -= 1;
+  return times[at] ?? NaN;
 }
 
 function add(stream: Stream, answer: HistoryAnswer, shift: number, before: number): void {

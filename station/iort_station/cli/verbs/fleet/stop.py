@@ -17,7 +17,7 @@ from iort_station.fleet import registry, stopping
 from iort_station.fleet.stopping import Motion
 
 commands = typer.Typer()
-_POLL_S = 0.3
+_POLL_S, _AGAIN_S = 0.3, 2.0
 
 
 @commands.command("stop", epilog=examples("stop car7", "stop car7 --release", "stop --all --release"))
@@ -61,12 +61,16 @@ def stop(
 
 def _wait(cloud: Cloud, names: list[str], seconds: float, *, stopped: bool) -> dict[str, Motion]:
     """What the robots have said once each has answered, or after so many seconds."""
-    deadline = time.monotonic() + seconds
+    deadline, again = time.monotonic() + seconds, time.monotonic() + _AGAIN_S
     while True:
         found = stopping.motion(cloud, names)
-        waits = [one for one in found.values() if not one.reason and not _done(one, stopped=stopped)]
+        waits = [name for name, one in found.items() if not one.reason and not _done(one, stopped=stopped)]
         if not waits or time.monotonic() > deadline:
             return found
+        if time.monotonic() > again:
+            # A robot that has missed the change learns from the next one that it has.
+            stopping.stop(cloud, waits, stopped=stopped)
+            again += _AGAIN_S
         # A shadow sends no events to this API.
         time.sleep(_POLL_S)
 
