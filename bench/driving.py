@@ -42,9 +42,12 @@ _DRIVEN_S, _PAUSE_S, _START_MS = 0.3, 0.7, 60_000
 
 @dataclass(frozen=True)
 class Stops:
-    """The tries of one failure. ``within`` counts those whose stop came within the lease of the last command
-    that moved the car, with no motion after it; ``after_ms`` is from the failure to the stop, ``latest_ms`` the longest of
-    those times from the failure or, if it came later, from the last command that moved the car."""
+    """The tries of one failure.
+
+    ``within`` counts those whose stop came within the lease of the last command that moved the car, with no
+    motion after it. ``after_ms`` is from the failure to the stop. ``latest_ms`` is the longest time to a
+    stop, from the failure or from the last command that moved the car, whichever was later.
+    """
 
     failure: str
     tries: int
