@@ -6,8 +6,12 @@ import time
 from typing import Any
 
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
+from iort_contract.messages.viewing import VIEW_LEASE_MS
 from iort_station.fleet.viewing import Viewer
+from iort_station.page.answers import actions
 from iort_station.page.listener import Listener
+from iort_station.page.server import PageServer
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
 
@@ -42,6 +46,32 @@ def test_a_lease_wakes_a_car_and_its_end_lets_it_sleep(embedded, bundle):
             assert agent.status()["lanes"]["live"]["viewers"] == 0
             until(lambda: len(heard) > count, seconds=30)
             assert periods()[count:] == [_IDLE_MS]
+        finally:
+            agent.stop()
+            agent.report()
+
+
+def test_a_page_wakes_its_car_and_one_that_is_cut_off_lets_it_sleep(embedded, bundle, open_page):
+    car = bundle(sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}])
+
+    def lane() -> dict[str, Any]:
+        found: dict[str, Any] = agent.status()["lanes"]["live"]
+        return found
+
+    told = {"namespace": embedded.namespace, **embedded.keys.reading()}
+    with PageServer(**told, open_actions=actions(embedded.cloud)) as server:
+        agent = Agent(car)
+        try:
+            until(agent.status)
+            assert lane()["viewers"] == 0
+            page = open_page(f"{server.url}#/car/{car.robot}")
+            until(lambda: lane()["viewers"] == 1)
+            assert lane()["asked_hz"] == LIVE_MAX_RATE_HZ
+            page.context.set_offline(True)
+            cut = time.monotonic()
+            until(lambda: lane()["viewers"] == 0, seconds=30)
+            assert time.monotonic() - cut <= VIEW_LEASE_MS / 1000 + 3
+            assert lane()["asked_hz"] == 1 / LIVE_BROKER_EVERY_S
         finally:
             agent.stop()
             agent.report()
