@@ -23,7 +23,7 @@ from rich.console import Console
 from bench.command import made, parser, write
 from bench.errors import BenchError
 from bench.load.course import LEASE_S, ROBOT, Course
-from bench.meters import chromium, usage
+from bench.load.tabs import Tabs
 from bench.report.result import Table
 from bench.ros.graph import python_with_rospy
 from local.errors import LocalError
@@ -31,38 +31,56 @@ from local.figures import Spread
 from local.proxy import FREEZE, PASS
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, BrowserType, Page
 
 PRESSES, TRIES = 100, 50
 # A hold that a slow round trip ends before the failure is no try.
 _HOLDS = 60
+Failed = tuple[float, Callable[[], None]]
 _DRIVEN_S, _PAUSE_S, _START_MS = 0.3, 0.7, 60_000
 
 
 @dataclass(frozen=True)
 class Stops:
-    """The tries of one failure. ``within`` counts those whose stop came within the lease of the last command
-    that moved the car, with no motion after it; ``after_ms`` is from the failure to the stop."""
+    """The tries of one failure.
+
+    ``within`` counts those whose stop came within the lease of the last command that moved the car, with no
+    motion after it. ``after_ms`` is from the failure to the stop. ``latest_ms`` is the longest time to a
+    stop, from the failure or from the last command that moved the car, whichever was later.
+    """
 
     failure: str
     tries: int
     within: int
     after_ms: Spread
+    latest_ms: float
 
 
 class Driver:
     """A person with the keys Space and Up, at a page of the course."""
 
-    def __init__(self, course: Course, browser: Browser) -> None:
-        self.course = course
-        # Without a graphics card, smooth charts take a core.
-        self._context = browser.new_context(viewport={"width": 1280, "height": 800}, reduced_motion="reduce")
+    def __init__(self, course: Course, tabs: Tabs, chromium: BrowserType) -> None:
+        self.course, self.tabs, self._chromium = course, tabs, chromium
         self.page: Page
+        self._browser: Browser
+        self.connect()
         self.sit(course.server.invitation(f"#/car/{ROBOT}"))
+
+    def connect(self) -> None:
+        """Have the browser in hand, again, with the car's page if it is open."""
+        self._browser = self._chromium.connect_over_cdp(self.tabs.url)
+        pages = self._browser.contexts[0].pages
+        self.page = next((page for page in pages if ROBOT in page.url), pages[0])
+
+    def disconnect(self) -> None:
+        """Leave the browser to itself; the keys stay pressed."""
+        self._browser.close()
 
     def sit(self, address: str = "") -> None:
         """Open the page, and take the wheel."""
-        self.page = self._context.new_page()
+        self.page = self._browser.contexts[0].new_page()
+        # Without a graphics card, smooth charts take a core.
+        self.page.emulate_media(reduced_motion="reduce")
         self.page.goto(address or f"{self.course.server.url}#/car/{ROBOT}")
         take = self.page.get_by_role("button", name="Take the wheel")
         take.click(timeout=_START_MS)
@@ -121,36 +139,33 @@ def _press_ms(driver: Driver, count: int) -> Spread:
     return Spread.of(took)
 
 
-def _hidden(driver: Driver) -> Callable[[], None]:
-    other = driver.page.context.new_page()
-    other.bring_to_front()
+# Each returns when it happened, and what makes it good again.
+def _hidden(driver: Driver) -> Failed:
+    driver.disconnect()
+    at, tab = time.monotonic(), driver.tabs.cover()
 
     def again() -> None:
-        other.close()
-        driver.page.bring_to_front()
+        driver.tabs.uncover(tab)
+        driver.connect()
 
-    return again
+    return at, again
 
 
-def _closed(driver: Driver) -> Callable[[], None]:
+def _closed(driver: Driver) -> Failed:
+    at = time.monotonic()
     driver.page.close()
-    return driver.sit
+    return at, driver.sit
 
 
-def _frozen(_driver: Driver) -> Callable[[], None]:
-    browser = [pid for pid in usage.descendants(os.getpid()) if "chrom" in _program(pid)]
-    for pid in browser:
+def _frozen(driver: Driver) -> Failed:
+    processes, at = driver.tabs.processes(), time.monotonic()
+    for pid in processes:
         os.kill(pid, signal.SIGSTOP)
-
-    def again() -> None:
-        for pid in browser:
-            os.kill(pid, signal.SIGCONT)
-
-    return again
+    return at, lambda: driver.tabs.signal(signal.SIGCONT)
 
 
-def _cut(driver: Driver) -> Callable[[], None]:
-    proxy = driver.course.proxy
+def _cut(driver: Driver) -> Failed:
+    at, proxy = time.monotonic(), driver.course.proxy
     proxy.mode = FREEZE
 
     def again() -> None:
@@ -158,15 +173,16 @@ def _cut(driver: Driver) -> Callable[[], None]:
         # The page opens a new connection.
         proxy.reset()
 
-    return again
+    return at, again
 
 
-def _killed(driver: Driver) -> Callable[[], None]:
+def _killed(driver: Driver) -> Failed:
+    at = time.monotonic()
     driver.course.kill_agent()
-    return driver.course.start_agent
+    return at, driver.course.start_agent
 
 
-FAILURES: dict[str, Callable[[Driver], Callable[[], None]]] = {
+FAILURES: dict[str, Callable[[Driver], Failed]] = {
     "tab hidden": _hidden,
     "tab closed": _closed,
     "browser frozen (SIGSTOP)": _frozen,
@@ -175,29 +191,24 @@ FAILURES: dict[str, Callable[[Driver], Callable[[], None]]] = {
 }
 
 
-def _program(pid: int) -> str:
-    with suppress(OSError):
-        return Path(f"/proc/{pid}/comm").read_text()
-    return ""
-
-
 def _stops(driver: Driver, failure: str, tries: int, progress: Callable[[str], None]) -> Stops:
-    course, within, after_ms = driver.course, 0, []
+    course, within, after_ms, latest_s = driver.course, 0, [], 0.0
     for done in range(tries):
         driver.drive()
-        failed_at = time.monotonic()
-        again = FAILURES[failure](driver)
+        failed_at, again = FAILURES[failure](driver)
         with suppress(BenchError):
             stop = course.wait(failed_at, moving=False, within_s=LEASE_S * 6)
             after_ms.append((stop.at - failed_at) * 1000)
             course.quiet(LEASE_S)
             last = course.last_motion()
-            within += last.at < stop.at <= max(last.at, failed_at) + LEASE_S
+            late_s = stop.at - max(last.at, failed_at)
+            within += last.at < stop.at and late_s <= LEASE_S
+            latest_s = max(latest_s, late_s)
         again()
         with suppress(Exception):  # a page that is closed or still frozen has no keys
             driver.release()
         progress(f"{failure}: {within} of {done + 1}")
-    return Stops(failure, tries, within, Spread.of(after_ms))
+    return Stops(failure, tries, within, Spread.of(after_ms), round(latest_s * 1000, 1))
 
 
 def main() -> None:
@@ -209,12 +220,17 @@ def main() -> None:
     options = arguments.parse_args()
     console = Console()
     try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only who has a browser needs it
+    except ImportError:
+        sys.exit("bench-drive: playwright is not installed: run `make setup`")
+    try:
         with (
-            tempfile.TemporaryDirectory() as folder,
-            chromium.opened() as browser,
+            tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+            sync_playwright() as play,
+            Tabs(Path(folder)) as tabs,
             Course(python_with_rospy(), Path(folder)) as course,
         ):
-            driver = Driver(course, browser)
+            driver = Driver(course, tabs, play.chromium)
             console.print(f"{options.presses} key presses ...")
             press_ms = _press_ms(driver, options.presses)
             found = [
@@ -231,7 +247,14 @@ def main() -> None:
 
 def _table(press_ms: Spread, found: list[Stops]) -> Table:
     rows = [["key press to command at the ROS subscriber", press_ms.text(0), ""]]
-    rows += [[f"stop, {one.failure}", f"{one.within} of {one.tries}", one.after_ms.text(0)] for one in found]
+    rows += [
+        [
+            f"stop, {one.failure}",
+            f"{one.within} of {one.tries}",
+            f"{one.after_ms.text(0)}, at most {one.latest_ms:.0f}",
+        ]
+        for one in found
+    ]
     return Table(
         "Driving by hand", ["figure", "measured", f"stop after, lease {LEASE_S * 1000:.0f} ms"], rows
     )

@@ -79,6 +79,16 @@ SETTINGS: list[dict[str, Any]] = [
 ]
 
 
+LIMITS = {
+    "command": "drive",
+    "speed": "drive.speed",
+    "steering": "drive.steering_angle",
+    "max_speed_mps": 2.0,
+    "max_steering_rad": 0.4,
+    "lease_ms": 500,
+}
+
+
 class Lab:
     """What the lab's server answers; a test may change it."""
 
@@ -128,11 +138,19 @@ class Lab:
 
     def motion(self, asked: Mapping[str, str]) -> dict[str, Any]:
         cars = {
-            name: {"asked": told, "stopped": stands, "reason": "", "drive": None}
+            name: {
+                "asked": told,
+                "stopped": stands,
+                "reason": "",
+                "drive": LIMITS if name == "car-1" else None,
+            }
             for name, (told, stands) in self.cars.items()
             if asked.get("robot", name) == name
         }
         return {"robots": cars, "user": "operator@lab", "failed": {}}
+
+    def drive(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        raise StationError("the role of a driver cannot be assumed")
 
     def stop(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.asked.append(dict(asked))
@@ -157,6 +175,7 @@ class Lab:
                 "note": self.write,
                 "delete_note": self.delete,
                 "stop": self.stop,
+                "drive": self.drive,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
             },
         )

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from iort_station.operations import trace
 from local.deployment import ROOT
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
@@ -34,6 +35,8 @@ def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
     try:
         until(agent.status, seconds=60)
         done = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60")
+        # The same car, by the way without PubNub.
+        straight = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60", "--live", "iot")
     finally:
         agent.process.terminate()
         agent.process.wait(60)
@@ -45,6 +48,10 @@ def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
     # All hops share one clock here: a message cannot arrive before it has left.
     for hop in found["hops"]:
         assert hop["p50_ms"] >= -1.0 - (hop["uncertainty_ms"] or 0.0), hop
+    assert found["whole"]["p50_ms"] > 0
+    assert straight.returncode == 0, straight.stderr
+    found = json.loads(straight.stdout)
+    assert [hop["name"] for hop in found["hops"]] == [trace.CAR, trace.BROKER]
     assert found["whole"]["p50_ms"] > 0
 
 

@@ -3,7 +3,7 @@
 import { DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, type Config, type DriveLimitsEntry } from "../base/contract";
 import { now } from "../base/clock";
 import { el, setAttribute, Text } from "../base/dom";
-import { NOTHING, number } from "../base/format";
+import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { may } from "../server/admission";
 import { Driver } from "./driver";
@@ -196,7 +196,8 @@ export class DrivePanel {
   }
 
   private say(text: string): void {
-    if (this.said.textContent !== text) this.said.textContent = text;
+    const words = capital(text);
+    if (this.said.textContent !== words) this.said.textContent = words;
   }
 }
 
