@@ -115,7 +115,7 @@ def test_a_hold_begins_at_a_standstill_and_moves_once_the_car_has_answered() -> 
     assert told["phase"] == "driving"
     # As the robot reads them.
     commands = [decode_command(json.dumps({**one, "at": None})) for one in told["sent"]]
-    assert {(one.session, one.by, one.lease_ms) for one in commands} == {("00000001", "ada", 400)}
+    assert {(one.session, one.by, one.lease_ms) for one in commands} == {("00000001", "ada", 350)}
     assert [one.seq for one in commands] == list(range(len(commands)))
     still = speeds(told).index(1)
     assert 1 <= still <= 5

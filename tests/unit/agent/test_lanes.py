@@ -183,7 +183,7 @@ def topics(count: int, hz: float, values: Callable[[], Mapping[str, Any]] = lamb
 
 @pytest.mark.parametrize(
     ("count", "hz", "least_live_hz", "most_live_hz"),
-    [(10, 20, 7.5, 8.0), (50, 20, 0.75, 0.8), (10, 200, 7.5, 8.0), (80, 5, 0.08, 0.13)],
+    [(10, 20, 7.5, 8.0), (50, 20, 0.75, 0.8), (10, 200, 7.5, 8.0), (80, 5, 0.075, 0.13)],
 )
 def test_recordings_go_first_and_live_shares_the_rest(
     count: int, hz: float, least_live_hz: float, most_live_hz: float

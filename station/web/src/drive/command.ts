@@ -1,6 +1,6 @@
 // The commands of one hold of the stick, as `iort_contract.messages.commands` writes them.
 
-import { DRIVE_LEASE_MS, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
+import { DRIVE_LEASE_MS, DRIVE_RATE_HZ, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
 import type { Motion } from "./stick";
 
 export interface Command {
@@ -18,6 +18,9 @@ export interface Command {
   readonly ends?: true;
 }
 
+// A lease ends this much earlier: the cloud's clock is known to half a round trip, and the agent takes its time to stop.
+const MARGIN_MS = 1000 / DRIVE_RATE_HZ;
+
 /** One hold of the stick. */
 export interface Session {
   readonly name: string;
@@ -26,7 +29,7 @@ export interface Session {
 }
 
 export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
-  const lease_ms = Math.min(DRIVE_LEASE_MS, limits.lease_ms);
+  const lease_ms = Math.max(1, Math.min(DRIVE_LEASE_MS, limits.lease_ms) - MARGIN_MS);
   return {
     v: SCHEMA_VERSION,
     session: session.name,
