@@ -116,7 +116,7 @@ def live_update(
     clock offset that converts the car's times to the cloud's. A sample from the broker has no hop before."""
     hops = {"sent_us": live.sent_us}
     if received_ms is not None and lambda_us is not None:
-        hops |= {RECEIVED_MS: received_ms, "lambda_us": lambda_us}
+        hops.update({RECEIVED_MS: received_ms, "lambda_us": lambda_us})
     return {
         "v": SCHEMA_VERSION,
         ROBOT: robot,

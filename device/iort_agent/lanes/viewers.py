@@ -100,9 +100,10 @@ class Viewers:
         to_broker = any(demand.to_broker for demand in demands)
         if self._settings.live_when == ALWAYS or not self._hears:
             return Demand(most_hz, to_broker or self._to_broker)
-        if not demands:
-            return Demand(min(most_hz, 1 / LIVE_BROKER_EVERY_S), to_broker=True)
-        return Demand(min(most_hz, max(demand.rate_hz for demand in demands)), to_broker)
+        # The alert rules rely on this rate, so a viewer who asks for less does not lower it.
+        idle_hz = 1 / LIVE_BROKER_EVERY_S
+        asked_hz = max([idle_hz, *(demand.rate_hz for demand in demands)])
+        return Demand(min(most_hz, asked_hz), to_broker or asked_hz == idle_hz)
 
     def _tell(self, *, at_once: bool = False) -> None:
         demand = self._demand()

@@ -47,8 +47,9 @@ class Role:
     def credentials(self) -> ReadOnlyCredentials:
         """Credentials that are good for at least ten minutes; raises `StationError` if the role cannot be
         assumed."""
-        if self._got is None or time.monotonic() > self._got[0]:
-            self._got = time.monotonic() + _LASTS_S - _EARLY_S, self._assume()
+        # Not the monotonic clock, which stands while a laptop sleeps.
+        if self._got is None or time.time() > self._got[0]:
+            self._got = time.time() + _LASTS_S - _EARLY_S, self._assume()
         return self._got[1]
 
     def client_id(self) -> str:

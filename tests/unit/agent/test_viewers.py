@@ -8,6 +8,7 @@ from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_contract.limits import LIVE_MIN_RATE_HZ
 from iort_contract.messages.live import LiveSample, decode_live
 from iort_contract.messages.settings import ALWAYS, WATCHED
 from iort_contract.messages.viewing import MAX_VIEWERS, Lease, encode_lease, lease_topic
@@ -114,6 +115,19 @@ def test_the_fastest_viewer_counts_within_the_cars_own_rate() -> None:
     assert 48 <= len(rig.drive(10)) <= 52
     rig.lease("a", 1)
     assert 4 <= len(rig.drive(4)) <= 6, "the slow one still looks"
+
+
+def test_a_viewer_who_asks_for_little_does_not_delay_the_alert_rules() -> None:
+    rig = Rig()
+    rig.lease("a", LIVE_MIN_RATE_HZ)
+    mark = len(rig.uplink.published)
+    sent = []
+    for _ in range(6):
+        sent += rig.drive(10)
+        rig.lease("a", LIVE_MIN_RATE_HZ)
+    assert 6 <= len(sent) <= 7
+    assert {live.next_ms for live in sent} == {10_000}
+    assert rig.topics(mark) == {BROKER}
 
 
 def test_everything_goes_to_the_broker_while_a_viewer_listens_there() -> None:
