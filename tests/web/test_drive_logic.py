@@ -46,7 +46,7 @@ function turn() {
     const session = link.driver ?? last?.session ?? "";
     const by = { driver: session, driverBy: link.by || "ada", leaseLeft_ms: 300 };
     const driven = last && { session: last.session, seq: last.seq, outcome: link.outcome, ...by };
-    driver.hear({ taken_ms, sent_ms, lay_ms: 2, next_ms: 100, driven }, now);
+    driver.hear({ taken_ms, sent_ms, lay_ms: 2, next_ms: 10_000, driven }, now);
   }
 }
 for (const [times, change = {}] of steps) {
@@ -218,3 +218,79 @@ def test_a_wrong_clock_is_corrected_by_the_cars_answer() -> None:
     forever = drive([4], [30, {"hold": True, **AHEAD, "link": {"outcome": "stale"}}])
     assert "too old when it came" in forever["reason"]
     assert len({one["session"] for one in forever["sent"]}) == 3
+
+
+# A browser's events at `Inputs`; tells after each step whether the dead-man's switch is held.
+HAND = """
+const [steps] = given;
+class Node extends EventTarget {
+  matches = () => this.field;
+}
+globalThis.Element = Node;
+globalThis.window = new EventTarget();
+globalThis.document = Object.assign(new EventTarget(), { hidden: false, hasFocus: () => true });
+let shoulder;
+const pad = { connected: true, mapping: "standard", axes: [0, -1] };
+const gamepad = () => ({ ...pad, buttons: Array(8).fill({ pressed: shoulder }) });
+const getGamepads = () => (shoulder === undefined ? [] : [null, gamepad()]);
+Object.defineProperty(globalThis, "navigator", { value: { getGamepads } });
+const hand = new page.Inputs(new Node(), new Node(), () => {}, () => {});
+return steps.map(([type, { pad, field, ...told } = {}]) => {
+  if (pad !== undefined) shoulder = pad ?? undefined;
+  const target = Object.assign(new Node(), { field });
+  const event = Object.defineProperty(Object.assign(new Event(type), told), "target", { value: target });
+  window.dispatchEvent(event);
+  hand.read(0.05);
+  return hand.held;
+});
+"""
+DOWN: Any = ["keydown", {"code": "Space"}]
+AGAIN: Any = ["keydown", {"code": "Space", "repeat": True}]
+
+
+@pytest.mark.parametrize(
+    ("steps", "held"),
+    [
+        ([DOWN, AGAIN, ["keyup", {"code": "Space"}]], [True, True, False]),
+        # Let go in a text field, which has got the focus meanwhile.
+        ([DOWN, ["keyup", {"code": "Space", "field": True}]], [True, False]),
+        # The release of a key is not told while a menu is open, something is dragged, or a Mac's Cmd is held.
+        ([DOWN, ["contextmenu"], AGAIN], [True, False, False]),
+        ([DOWN, ["dragstart"], AGAIN], [True, False, False]),
+        ([DOWN, ["focusin", {"field": True}], AGAIN], [True, False, False]),
+        ([DOWN, ["keydown", {"code": "MetaLeft", "metaKey": True}], AGAIN], [True, False, False]),
+        # A key that is still held when the page gets the focus back is no press; a gamepad's button neither.
+        ([DOWN, ["blur"], AGAIN, DOWN], [True, False, False, True]),
+        (
+            [
+                ["x", {"pad": False}],
+                ["x", {"pad": True}],
+                ["blur"],
+                ["x"],
+                ["x", {"pad": False}],
+                ["x", {"pad": True}],
+            ],
+            [False, True, False, False, False, True],
+        ),
+        # A gamepad that was away, and comes back with its button held.
+        (
+            [["x", {"pad": False}], ["x", {"pad": True}], ["x", {"pad": None}], ["x", {"pad": True}]],
+            [False, True, False, False],
+        ),
+    ],
+)
+def test_a_dead_mans_switch_whose_release_may_not_be_seen_is_let_go(
+    steps: list[Any], held: list[bool]
+) -> None:
+    assert run("drive/inputs.ts", HAND, steps) == held
+
+
+def test_clocks_that_contradict_each_other_are_the_newest_message() -> None:
+    # This computer slept for an hour after an answer.
+    script = """
+const clock = new page.CloudClock();
+clock.heard(1_000, 1_000); clock.answered(990, 1_000);
+clock.heard(3_601_100, 1_100);
+return clock.offset_ms;
+"""
+    assert run("drive/cloud_clock.ts", script) == 3_600_000

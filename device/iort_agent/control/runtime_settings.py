@@ -29,9 +29,10 @@ def overlay(
     """The base with the desired settings, and the rejected ones by name; these keep what is ``in_force``.
 
     ``known_fields`` holds the fields of the streams seen so far; only these can be selected. A robot that no
-    command ``moves`` must not seem to be stopped.
+    command ``moves`` must not seem to be stopped. Only an explicit value ends an emergency stop, because a
+    shadow may be deleted, or lost with its cloud.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {"motion_stopped": in_force.motion_stopped}
     fields = dict(base.fields)
     rejected: dict[str, Rejection] = {}
     for name, value in desired.items():

@@ -129,6 +129,16 @@ def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -
     assert offered(leases, C, 1.2, seq=0) is None
 
 
+def test_a_stick_that_is_held_is_refused_however_many_others_try() -> None:
+    leases = Leases(LIMITS)
+    leases.hold(0.0)
+    for i in range(200):
+        assert offered(leases, A, 0.1, seq=i) == EMERGENCY_STOP
+        assert offered(leases, f"{i:08x}", 0.1, seq=0) == EMERGENCY_STOP
+    leases.free()
+    assert offered(leases, A, 0.2, seq=200) == BEGIN_AGAIN
+
+
 def test_a_released_emergency_stop_ends_after_a_few_stops_and_so_does_a_closed_one() -> None:
     for end in (Leases.free, lambda leases: leases.close(0.0)):
         leases = Leases(LIMITS)

@@ -263,6 +263,21 @@ def test_the_settings_are_unknown_without_a_connection_and_after_a_missed_change
     assert rig.applied[-1].motion_stopped
 
 
+def test_an_emergency_stop_outlives_the_shadow_that_asked_for_it() -> None:
+    rig = Rig(motion={"stopped": True})
+    assert rig.applied[-1].motion_stopped
+    rig.uplink.cut()
+    rig.document, rig.version = {}, 0
+    rig.uplink.connect()
+    rig.settle()
+    assert rig.shadow.known()
+    assert rig.shadow.settings.motion_stopped
+    assert rig.reported["motion"] == {"stopped": True}
+    rig.change({"desired": {"motion": {"stopped": False}}})
+    rig.settle()
+    assert not rig.applied[-1].motion_stopped
+
+
 def test_a_robot_without_motion_does_not_seem_to_be_stopped() -> None:
     desired = {"motion.stopped": True}
     settings, rejected = overlay(BASE, BASE, desired, {}, moves=False)

@@ -153,8 +153,6 @@ class Commands:
         stopped: list[Mapping[str, Value]] = []
         with self._lock:
             now = self._clock.monotonic()
-            if self._guard is not None:
-                self._guard.tick()
             for command in self._commands.values():
                 if command.leases.stop_due(now):
                     if not command.stopping:
@@ -173,6 +171,9 @@ class Commands:
             # Under the lock, so that no command that has just passed is released.
             for topic in ended.difference(topic for _, topic in due):
                 self._graph.release(topic)
+            # After the stops, since it may have to start a process.
+            if self._guard is not None:
+                self._guard.tick()
         for sample in stopped:
             self._operator.drove(sample)
         return min((at for at, _ in due), default=None)

@@ -12,6 +12,7 @@ import logging
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from typing import Any, Mapping
 
 from iort_agent.clock import Clock
@@ -22,7 +23,8 @@ PROCESS = "iort_agent.control.motion.guard_process"
 # The guard answers each line with one byte. If it does not within this time, it is frozen.
 _ANSWER_S = 1.0
 _AGAIN_S = 2.0
-_CLOSE_S = 3.0
+# A process that the kernel holds ends later; stops must not wait for it.
+_CLOSE_S, _KILLED_S = 3.0, 0.2
 
 
 class Guard:
@@ -76,12 +78,16 @@ class Guard:
             return
         self._start_at = now + _AGAIN_S
         remappings = [one for one in sys.argv if ":=" in one and not one.startswith("__name:=")]
-        self._process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", PROCESS, *remappings],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                [sys.executable, "-m", PROCESS, *remappings],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,
+            )
+        except OSError as error:  # no memory, no process left
+            _log.error("the guard cannot be started, and motion is refused: %s", error)
+            return
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
@@ -97,19 +103,23 @@ class Guard:
             return
         assert self._process.stdin is not None
         self._process.stdin.close()
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self._process.wait(_CLOSE_S)
-        except subprocess.TimeoutExpired:
-            self._kill()
+        self._kill()
 
     def _running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
     def _kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
         self._in_graph = False
+        if self._process is None:
+            return
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILLED_S)
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            pipe.close()
 
     def _write(self, line: bytes) -> bool:
         if self._process is None or self._process.stdin is None:
@@ -128,7 +138,7 @@ class Guard:
             return
         try:
             answers = len(os.read(self._process.stdout.fileno(), 65_536))
-        except OSError:  # nothing yet
+        except (OSError, ValueError):  # nothing yet, or it was killed
             return
         if answers:
             self._in_graph = True

@@ -103,8 +103,10 @@ class Leases(Stops):
         self.cut(now)
 
     def _refuse(self, session: str) -> None:
-        if session not in self._refused:
-            self._refused.append(session)
+        # Those that try on are remembered longest.
+        if session in self._refused:
+            self._refused.remove(session)
+        self._refused.append(session)
 
     def _other_driver(self, command: Command, now: float) -> str | None:
         """Why a motion that is in time may not pass beside another driver or an emergency stop."""

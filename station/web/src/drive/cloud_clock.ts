@@ -29,7 +29,8 @@ export class CloudClock {
     const low = this.lows[0]?.offset_ms;
     const high = this.highs[0]?.offset_ms;
     if (low === undefined) return undefined;
-    return high === undefined ? low : (low + high) / 2;
+    // They contradict each other once one of the clocks was set, or this computer slept.
+    return high === undefined || high < low ? low : (low + high) / 2;
   }
 }
 

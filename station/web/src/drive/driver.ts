@@ -19,6 +19,8 @@ const ANSWER_MS = 2_000;
 const STOPS = 3;
 // A wrong clock is known after one answer, and corrected with a new session.
 const CORRECTIONS = 2;
+// Between two samples of the stream `drive`, at most, however slow the other streams are.
+const SAMPLE_MS = 1000 / LIVE_MAX_RATE_HZ;
 const STANDING: Motion = { speed_mps: 0, steering_rad: 0 };
 
 export class Driver {
@@ -43,7 +45,6 @@ export class Driver {
   private halted = false;
   private ticked_ms = Infinity;
   private taken_ms = -Infinity;
-  private next_ms = 1000 / LIVE_MAX_RATE_HZ;
   private clockless = false;
   private newest: { readonly driven: Driven; readonly until_ms: number } | undefined;
   /** When each command left that the car has not answered, the oldest first. */
@@ -160,7 +161,7 @@ export class Driver {
   private unanswered(now_ms: number): string {
     if (this.phase === "starting") return now_ms - this.began_ms > ANSWER_MS ? "The car does not answer" : "";
     const oldest = this.waiting[0]?.left_ms ?? now_ms;
-    return now_ms - oldest > DRIVE_MAX_RTT_MS + this.next_ms ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
+    return now_ms - oldest > DRIVE_MAX_RTT_MS + SAMPLE_MS ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
   }
 
   private answer(driven: Driven, message: LiveMessage, now_ms: number): void {
@@ -172,7 +173,6 @@ export class Driver {
     }
     const sent = this.waiting.find(({ seq }) => seq === driven.seq);
     this.waiting = this.waiting.filter(({ seq }) => seq > driven.seq);
-    if (message.next_ms !== undefined) this.next_ms = message.next_ms;
     if (sent) {
       this.rtt_ms = Math.max(0, now_ms - sent.left_ms - message.lay_ms);
       if (message.taken_ms !== undefined) this.clock.answered(sent.left_ms, message.taken_ms);

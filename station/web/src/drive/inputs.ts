@@ -1,5 +1,6 @@
 // What a hand does: keys, a gamepad, a finger or the mouse. Space, a shoulder button, the button on the page or the
-// pressed mouse is the dead-man's switch. Whatever is held is let go when the page loses the focus: its end is not seen.
+// pressed mouse is the dead-man's switch. Whatever is held is let go when its end may not be seen: without the focus, in a
+// menu, while something is dragged, in a text field. It must then be pressed again.
 
 import { CENTRE, followed, keyed, padded, pointed, pushes, type Stick } from "./stick";
 
@@ -12,6 +13,8 @@ export class Inputs {
   private readonly pointers = new Set<number>();
   private space = false;
   private shoulder = false;
+  /** Whether the gamepad's button was seen let go, since the page has the focus. */
+  private fresh = false;
   private dragged: { readonly id: number; readonly mouse: boolean } | undefined;
   private byKeys = CENTRE;
   private byPad = CENTRE;
@@ -29,9 +32,9 @@ export class Inputs {
     const early = { signal, capture: true };
     window.addEventListener("keydown", (event) => this.key(event, true, leave), early);
     window.addEventListener("keyup", (event) => this.key(event, false, leave), early);
-    window.addEventListener("blur", () => this.release(), { signal });
     document.addEventListener("visibilitychange", () => this.release(), { signal });
-    window.addEventListener("pagehide", () => this.release(), { signal });
+    for (const end of ["blur", "pagehide", "contextmenu", "dragstart"] as const) window.addEventListener(end, () => this.release(), { signal });
+    window.addEventListener("focusin", (event) => typed(event) && this.release(), { signal });
     for (const node of [pad, button]) node.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
     button.addEventListener("pointerdown", (event) => {
       button.setPointerCapture(event.pointerId);
@@ -62,7 +65,9 @@ export class Inputs {
     this.byKeys = followed(this.byKeys, keyed(this.keys), seconds);
     const gamepad = navigator.getGamepads().find((each) => each?.connected && each.mapping === "standard") ?? undefined;
     this.byPad = gamepad ? padded(gamepad.axes) : CENTRE;
-    this.shoulder = gamepad !== undefined && document.hasFocus() && SHOULDERS.some((i) => gamepad.buttons[i]?.pressed);
+    const pressed = SHOULDERS.some((i) => gamepad?.buttons[i]?.pressed);
+    this.fresh = gamepad !== undefined && !document.hidden && document.hasFocus() && (this.fresh || !pressed);
+    this.shoulder = this.fresh && pressed;
     if (this.dragged) return this.byPointer;
     return this.byKeys.x !== 0 || this.byKeys.y !== 0 || this.keys.size > 0 ? this.byKeys : this.byPad;
   }
@@ -75,19 +80,21 @@ export class Inputs {
   private release(): void {
     this.keys.clear();
     this.pointers.clear();
-    [this.space, this.shoulder, this.dragged] = [false, false, undefined];
+    [this.space, this.shoulder, this.fresh, this.dragged] = [false, false, false, undefined];
     this.byKeys = this.byPointer = CENTRE;
     this.changed();
   }
 
   private key(event: KeyboardEvent, down: boolean, leave: () => void): void {
-    if (event.target instanceof Element && event.target.matches(TYPED)) return;
-    if (down && (event.ctrlKey || event.metaKey || event.altKey)) return;
+    // A Mac does not tell the release of a key while this one is held.
+    if (down && event.metaKey) this.release();
+    if (down && (typed(event) || event.ctrlKey || event.metaKey || event.altKey)) return;
     if (event.code === "Escape" && down) leave();
-    else if (event.code === "Space") this.space = down;
+    else if (event.code === "Space") this.space = down && (this.space || !event.repeat);
     else if (!pushes(event.code)) return;
     else if (down) this.keys.add(event.code);
     else this.keys.delete(event.code);
+    if (typed(event)) return this.changed();
     // Neither another car, nor a press on the button that has the focus.
     event.preventDefault();
     event.stopPropagation();
@@ -105,3 +112,5 @@ export class Inputs {
     this.changed();
   }
 }
+
+const typed = ({ target }: Event): boolean => target instanceof Element && target.matches(TYPED);

@@ -18,8 +18,6 @@ export interface LiveMessage {
   readonly sent_ms: number | undefined;
   /** How long the sample lay in the car. */
   readonly lay_ms: number;
-  /** The next message comes within this time. */
-  readonly next_ms: number | undefined;
   readonly driven: Driven | undefined;
 }
 
@@ -32,14 +30,13 @@ export function readLive(topic: string, payload: string): LiveMessage | undefine
     return undefined;
   }
   if (!isObject(message)) return undefined;
-  const { v, t, sent_us, offset_us, next_ms, sample } = message;
+  const { v, t, sent_us, offset_us, sample } = message;
   if (v !== SCHEMA_VERSION || !isInteger(t) || !isInteger(sent_us) || !isObject(sample)) return undefined;
   const cloud = (us: number): number | undefined => (isInteger(offset_us) ? (us + offset_us) / 1e3 : undefined);
   return {
     taken_ms: cloud(t),
     sent_ms: cloud(sent_us),
     lay_ms: Math.max(0, (sent_us - t) / 1e3),
-    next_ms: isInteger(next_ms) ? next_ms : undefined,
     driven: topic.split("/")[3] === DRIVE_STREAM ? drivenOf(sample) : undefined,
   };
 }
