@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from urllib.parse import urlsplit
 
 from aiohttp import (
     ClientError,
@@ -21,6 +22,7 @@ from aiohttp import (
 from yarl import URL
 
 from iort_station.page.background import BackgroundServer
+from iort_station.page.server import on_loopback
 
 # "Amazon Cognito Federated Identities": these two are not signed.
 _TARGETS = {f"AWSCognitoIdentityService.{call}" for call in ("GetId", "GetCredentialsForIdentity")}
@@ -48,6 +50,10 @@ class Relay(BackgroundServer):
 
     async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
         """Pass on one call, or one connection until either side ends it."""
+        # Every browser sends the origin with a POST and with a WebSocket, and no script can change it.
+        origin = request.headers.get("Origin")
+        if origin is not None and not on_loopback(urlsplit(origin).hostname or ""):
+            return web.Response(status=403, text="only a page of this machine may connect\n")
         if request.method == "OPTIONS":
             return web.Response(status=204, headers=_CORS)
         async with ClientSession(connector=TCPConnector(ssl=self._trusts), auto_decompress=False) as session:

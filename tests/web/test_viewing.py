@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.viewing import VIEW_LEASE_MS
+from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S
 from iort_station.page.server import PageServer
 from tests.browser import show, until
 from tests.web.cars import SUBSCRIBE_KEY, Car
@@ -24,14 +25,22 @@ HIDE = """(hidden) => {
   document.dispatchEvent(new Event("visibilitychange"));
 }"""
 
+NO_RENEWAL = f"""const every = setInterval;
+window.setInterval = (call, ms) => ms === {VIEW_RENEW_S * 1000:.0f} ? 0 : every(call, ms);"""
+
 
 class Leases:
     """Keeps what the page's server was asked for."""
 
     def __init__(self) -> None:
         self.asked: list[Mapping[str, str]] = []
+        # The ends of leases wait for it.
+        self.ends = threading.Event()
+        self.ends.set()
 
     def view(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        if asked["lease_ms"] == "0":
+            assert self.ends.wait(30)
         self.asked.append(asked)
         return {"asked": asked["robots"].count(",") + 1}
 
@@ -116,3 +125,22 @@ def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page
     until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "the promise of ten a second", 3)
     car.send(next_ms=10**6)
     until(lambda: page.evaluate("iort.malformed") == 1, "a time that no car may say")
+
+
+def test_a_car_that_is_looked_at_again_is_held_though_the_end_arrives_late(
+    open_page: Callable[..., Page], served: str, leases: Leases
+) -> None:
+    page = open_page(f"{served}#/car/car-99")
+    page.add_init_script(NO_RENEWAL)
+    page.reload()
+    until(lambda: leases.held() == {"car-99": LIVE_MAX_RATE_HZ}, "the car to be held")
+    leases.ends.clear()
+    known = len(leases.asked)
+    page.evaluate(HIDE, True)
+    page.evaluate(HIDE, False)
+    until(lambda: len(leases.asked) > known, "the new look")
+    leases.ends.set()
+    until(lambda: len(leases.asked) > known + 2, "the end, and a renewal", 20)
+    told = [asked["lease_ms"] for asked in leases.asked[known:]]
+    assert told == [str(VIEW_LEASE_MS), "0", str(VIEW_LEASE_MS)]
+    assert leases.held() == {"car-99": LIVE_MAX_RATE_HZ}

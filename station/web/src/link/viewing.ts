@@ -79,7 +79,11 @@ export class Viewing {
     }
     const asked = { robots: robots.join(","), viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms), ...(this.connected ? { broker: "yes" } : {}) };
     act("view", asked, lease_ms === 0)
-      .then(() => (this.error = ""))
+      .then(() => {
+        this.error = "";
+        // A car that is looked at again meanwhile may have heard of it before it heard of the end.
+        if (lease_ms === 0 && robots.some((robot) => this.held.has(robot))) this.renew();
+      })
       .catch((error: unknown) => (this.error = error instanceof AnswerError ? error.message : String(error)));
   }
 }
