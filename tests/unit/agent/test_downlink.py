@@ -227,7 +227,7 @@ def test_a_ros_library_that_fails_once_does_not_keep_the_car_from_stopping() -> 
             raise failures.pop()
         return publish(topic, data)
 
-    rig.graph.publish = failing  # type: ignore[method-assign]
+    rig.graph.publish = failing  # type: ignore[method-assign]  # once
     rig.downlink.start()
     rig.send({"data": 2.5}, lease_ms=100)
     assert rig.graph.stopped.wait(5)
