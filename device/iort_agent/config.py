@@ -73,6 +73,10 @@ def load_config(file: Path) -> Config:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, place)
     try:
+        config.downlink.check_topics()
+    except ContractError as error:
+        raise place.child("downlink").problem(str(error)) from error
+    try:
         config.downlink.drive_limits()
     except ContractError as error:
         raise place.child("downlink.drive").problem(str(error)) from error

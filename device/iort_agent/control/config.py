@@ -187,6 +187,16 @@ class DownlinkConfig:
             if one.motion is not None
         }
 
+    def check_topics(self) -> None:
+        """Raise `ContractError` for a command without motion on a topic that moves the robot: neither a lease
+        nor the emergency stop would end what it began."""
+        moved = {one.topic: name for name, one in self.cmd if one.motion is not None}
+        for name, one in self.cmd:
+            if one.motion is None and one.topic in moved:
+                raise ContractError(
+                    f"cmd.{name} must have motion, as cmd.{moved[one.topic]} has: {one.topic} moves the robot"
+                )
+
     def drive_limits(self) -> DriveLimits | None:
         """What a stick drives; None if nothing. Raises `ContractError` if the command is no motion."""
         drive = self.drive

@@ -26,7 +26,7 @@ from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)
 
-_IDLE_S = 1.0
+_IDLE_S, _AGAIN_S = 1.0, 0.1
 
 
 class Downlink:
@@ -123,7 +123,12 @@ class Downlink:
     def _run(self) -> None:
         while not self._end.is_set():
             self._wake.clear()
-            wait_s = self.tick()
+            try:
+                wait_s = self.tick()
+            except Exception:  # noqa: BLE001 - whatever a ROS library raises
+                # The thread must outlive it: the stops are published here.
+                _log.exception("the downlink failed, and tries again")
+                wait_s = _AGAIN_S
             if not self._end.is_set():
                 self._clock.wait(self._wake, min(wait_s, _IDLE_S))
 

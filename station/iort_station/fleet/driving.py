@@ -39,6 +39,8 @@ from iort_contract.topics import ACCEPTED
 
 # A car that has not answered by then does not hear us.
 _ANSWER_US = 2_000_000
+# After a pause of this program as long as this, the car has stopped.
+_STILL_US = DRIVE_LEASE_MS * 1000
 # A stop is sent this often: a message may be lost.
 _STOPS = 3
 # A wrong time is known after one answer, and corrected with a new session.
@@ -113,6 +115,7 @@ class Driver:
         self._held = False
         self._session, self._started_us, self._seq = "", 0, 0
         self._began_us = self._driver_until_us = 0
+        self._ticked_us: int | None = None
         self._corrections = self._stops = 0
         self._taken_us: int | None = None
         # When each command left that the car has not answered.
@@ -153,10 +156,14 @@ class Driver:
 
     def tick(self, now_us: int) -> Command | None:
         """The command to send now, if any; called `DRIVE_RATE_HZ` times a second."""
+        still_us = now_us - (now_us if self._ticked_us is None else self._ticked_us)
+        self._ticked_us = now_us
         if now_us > self._driver_until_us:
             self.driver, self.mine = "", False
         if self.phase in (Phase.STARTING, Phase.DRIVING):
-            against = self._against(now_us) or self._unanswered(now_us)
+            # The keys of that time may have been let go since.
+            frozen = f"this program stood still for {still_us // 1000} ms" if still_us > _STILL_US else ""
+            against = frozen or self._against(now_us) or self._unanswered(now_us)
             if against:
                 self._end(against)
         if self.phase is Phase.DRIVING:

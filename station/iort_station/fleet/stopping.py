@@ -65,9 +65,11 @@ def stop(cloud: Cloud, robots: Iterable[str], *, stopped: bool) -> dict[str, str
 def _motion(cloud: Cloud, robot: str) -> Motion:
     state = read(cloud.client("iot-data"), robot)
     rejected = state.rejected().get(MOTION_STOPPED)
+    stopped = state.reported.settings.get(MOTION_STOPPED)
     return Motion(
-        asked=state.desired.settings.get(MOTION_STOPPED) is True,
-        stopped=state.reported.settings.get(MOTION_STOPPED),
+        # A robot may also stand by its car.yaml, or since the shadow that asked for it was deleted.
+        asked=state.desired.settings.get(MOTION_STOPPED, stopped) is True,
+        stopped=stopped,
         reason=rejected.reason if rejected is not None else "",
         drive=state.reported.drive,
     )

@@ -93,6 +93,7 @@ def test_the_queues_path_is_relative_to_the_file(
 
 
 SIM = "  - type: sim\n"
+DRIVE = "topic: /drive, type: ackermann_msgs/AckermannDriveStamped"
 
 
 @pytest.mark.parametrize(
@@ -171,6 +172,10 @@ SIM = "  - type: sim\n"
         (
             (SIM, SIM + "queue: {path: 7}\n"),
             ["queue.path: must be ", "got 7 (a number)", "the path of a file"],
+        ),
+        (
+            (SIM, f"{SIM}downlink: {{cmd: {{a: {{{DRIVE}, motion: {{stop: {{}}}}}}, b: {{{DRIVE}}}}}}}\n"),
+            ["downlink: cmd.b must have motion, as cmd.a has: /drive moves the robot"],
         ),
         ((SIM, SIM + "port: 88830\n"), ["port: must be ", "got 88830", "1 to 65535"]),
         ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),

@@ -216,3 +216,20 @@ def test_in_real_time_the_stop_comes_with_the_end_of_the_lease() -> None:
     assert stopped.wait(5)
     rig.downlink.close()
     assert not rig.downlink._thread.is_alive()
+
+
+def test_a_ros_library_that_fails_once_does_not_keep_the_car_from_stopping() -> None:
+    rig = Rig(clock=SystemClock())
+    publish, failures = rig.graph.publish, [RuntimeError("no more sockets")]
+
+    def failing(topic: str, data: bytes) -> bool:
+        if data == doubles(0) and failures:
+            raise failures.pop()
+        return publish(topic, data)
+
+    rig.graph.publish = failing  # type: ignore[method-assign]  # once
+    rig.downlink.start()
+    rig.send({"data": 2.5}, lease_ms=100)
+    assert rig.graph.stopped.wait(5)
+    assert not failures
+    rig.downlink.close()

@@ -133,6 +133,17 @@ def test_a_car_that_no_longer_answers_is_not_driven_on() -> None:
     assert "500 ms are allowed" in rig.driver.reason
 
 
+def test_a_program_that_stood_still_does_not_drive_on_by_the_keys_of_that_time() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.answer(rig.sent[-1])
+    rig.now_us += 2_000_000
+    rig.step(10)
+    assert rig.driver.phase is Phase.OVER
+    assert "stood still for 20" in rig.driver.reason
+    assert speeds(rig)[-4:] == [1, 0, 0, 0]
+
+
 def test_old_samples_and_a_long_round_trip_are_refused() -> None:
     rig = Rig()
     rig.begin()

@@ -63,6 +63,12 @@ def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
     assert (told["asked"], told["stopped"]) == (False, True)
 
 
+def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release(cloud):
+    cloud.confirm("car7", stopped=True)
+    told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
+    assert (told["asked"], told["stopped"]) == (True, True)
+
+
 def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):
     cloud.broken = "car7"
     told = motion.actions(cloud)["stop"]({"stopped": "true"})

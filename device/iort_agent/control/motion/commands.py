@@ -251,19 +251,19 @@ class Commands:
     ) -> tuple[tuple[str, str] | None, Mapping[str, Value] | None]:
         """Publish the command if it may pass. Returns the reason if not, as a word and as a text, and the
         sample of a motion."""
-        now_us = self._clock.now_us()
         try:
-            data = command.data(offered.message, now_us)
+            data = command.data(offered.message, self._clock.now_us())
         except MessageError as error:
             return ("malformed", str(error)), None
-        offset = self._bridge.offset()
-        uncertainty_us = None
-        if offset is not None:
-            now_us += round(offset.offset_ms * 1000)
-            uncertainty_us = round(offset.uncertainty_ms * 1000)
         moves = command.config.motion is not None
+        # All times under the lock, for which the command may have waited.
         with self._lock:
-            now = self._clock.monotonic()
+            now, now_us = self._clock.monotonic(), self._clock.now_us()
+            offset = self._bridge.offset()
+            uncertainty_us = None
+            if offset is not None:
+                now_us += round(offset.offset_ms * 1000)
+                uncertainty_us = round(offset.uncertainty_ms * 1000)
             reason = self._unready() if moves else None
             if reason is None:
                 reason = command.leases.offer(offered, now_us=now_us, uncertainty_us=uncertainty_us, now=now)

@@ -97,6 +97,7 @@ class _Seat:
         self._topic = build_topic(CMD, robot, driver.limits.command, cloud.namespace)
         self._lease = encode_lease(Lease(secrets.token_hex(8), LIVE_MAX_RATE_HZ, VIEW_LEASE_MS, broker=True))
         self._viewed_us = -int(VIEW_RENEW_S * 1e6)
+        self._stop_asked = False
         self.broker = Broker(
             cloud,
             Role(cloud, DRIVER),
@@ -151,8 +152,17 @@ class _Seat:
         elif key == "t":
             driver.takeover = not driver.takeover
         elif key == "e":
-            self._keys.let_go()
-            stopping.stop(self._cloud, [self._robot], stopped=True)
+            self._stop(now_us)
+
+    def _stop(self, now_us: int) -> None:
+        """Stop in an emergency; raises `StationError` if that fails."""
+        self._keys.let_go()
+        # The broker is faster than the shadow.
+        self._tick(now_us)
+        failed = stopping.stop(self._cloud, [self._robot], stopped=True)
+        if failed:
+            raise StationError(f"the emergency stop of {self._robot} has failed: {failed[self._robot]}")
+        self._stop_asked = True
 
     def _tick(self, now_us: int) -> None:
         while not self._heard.empty():
@@ -189,6 +199,9 @@ class _Seat:
         rows.add_row("steering", f"{steering} rad")
         rows.add_row("round trip", _ms(driver.rtt_us, DRIVE_MAX_RTT_MS))
         rows.add_row("newest sample", _ms(driver.age_us(now_us), DRIVE_MAX_AGE_MS))
+        if self._stop_asked:
+            confirms = f"asked for; `iort stop {self._robot}` tells whether the car has confirmed it"
+            rows.add_row("emergency stop", Text(confirms, style="red"))
         rows.add_row("", Text(_HELP, style="dim"))
         return rows
 
