@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from math import ceil
 
-from bench.sections import dashboard, outage, query, round_trips, utilisation
+from bench.sections import dashboard, outage, query, round_trips, utilisation, viewing
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
@@ -21,6 +21,7 @@ _METER, _WRITE, _READ = 5 * 1024, 1024, 2 * 4096
 _BATCH_WRITES, _SUMMARY_WRITES = 2, 3
 _BILLED_S = 0.02
 _MINUTES_CONNECTED = 30
+_WAKE_S = 5
 
 
 def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
@@ -33,6 +34,8 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "command": lambda: _items(write=60 * (_BATCH_WRITES + _SUMMARY_WRITES), read=60 * _BATCH_WRITES),
         # A metric of its own, for the hour that AWS bills.
         "abilities": lambda: [*_items(metric=1 / 730, message=500, write=500), *_invoked(100, 512)],
+        # Both ways, each with its wakes; a wake waits for the car to be idle.
+        "viewing": lambda: _driven(viewing.IDLE_S + 2 * (viewing.WATCHED_S + viewing.WAKES * _WAKE_S)),
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
     }
     return {key: line_items.total(counted[key]()) for key in sections if key in counted}

@@ -57,7 +57,7 @@ def test_an_installed_car_can_be_driven_queried_and_watched(agent, station, clou
     assert "speed" in json.loads(samples[0])
     with station.start("iort", "dashboard", "--port", "0", **cloud) as dashboard:
         try:
-            url = dashboard.stdout.readline().split()[0]
+            url = dashboard.stdout.readline().partition("#")[0]
             with urlopen(url) as page:
                 assert "<title>" in page.read().decode()
             with urlopen(f"{url}page.js") as script:
