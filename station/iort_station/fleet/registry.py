@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from typing import Any, NamedTuple
 
+from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.page import RobotPresence
@@ -93,8 +94,13 @@ def not_registered(cloud: Cloud, robot: str) -> StationError:
 def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
     """Write a new row, which reserves the name; AWS IoT does not refuse a second thing of the same name.
 
-    Raises `StationError` for a registered robot.
+    Raises `StationError` for a registered robot, and for a name that others at the broker may have.
     """
+    others = (client_prefix(who, cloud.namespace) for who in (VIEWER, DRIVER))
+    kept = (f"{claim_name(cloud.namespace)}-", *others)
+    if robot.startswith(kept):
+        # A robot's name is its client id. Who connects with the same one takes its connection.
+        raise UsageError(f"robot name must not begin with {', '.join(kept)}, got {robot}")
     # TAB needs the names of robots, but not boto3, whose import takes longer than TAB may.
     from boto3.dynamodb.types import TypeSerializer  # noqa: PLC0415 - see above
 

@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from iort_contract.cloud import DRIVER, IOT, PUBNUB, VIEWER, client_prefix
 from iort_contract.messages.page import Identity, SocketAnswer
 from iort_station.cloud import Cloud
+from iort_station.fleet import registry
 from iort_station.fleet.roles import Role, has_drivers, transport
 from iort_station.page import keys
 from iort_station.page.page import DRIVE
@@ -37,10 +38,17 @@ def reaching(cloud: Cloud, live: str) -> dict[str, Any]:
 
 
 def everybody(cloud: Cloud) -> dict[str, Any]:
-    """Keyword arguments for the configuration of a page without a server."""
+    """Keyword arguments for the configuration of a page without a server, which anybody can read."""
+    vehicles = registry.vehicles(cloud)
     if transport(cloud) == PUBNUB:
-        return keys.load(cloud).reading()
-    return {"live": IOT, "identity": identity(cloud)}
+        return {"vehicles": vehicles, **keys.load(cloud).reading()}
+    everybodys = identity(cloud)
+    shown = everybodys["robots"] or vehicles
+    return {
+        "vehicles": {robot: car for robot, car in vehicles.items() if robot in shown},
+        "live": IOT,
+        "identity": everybodys,
+    }
 
 
 def identity(cloud: Cloud) -> Identity:

@@ -41,6 +41,14 @@ def test_vehicles_have_their_gain_and_offset():
     }
 
 
+@pytest.mark.parametrize("name", ["iort-viewer-1", "iort-driver-car", "iort-claim-1"])
+def test_a_robot_has_no_name_under_which_others_connect(dynamodb, name):
+    cloud = FakeCloud(dynamodb)
+    with pytest.raises(StationError, match="must not begin with iort-claim-, iort-viewer-, iort-driver-"):
+        registry.enter(cloud, name, {})
+    registry.enter(cloud, "iort-viewer", {})
+
+
 def test_set_vehicle_changes_only_the_given_parameters(dynamodb):
     cloud = FakeCloud(dynamodb)
     registry.enter(cloud, "car", {"speed_to_erpm_gain": 4614.0, "serial": "s"})

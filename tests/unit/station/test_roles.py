@@ -13,7 +13,7 @@ from botocore.credentials import ReadOnlyCredentials
 
 from iort_contract.cloud import DRIVER, PUBNUB, VIEWER
 from iort_station.errors import StationError
-from iort_station.fleet import roles
+from iort_station.fleet import registry, roles
 from iort_station.fleet.roles import Role, has_drivers, signed_url, transport
 from iort_station.page.page import config
 from iort_station.page.socket import actions, everybody, reaching
@@ -67,7 +67,8 @@ def _signature(url: str) -> str:
     return parse_qs(urlsplit(url).query)["X-Amz-Signature"][0]
 
 
-def test_a_page_is_told_where_it_listens_and_may_connect_there():
+def test_a_page_is_told_where_it_listens_and_may_connect_there(monkeypatch):
+    monkeypatch.setattr(registry, "vehicles", lambda _: {"car1": {}, "hidden": {}})
     cloud: Any = Cloud(
         LiveTransport="iot", DriverRole="d", PublicPoolId="eu-west-1:1", PublicRobots="car1,car2"
     )
@@ -82,6 +83,7 @@ def test_a_page_is_told_where_it_listens_and_may_connect_there():
         "robots": ["car1", "car2"],
     }
     assert "sub-c-" not in str(config(namespace="iort", **told))
+    assert told["vehicles"] == {"car1": {}}, "nobody is told of a car that the site does not show"
     assert reaching(cloud, "iot") == {"live": "iot", "broker": "wss://abc-ats.iot.eu-west-1.amazonaws.com"}
     assert actions(cloud).keys() == {"drive"}
     assert not actions(Cloud())  # type: ignore[arg-type]  # a fake

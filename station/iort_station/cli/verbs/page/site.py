@@ -9,7 +9,6 @@ import typer
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
 from iort_station.cli.words import examples
-from iort_station.fleet import registry
 from iort_station.page.page import config, load_track
 from iort_station.page.site import publish, upload
 from iort_station.page.socket import everybody
@@ -43,7 +42,6 @@ def site(
         return
     told = config(
         namespace=cloud.namespace,
-        vehicles=registry.vehicles(cloud),
         token=token,
         track=None if track is None else load_track(track),
         **everybody(cloud),
