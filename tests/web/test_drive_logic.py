@@ -224,7 +224,7 @@ def test_a_wrong_clock_is_corrected_by_the_cars_answer() -> None:
 HAND = """
 const [steps] = given;
 class Node extends EventTarget {
-  matches = () => this.field;
+  matches = (selector) => selector.split(", ").includes(this.field);
 }
 globalThis.Element = Node;
 globalThis.window = new EventTarget();
@@ -238,7 +238,9 @@ const hand = new page.Inputs(new Node(), new Node(), () => {}, () => {});
 return steps.map(([type, { pad, field, ...told } = {}]) => {
   if (pad !== undefined) shoulder = pad ?? undefined;
   const target = Object.assign(new Node(), { field });
-  const event = Object.defineProperty(Object.assign(new Event(type), told), "target", { value: target });
+  const event = Object.assign(new Event(type, { cancelable: true }), told);
+  Object.defineProperty(event, "target", { value: target });
+  if (told.prevented) event.preventDefault();
   window.dispatchEvent(event);
   hand.read(0.05);
   return hand.held;
@@ -253,11 +255,15 @@ AGAIN: Any = ["keydown", {"code": "Space", "repeat": True}]
     [
         ([DOWN, AGAIN, ["keyup", {"code": "Space"}]], [True, True, False]),
         # Let go in a text field, which has got the focus meanwhile.
-        ([DOWN, ["keyup", {"code": "Space", "field": True}]], [True, False]),
+        ([DOWN, ["keyup", {"code": "Space", "field": "textarea"}]], [True, False]),
         # The release of a key is not told while a menu is open, something is dragged, or a Mac's Cmd is held.
         ([DOWN, ["contextmenu"], AGAIN], [True, False, False]),
+        ([DOWN, ["contextmenu", {"prevented": True}]], [True, True]),
         ([DOWN, ["dragstart"], AGAIN], [True, False, False]),
-        ([DOWN, ["focusin", {"field": True}], AGAIN], [True, False, False]),
+        ([DOWN, ["focusin", {"field": "textarea"}], AGAIN], [True, False, False]),
+        # The emergency stop ends a hold, and Space presses it.
+        ([DOWN, ["focusin", {"field": ".stop-press"}]], [True, False]),
+        ([["keydown", {"code": "Space", "field": ".stop-press"}]], [False]),
         ([DOWN, ["keydown", {"code": "MetaLeft", "metaKey": True}], AGAIN], [True, False, False]),
         # A key that is still held when the page gets the focus back is no press; a gamepad's button neither.
         ([DOWN, ["blur"], AGAIN, DOWN], [True, False, False, True]),

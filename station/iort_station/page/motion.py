@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -35,10 +36,21 @@ class _Fleet:
                 self._read_s = time.monotonic()
             return self._found
 
+    def forget(self) -> None:
+        """Read again when asked next: a stop must not seem to be gone."""
+        with self._lock:
+            self._read_s = -_KEPT_S
+
+
+@functools.cache
+def _fleet(cloud: Cloud) -> _Fleet:
+    """One for what asks and for what stops."""
+    return _Fleet(cloud)
+
 
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """The answer ``motion``: of ``robot``, as it is now; without one, of the fleet."""
-    fleet = _Fleet(cloud)
+    fleet = _fleet(cloud)
 
     def listed(asked: Mapping[str, str]) -> MotionAnswer:
         robot = asked.get("robot")
@@ -49,6 +61,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
 
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """The action ``stop``."""
+    fleet = _fleet(cloud)
 
     def stop(asked: Mapping[str, str]) -> MotionAnswer:
         """Stop ``robot``, or release it; without one, the fleet."""
@@ -57,6 +70,7 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
             raise StationError("stopped must be true or false")
         robots = [check_robot(asked["robot"])] if asked.get("robot") else list(registry.presence(cloud))
         failed = stopping.stop(cloud, robots, stopped=wanted)
+        fleet.forget()
         return _told(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
 
     return {"stop": stop}

@@ -1,15 +1,22 @@
-"""The guard's process, seen from the agent: motion is refused without it, and nothing waits for it."""
+"""The guard: motion is refused without it, nothing waits for it, and it stops the robot of a dead agent."""
 
 from __future__ import annotations
 
+import json
 import os
 import select
+import signal
 import subprocess
+import sys
+import threading
+import time
 from typing import Any
 
 import pytest
 
+from iort_agent.control.motion import guard_process
 from iort_agent.control.motion.guard import Guard
+from iort_contract.ros1.definition import parse
 from tests.agent_fakes import ManualClock
 
 
@@ -45,3 +52,49 @@ def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
     assert select.select([started[1].stdout], [], [], 30)[0]
     assert guard.ready()
     guard.close()
+
+
+class Node:
+    """A ROS node in a graph that is there."""
+
+    failed = None
+
+    def __init__(self) -> None:
+        self.ready, self.published = threading.Event(), list[bytes]()
+        self.ready.set()
+
+    def definition(self, kind: str) -> Any:
+        return parse(kind, "float64 data")
+
+    def listeners(self, _topic: str) -> int:
+        return 1
+
+    def publish(self, _topic: str, data: bytes) -> bool:
+        self.published.append(data)
+        return True
+
+    def advertise(self, *_: Any) -> None:
+        pass
+
+    start = close = advertise
+
+
+def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_with_stops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = Node()
+    lines, written = os.pipe()
+    nobody, answers = os.pipe()
+    os.close(nobody)
+    stops = {"speed": {"topic": "/speed", "type": "std_msgs/Float64", "stop": {"data": 0.0}}}
+    for line in ({"node": "guard", "stops": stops}, ["speed", time.monotonic() + 100]):
+        os.write(written, json.dumps(line).encode() + b"\n")
+    os.close(written)
+    monkeypatch.setattr(guard_process, "shared", lambda _name: node)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with os.fdopen(lines) as stdin, os.fdopen(answers, "w") as stdout:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert guard_process.main() == 0
+        monkeypatch.undo()
+    assert len(node.published) == 5

@@ -63,6 +63,13 @@ def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
     assert (told["asked"], told["stopped"]) == (False, True)
 
 
+def test_a_stop_of_the_fleet_is_seen_at_once(cloud):
+    ask, act = motion.answers(cloud)["motion"], motion.actions(cloud)["stop"]
+    assert not ask({})["robots"]["car8"]["asked"]
+    act({"stopped": "true"})
+    assert ask({})["robots"]["car8"]["asked"]
+
+
 def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release(cloud):
     cloud.confirm("car7", stopped=True)
     told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]

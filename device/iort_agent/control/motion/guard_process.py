@@ -14,6 +14,7 @@ import select
 import signal
 import sys
 import threading
+from contextlib import suppress
 from typing import Any, Mapping
 
 from iort_agent.clock import SystemClock
@@ -108,7 +109,9 @@ def main() -> int:
     while guard.node.failed is None:
         answers = answers or guard.ready()
         if waits and answers:
-            os.write(sys.stdout.fileno(), b"\n" * waits)
+            # An agent that was killed hears nothing. What it wrote before is read below, to its end.
+            with suppress(BrokenPipeError):
+                os.write(sys.stdout.fileno(), b"\n" * waits)
             waits = 0
         asleep_s = _IDLE_S if answers else _POLL_S
         readable, _, _ = select.select([sys.stdin], [], [], asleep_s if left is None else min(left, asleep_s))

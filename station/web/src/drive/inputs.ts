@@ -6,7 +6,8 @@ import { CENTRE, followed, keyed, padded, pointed, pushes, type Stick } from "./
 
 // L1 and R1 of the standard mapping.
 const SHOULDERS = [4, 5] as const;
-const TYPED = "input:not([type=range]), select, textarea";
+// What takes the keys itself: the emergency stop must be pressed by Space, too.
+const TYPED = "input:not([type=range]), select, textarea, .stop-press";
 
 export class Inputs {
   private readonly keys = new Set<string>();
@@ -33,7 +34,9 @@ export class Inputs {
     window.addEventListener("keydown", (event) => this.key(event, true, leave), early);
     window.addEventListener("keyup", (event) => this.key(event, false, leave), early);
     document.addEventListener("visibilitychange", () => this.release(), { signal });
-    for (const end of ["blur", "pagehide", "contextmenu", "dragstart"] as const) window.addEventListener(end, () => this.release(), { signal });
+    for (const end of ["blur", "pagehide", "dragstart"] as const) window.addEventListener(end, () => this.release(), { signal });
+    // A finger that rests on the button asks for a menu, too, and gets none.
+    window.addEventListener("contextmenu", (event) => event.defaultPrevented || this.release(), { signal });
     window.addEventListener("focusin", (event) => typed(event) && this.release(), { signal });
     for (const node of [pad, button]) node.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
     button.addEventListener("pointerdown", (event) => {
