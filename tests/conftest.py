@@ -163,6 +163,7 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
         device_defender=True,
         iot_log_level="error",
         robot_metrics=True,
+        drivers=True,
     )
 
 

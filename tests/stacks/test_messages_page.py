@@ -7,6 +7,7 @@ import re
 from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name
+from iort_contract.messages.viewing import lease_topic
 from iort_contract.topics import (
     ANSWER,
     ASK,
@@ -90,6 +91,7 @@ def test_the_table_has_every_topic_of_the_contract():
         *(build_topic(PING, ME, path) for path in (*PING_PATHS, FILE)),
         *(build_topic(PONG, ME, path) for path in (RULE, LAMBDA, FILE)),
         build_topic(CMD, ME, "drive"),
+        lease_topic(ME, "iort"),
         build_topic(ASK, ME, "drive"),
         build_topic(ANSWER, ME, "drive"),
         build_topic(FLEET, ME, "drive"),
