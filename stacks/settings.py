@@ -23,6 +23,8 @@ ROOT = Path(__file__).resolve().parent.parent
 DEV, PROD = "dev", "prod"
 _RESERVED_FOR_LIVE = 5
 OWN_LOGS, ALL_LOGS = "own", "all"
+# AWS IoT ends a connection with more subscriptions.
+_MOST_SITE_ROBOTS = 50
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
@@ -83,6 +85,8 @@ def _robots(value: Any) -> list[str]:
     names = value.split(",") if isinstance(value, str) else value
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("must be robots as car1,car2")
+    if len(set(names)) > _MOST_SITE_ROBOTS:
+        raise ValueError(f"must be at most {_MOST_SITE_ROBOTS} robots")
     return sorted({check_robot(name) for name in names})
 
 
@@ -224,7 +228,7 @@ class Settings(BaseModel):
     site_robots: Annotated[list[str], BeforeValidator(_robots)] = Field(
         default=[],
         description="the robots that the page on the web shows with `live_transport=iot`, as `car1,car2`; "
-        "without a value all of them. With PubNub, its access token says which",
+        "at most 50; without a value all of them. With PubNub, its access token says which",
     )
     embedded: Flag = Field(
         default=False, description="for the embedded cloud, with the caller's own credentials"

@@ -147,6 +147,7 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"live_transport": "mqtt"}, ["live_transport", "'mqtt'", "pubnub or iot"]),
         ({"site_robots": "car1,car 2"}, ["robot name", "car 2"]),
         ({"site_robots": 7}, ["site_robots", "7", "car1,car2"]),
+        ({"site_robots": [f"car{i}" for i in range(51)]}, ["site_robots", "at most 50 robots"]),
         ({"tags": "aws:x=1"}, ["tags", "'aws:x=1'"]),
         ({"tags": {"team": 7}}, ["tags", "7"]),
         ({"layer": "build/nowhere"}, ["build/nowhere", "make layer"]),

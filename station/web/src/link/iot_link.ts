@@ -16,6 +16,8 @@ const OPEN_S = 15;
 const CONNECT_S = 10;
 // The least that AWS IoT allows; the probe finds a dead connection sooner.
 const KEEPALIVE_S = 30;
+// The most that AWS IoT takes in one request to subscribe.
+const MOST_FILTERS = 8;
 // A reason code of MQTT 5 from this on is a failure.
 const FAILED = 0x80;
 
@@ -72,7 +74,7 @@ export class IotLink extends Link {
     try {
       const { url, client_id } = await socketAddress(identity);
       if (opened !== this.opened) return;
-      client = mqtt.connect(url, { protocolVersion: 5, clientId: client_id, clean: true, reconnectPeriod: 0, resubscribe: false, keepalive: KEEPALIVE_S, connectTimeout: CONNECT_S * 1000, timerVariant: "native" });
+      client = mqtt.connect(url, { protocolVersion: 5, clientId: client_id, clean: true, reconnectPeriod: 0, resubscribe: false, subscribeBatchSize: MOST_FILTERS, keepalive: KEEPALIVE_S, connectTimeout: CONNECT_S * 1000, timerVariant: "native" });
     } catch (error) {
       if (opened !== this.opened) return;
       if (error instanceof AnswerError) this.lose(error.message);
