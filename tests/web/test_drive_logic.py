@@ -300,3 +300,16 @@ clock.heard(3_601_100, 1_100);
 return clock.offset_ms;
 """
     assert run("drive/cloud_clock.ts", script) == 3_600_000
+
+
+def test_a_confirmation_is_a_press_of_its_own() -> None:
+    script = """
+const button = new EventTarget();
+let presses = 0;
+page.onPress(button, () => (presses += 1));
+for (const detail of [1, 2, 0]) button.dispatchEvent(Object.assign(new Event("click"), { detail }));
+const held = Object.assign(new Event("keydown", { cancelable: true }), { repeat: true });
+// The browser presses the button unless this is prevented.
+return [presses, button.dispatchEvent(held)];
+"""
+    assert run("base/dom.ts", script) == [2, False]

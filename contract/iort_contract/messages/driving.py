@@ -124,6 +124,7 @@ def check_limits(limits: DriveLimits) -> DriveLimits:
 def check_path(path: str, what: str) -> str:
     """Return ``path`` if it is a field of a message, or of messages within it; not an array's element."""
     checked(FIELD_NAME, path, what, "a ROS field name or a dotted path of them")
-    if any(part.isdigit() for part in path.split(".")):
-        raise ContractError(f"{what} must not be an array's element, got {shown(path)}")
+    # A page makes an object of the path, where `__proto__` is no name.
+    if any(part.isdigit() or part.startswith("_") for part in path.split(".")):
+        raise ContractError(f"{what} must not be an array's element, nor begin with _, got {shown(path)}")
     return path
