@@ -6,6 +6,7 @@ import { el, onPress, setAttribute, Text } from "../base/dom";
 import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { may } from "../server/admission";
+import { driverName } from "./command";
 import { Driver } from "./driver";
 import { Inputs } from "./inputs";
 import { readLive } from "./live_message";
@@ -90,7 +91,7 @@ export class DrivePanel {
     const motion = robot === undefined ? undefined : this.stops.of(robot);
     if (robot === undefined || !motion?.drive) return;
     const limits = motion.drive;
-    const by = this.name.value.trim() || this.stops.user;
+    const by = driverName(this.name.value, this.stops.user);
     const driver = new Driver(limits, by, newName);
     this.top.max = String(limits.max_speed_mps);
     this.top.value = String(Math.min(limits.max_speed_mps, Number(kept("drive.top") ?? FIRST_TOP_MPS)));
