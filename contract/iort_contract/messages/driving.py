@@ -6,7 +6,7 @@ A driver's session is one hold of the stick. It sends `DRIVE_RATE_HZ` commands a
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import asdict, dataclass
 from typing import Any, Mapping
 
@@ -112,7 +112,8 @@ def check_limits(limits: DriveLimits) -> DriveLimits:
         ("max_steering_rad", limits.max_steering_rad),
     ):
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or value <= 0:
+        # An integer may be larger than every float.
+        if not number or not 0 < value <= sys.float_info.max:
             raise ContractError(f"{name} must be a number above 0, got {shown(value)}")
     if type(limits.lease_ms) is not int or not 1 <= limits.lease_ms <= MAX_LEASE_MS:
         raise ContractError(
