@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import decode_command
+from iort_contract.messages.commands import check_by, decode_command
 from iort_contract.messages.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS
 from tests.web.node import call, run
 
@@ -300,3 +300,29 @@ clock.heard(3_601_100, 1_100);
 return clock.offset_ms;
 """
     assert run("drive/cloud_clock.ts", script) == 3_600_000
+
+
+@pytest.mark.parametrize(
+    ("names", "by"),
+    [
+        (["\u00a0ada \u202elovelace\t"], "ada  lovelace"),
+        (["\u200d", "bob"], "bob"),
+        (["", "\x1b"], "somebody"),
+        (["Z\u00fcrich \U0001f697"], "Z\u00fcrich \U0001f697"),
+    ],
+)
+def test_a_drivers_name_is_one_that_the_car_takes(names: list[str], by: str) -> None:
+    assert call("drive/command.ts", "driverName", *names) == check_by(by)
+
+
+def test_a_confirmation_is_a_press_of_its_own() -> None:
+    script = """
+const button = new EventTarget();
+let presses = 0;
+page.onPress(button, () => (presses += 1));
+for (const detail of [1, 2, 0]) button.dispatchEvent(Object.assign(new Event("click"), { detail }));
+const held = Object.assign(new Event("keydown", { cancelable: true }), { repeat: true });
+// The browser presses the button unless this is prevented.
+return [presses, button.dispatchEvent(held)];
+"""
+    assert run("base/dom.ts", script) == [2, False]

@@ -6,7 +6,7 @@ A driver's session is one hold of the stick. It sends `DRIVE_RATE_HZ` commands a
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import asdict, dataclass
 from typing import Any, Mapping
 
@@ -112,7 +112,8 @@ def check_limits(limits: DriveLimits) -> DriveLimits:
         ("max_steering_rad", limits.max_steering_rad),
     ):
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or value <= 0:
+        # An integer may be larger than every float.
+        if not number or not 0 < value <= sys.float_info.max:
             raise ContractError(f"{name} must be a number above 0, got {shown(value)}")
     if type(limits.lease_ms) is not int or not 1 <= limits.lease_ms <= MAX_LEASE_MS:
         raise ContractError(
@@ -124,6 +125,7 @@ def check_limits(limits: DriveLimits) -> DriveLimits:
 def check_path(path: str, what: str) -> str:
     """Return ``path`` if it is a field of a message, or of messages within it; not an array's element."""
     checked(FIELD_NAME, path, what, "a ROS field name or a dotted path of them")
-    if any(part.isdigit() for part in path.split(".")):
-        raise ContractError(f"{what} must not be an array's element, got {shown(path)}")
+    # A page makes an object of the path, where `__proto__` is no name.
+    if any(part.isdigit() or part.startswith("_") for part in path.split(".")):
+        raise ContractError(f"{what} must not be an array's element, nor begin with _, got {shown(path)}")
     return path

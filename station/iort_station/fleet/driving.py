@@ -226,9 +226,11 @@ class Driver:
             self.rtt_us = now_us - left_us
             if live.offset_us is not None:
                 self._clock.answered(left_us, live.t_us + live.offset_us)
-        if outcome == STOPPED or self.phase not in (Phase.STARTING, Phase.DRIVING):
+        if self.phase not in (Phase.STARTING, Phase.DRIVING):
             return
-        if outcome != ACCEPTED:
+        if outcome == STOPPED:
+            self._end("the car was stopped")
+        elif outcome != ACCEPTED:
             self._refused(str(outcome), now_us)
         elif self.rtt_us is not None and self.rtt_us > DRIVE_MAX_RTT_MS * 1000:
             self._end(_slow(self.rtt_us))

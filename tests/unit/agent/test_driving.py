@@ -148,6 +148,7 @@ def test_before_the_operators_settings_are_known_nothing_moves() -> None:
         ),
         ({"max_speed_mps": 0}, "max_speed_mps: must be a number from 0.01"),
         ({"speed": "pose.0"}, "must not be an array"),
+        ({"speed": "pose.__proto__.x"}, "nor begin with _"),
     ],
 )
 def test_a_wrong_configuration(change: Any, error: str) -> None:

@@ -144,6 +144,15 @@ def test_a_program_that_stood_still_does_not_drive_on_by_the_keys_of_that_time()
     assert speeds(rig)[-4:] == [1, 0, 0, 0]
 
 
+def test_a_car_that_has_stopped_meanwhile_does_not_go_on() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.answer(rig.sent[-1], "stopped")
+    rig.step(10)
+    assert (rig.driver.phase, rig.driver.reason) == (Phase.OVER, "the car was stopped")
+    assert speeds(rig)[-4:] == [1, 0, 0, 0]
+
+
 def test_old_samples_and_a_long_round_trip_are_refused() -> None:
     rig = Rig()
     rig.begin()

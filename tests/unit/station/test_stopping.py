@@ -70,6 +70,13 @@ def test_a_stop_of_the_fleet_is_seen_at_once(cloud):
     assert ask({})["robots"]["car8"]["asked"]
 
 
+def test_a_robot_with_impossible_limits_keeps_no_other_from_its_stop(cloud):
+    cloud.states["car7"]["reported"]["drive"]["max_speed_mps"] = 10**400
+    told = motion.actions(cloud)["stop"]({"stopped": "true"})["robots"]
+    assert told["car8"]["asked"]
+    assert told["car7"]["drive"] is None
+
+
 def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release(cloud):
     cloud.confirm("car7", stopped=True)
     told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]

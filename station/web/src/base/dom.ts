@@ -42,5 +42,12 @@ export function marked(text: string): (HTMLElement | string)[] {
   return text.split("`").map((part, i) => (i % 2 === 1 ? el("code", {}, part) : part));
 }
 
+/** Call back for each press of a button that is meant: not for a key's repetitions, nor for the second half of a
+ *  double click. */
+export function onPress(button: HTMLElement, pressed: () => void): void {
+  button.addEventListener("keydown", (event) => event.repeat && event.preventDefault());
+  button.addEventListener("click", ({ detail }) => detail < 2 && pressed());
+}
+
 /** Natural order: car-2 before car-10. */
 export const byName = new Intl.Collator("en", { numeric: true }).compare;

@@ -28,6 +28,12 @@ export interface Session {
   readonly by: string;
 }
 
+/** The first of the names in characters that the contract takes; a car ignores a command with others. */
+export function driverName(...names: readonly string[]): string {
+  const printable = names.map((name) => name.replace(/[\p{C}\p{Z}]/gu, " ").trim());
+  return printable.find((name) => name !== "") ?? "somebody";
+}
+
 export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
   const lease_ms = Math.max(1, Math.min(DRIVE_LEASE_MS, limits.lease_ms) - MARGIN_MS);
   return {

@@ -2,10 +2,11 @@
 
 import { DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, type Config, type DriveLimitsEntry } from "../base/contract";
 import { now } from "../base/clock";
-import { el, setAttribute, Text } from "../base/dom";
+import { el, onPress, setAttribute, Text } from "../base/dom";
 import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { may } from "../server/admission";
+import { driverName } from "./command";
 import { Driver } from "./driver";
 import { Inputs } from "./inputs";
 import { readLive } from "./live_message";
@@ -54,7 +55,7 @@ export class DrivePanel {
     this.name.addEventListener("change", () => keep("name", this.name.value));
     this.take.addEventListener("click", () => this.enter());
     this.leave.addEventListener("click", () => this.exit());
-    this.over.addEventListener("click", () => this.takeOver());
+    onPress(this.over, () => this.takeOver());
     this.over.addEventListener("blur", () => (this.sure = false));
     this.top.addEventListener("input", () => this.topped());
     const limits = el("div", { class: "drive-limits" }, el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top), ...Object.values(this.figures).map(({ node }) => node));
@@ -90,7 +91,7 @@ export class DrivePanel {
     const motion = robot === undefined ? undefined : this.stops.of(robot);
     if (robot === undefined || !motion?.drive) return;
     const limits = motion.drive;
-    const by = this.name.value.trim() || this.stops.user;
+    const by = driverName(this.name.value, this.stops.user);
     const driver = new Driver(limits, by, newName);
     this.top.max = String(limits.max_speed_mps);
     this.top.value = String(Math.min(limits.max_speed_mps, Number(kept("drive.top") ?? FIRST_TOP_MPS)));

@@ -2,7 +2,7 @@
 // asks whether it is meant.
 
 import type { Config } from "../base/contract";
-import { el, setAttribute, Text } from "../base/dom";
+import { el, onPress, setAttribute, Text } from "../base/dom";
 import { Stops } from "./stops";
 
 // A longer list of names says nothing more.
@@ -28,7 +28,7 @@ export class StopControl {
     this.press.hidden = this.release.hidden = !this.stops.able;
     if (this.stops.able) header.querySelector("#link")!.before(this.press);
     this.press.addEventListener("click", () => void this.stops.set(this.robot, true));
-    this.release.addEventListener("click", () => {
+    onPress(this.release, () => {
       if (this.sure) void this.stops.set(this.robot, false);
       this.ask(!this.sure);
     });
