@@ -93,7 +93,7 @@ def test_one_drives_the_other_sees_it_and_takes_over(
         def bob_is_refused() -> bool:
             """Ada's hold may end by itself on a slow machine."""
             bob.keyboard.up("Space")
-            return hold(ada) == "Driving." and "ada drives this car" in hold(bob, "ada drives this car")
+            return hold(ada) == "Driving." and "Ada drives this car" in hold(bob, "Ada drives this car")
 
         until(bob_is_refused, "the second driver to be refused")
         bob.keyboard.up("Space")

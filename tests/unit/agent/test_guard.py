@@ -60,7 +60,8 @@ class Node:
     failed = None
 
     def __init__(self) -> None:
-        self.ready, self.published = threading.Event(), list[bytes]()
+        self.published: list[bytes] = []
+        self.ready = threading.Event()
         self.ready.set()
 
     def definition(self, kind: str) -> Any:
