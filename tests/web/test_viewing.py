@@ -130,9 +130,12 @@ def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page
 def test_a_car_that_is_looked_at_again_is_held_though_the_end_arrives_late(
     open_page: Callable[..., Page], served: str, leases: Leases
 ) -> None:
-    page = open_page(f"{served}#/car/car-99")
+    page = open_page(f"{served}#/alarms")
     page.add_init_script(NO_RENEWAL)
     page.reload()
+    # The page asks again when it is connected.
+    until(lambda: page.inner_text("#link") == "Connected", "the page to connect")
+    page.goto(f"{served}#/car/car-99")
     until(lambda: leases.held() == {"car-99": LIVE_MAX_RATE_HZ}, "the car to be held")
     leases.ends.clear()
     known = len(leases.asked)
