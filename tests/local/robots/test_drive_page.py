@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from iort_station.fleet.robots import Bundle
     from local.cloud import EmbeddedCloud
 
-LEASE_S = 5.0
+LEASE_S = 10.0
 DRIVE = {
     "topic": "/drive",
     "type": "ackermann_msgs/AckermannDriveStamped",
@@ -86,6 +87,7 @@ def hold(page: Page, *reasons: str) -> str:
     until(
         lambda: found.append(tried()) or any(one in found[-1] for one in ("Driving.", *reasons)),
         "the car to be driven, or refused",
+        180,
     )
     return found[-1]
 
@@ -118,23 +120,31 @@ def test_one_drives_the_other_sees_it_and_takes_over(
             ada.drive()
             return seen(onlooker, "ada drives")
 
-        until(onlooker_sees, "the onlooker to see who drives")
+        until(onlooker_sees, "the onlooker to see who drives", 120)
         assert onlooker.get_by_role("button", name="Take the wheel").count() == 0
 
         def bob_is_refused() -> bool:
             ada.drive(takeover=True)
             return "Ada drives this car" in hold(bob, "Ada drives this car")
 
-        until(bob_is_refused, "the second driver to be refused")
+        until(bob_is_refused, "the second driver to be refused", 180)
         bob.keyboard.up("Space")
-        ada.drive(takeover=True)
-        bob.get_by_role("button", name="Take over from ada").click()
-        bob.get_by_role("button", name="Really take over?").click()
+
+        def bob_takes_over() -> bool:
+            """The buttons are there while the other one drives."""
+            ada.drive(takeover=True)
+            with suppress(TimeoutError):
+                bob.get_by_role("button", name="Take over from ada").click(timeout=8000)
+                bob.get_by_role("button", name="Really take over?").click(timeout=8000)
+                return True
+            return False
+
+        until(bob_takes_over, "the takeover to be confirmed", 120)
         assert hold(bob) == "Driving."
         # The one who loses the wheel learns it.
         ada.drive(takeover=True)
         bob.locator(".drive[data-phase=over]").wait_for()
-        until(lambda: hold(bob) == "Driving.", "the lease of the other driver to end")
+        until(lambda: hold(bob) == "Driving.", "the lease of the other driver to end", 180)
         # An emergency stop ends it, and the stick that is still held moves nothing after the release.
         bob.get_by_role("button", name=f"Stop {car.robot}").click()
         bob.locator(".drive[data-phase=over]").wait_for()
