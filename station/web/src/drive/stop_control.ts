@@ -54,17 +54,16 @@ export class StopControl {
 
   private show(): void {
     const { stand, pending } = this.stops.stopped;
-    const refused = this.robot === undefined ? "" : (this.stops.of(this.robot)?.reason ?? "");
+    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
     const texts = [
       ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
       ...(pending.length > 0 ? [`Not confirmed by ${listed(pending)}.`] : []),
-      ...(refused && this.stops.of(this.robot!)!.asked ? [`${this.robot} rejects the stop: ${refused}.`] : []),
+      ...(one?.reason ? [`${this.robot} rejects the ${one.asked ? "stop" : "release"}: ${one.reason}.`] : []),
       ...(this.stops.error ? [`${this.stops.error}.`] : []),
     ];
     this.words.set(texts.join(" "));
     this.strip.hidden = texts.length === 0;
     setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== ""));
-    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
     const any = this.robot === undefined ? stand.length + pending.length > 0 : one !== undefined && (one.asked || one.stopped === true);
     this.release.hidden = !this.stops.able || !any;
   }

@@ -81,7 +81,7 @@ def _done(one: Motion, *, stopped: bool) -> bool:
 
 def _told(one: Motion, *, stopped: bool) -> str:
     if one.reason:
-        return f"not stopped: {one.reason}"
+        return f"not {'stopped' if stopped else 'released'}: {one.reason}"
     if _done(one, stopped=stopped):
         return "stopped" if stopped else "released"
     return f"not confirmed: it {'stops' if stopped else 'is released'} when it is connected"
