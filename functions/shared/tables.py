@@ -15,7 +15,7 @@ from functions.shared.archive.marks import Marks
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
-from iort_contract.limits import ContractError
+from iort_contract.limits import MAX_FIELD_CHARACTERS, ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, OMITTED, ROBOT, SECOND, STREAMS, TOPIC, VEHICLE_CACHE_S
 
@@ -29,6 +29,8 @@ MAX_STREAMS, _NOTED = 200, 50_000
 _MAX_ITEM_BYTES = 380 * 1024
 # The longest text of a float; its stored number is shorter.
 _MAX_NUMBER_BYTES = 25
+# So many attributes of numbers alone always fit: a name with a statistic's suffix, and a list of four.
+_FIT_WITHOUT_TEXT = _MAX_ITEM_BYTES // (MAX_FIELD_CHARACTERS + 8 + 4 * _MAX_NUMBER_BYTES)
 # The range of a DynamoDB number, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
@@ -39,7 +41,15 @@ def attribute(value: Statistics) -> dict[str, Any]:
     A number too small becomes 0, one too large becomes text.
     """
     if isinstance(value, list):
-        return {"L": list(map(attribute, value))}
+        # Nearly all values of a second are here.
+        return {
+            "L": [
+                {"N": repr(one)}
+                if type(one) is int or (type(one) is float and _SMALLEST <= abs(one) <= _LARGEST)
+                else attribute(one)
+                for one in value
+            ]
+        }
     if isinstance(value, float):
         if _SMALLEST <= abs(value) <= _LARGEST:
             return {"N": repr(value)}
@@ -141,6 +151,8 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
     A stream may have 512 fields of texts of 4096 characters, and the summary keeps the last of each; the
     samples themselves are in the telemetry table.
     """
+    if len(item) <= _FIT_WITHOUT_TEXT and not any("S" in value for value in item.values()):
+        return item
     sizes = list(map(_size, item, item.values()))
     total, dropped = sum(sizes), set()
     if total <= _MAX_ITEM_BYTES:

@@ -152,6 +152,7 @@ def _time_of(item: Mapping[str, Any], otherwise: int) -> int:
 def _bytes(batch: Batch) -> int:
     """Estimated memory of the columns."""
     return sum(
-        8 * len(column) + sum(len(value) for value in column if isinstance(value, str))
+        8 * len(column)
+        + (sum(len(value) for value in column if type(value) is str) if str in set(map(type, column)) else 0)
         for column in batch.columns.values()
     )
