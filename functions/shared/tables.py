@@ -66,8 +66,8 @@ class Tables:
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches from a start time on, in order of time. The first page has ``at_once``
-        batches, and each one after it four times as many: callers rarely want a whole drive, and while summaries are
-        late, all that was stored since comes after what they want."""
+        batches, and each one after it four times as many: callers rarely want a whole drive. While summaries
+        are late, what was stored since comes after what they want."""
         keys, after = starting_between(first_us, None), None
         for pages in count():
             size = min(at_once << 2 * pages, max(at_once, _MANY))

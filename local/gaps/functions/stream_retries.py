@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
 # The two clocks differ by less than this.
 _SLACK_S = 0.005
-# The stream of a new on-demand table has four shards, which Lambda reads at once. More shards than cores would
-# only make smaller events.
+# The stream of a new on-demand table has four shards, which Lambda reads at once. More shards than cores
+# would only make smaller events.
 _SHARDS = min(4, os.cpu_count() or 1)
 # Records to read ahead; for each shard at least as many as one event may hold.
 _AHEAD = 2_000 * _SHARDS
