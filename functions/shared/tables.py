@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -75,13 +76,15 @@ class Tables:
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches from a start time on, in order of time. The first page has ``at_once``
-        batches, later ones a hundred: callers rarely want a whole drive."""
-        keys = starting_between(first_us, None)
-        few = next(self.telemetry.pages(topic, keys, page_items=at_once))
-        yield from map(plain, few.items)
-        if few.after is not None:
-            for page in self.telemetry.pages(topic, keys, page_items=_MANY, after=few.after):
-                yield from map(plain, page.items)
+        batches, and each one after it four times as many: callers rarely want a whole drive. While summaries
+        are late, what was stored since comes after what they want."""
+        keys, after = starting_between(first_us, None), None
+        for pages in count():
+            size = min(at_once << 2 * pages, max(at_once, _MANY))
+            page = next(self.telemetry.pages(topic, keys, page_items=size, after=after))
+            yield from map(plain, page.items)
+            if (after := page.after) is None:
+                return
 
     def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches before a time, the nearest first. Each is read on demand, since the first
