@@ -12,6 +12,7 @@ from iort_station.errors import StationError
 
 UP = "up.json"
 CLOUD = "cloud.json"
+LEDGER = "ledger.db"
 
 
 def folder(environment: Mapping[str, str] = os.environ) -> Path:
@@ -34,7 +35,8 @@ class Certificate:
 
 @dataclass(frozen=True, kw_only=True)
 class Up:
-    """A running kept cloud. It is written again whenever something in it changes.
+    """A running kept cloud. It is written again whenever something in it changes, and removed at the end;
+    after a kill its processes are gone.
 
     ``version`` is that of the state folder, ``versions`` those of the programs. ``pids`` has ``up``, the
     process that started the others, and ``emulator``. ``ports`` are by name: ``gateway``, ``relay`` and
