@@ -3,8 +3,8 @@
 AWS: splits a failed batch, gives it up after its retries or its age, and tells the destination
   (https://docs.aws.amazon.com/lambda/latest/dg/services-dynamodb-errors.html).
 ministack: invokes the function with the same batch until it succeeds, in the thread that also serves the
-  queues. Each mapping has here a thread for each of its concurrent batches. After a restart of the emulator
-  it reads the stream from its beginning again, which AWS too does after a lost acknowledgement.
+  queues. Each mapping has here a thread for each of its concurrent batches. The ledger knows the first record
+  that a mapping has not finished (local/keeping/streams.py): there it goes on after a restart.
 Test:
   tests/local/gaps/test_stream_gap.py::test_only_the_failing_record_goes_to_the_destination
 Patch: none; it replaces the whole poller by local/gaps/parts/stream_mapping.py
@@ -18,6 +18,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,8 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
 from local.gaps.parts.stream_mapping import Answer, Settings, Shard
+from local.keeping.ledger import LedgerError
+from local.keeping.streams import Streams, position_of
 
 _log = logging.getLogger(__name__)
 # AWS waits longer between attempts; tests must not.
@@ -37,7 +40,8 @@ _AHEAD = 2_000
 
 def install() -> None:
     """Close the gap in this process."""
-    lambda_svc._poll_dynamodb_streams = StreamMappings().poll
+    # The emulator keeps its streams in the ledger, which is installed before.
+    lambda_svc._poll_dynamodb_streams = StreamMappings(dynamodb._stream_records).poll
 
 
 def is_open() -> bool:
@@ -54,6 +58,7 @@ class _Running:
     mapping: dict[str, Any]
     shard: Shard
     position: int
+    marked: int | None
     busy: set[int] = field(default_factory=set)
     pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
     windows: dict[int, float] = field(default_factory=dict)
@@ -62,10 +67,11 @@ class _Running:
 class StreamMappings:
     """All stream mappings; `poll` replaces ministack's own poller."""
 
-    def __init__(self, clock: Callable[[], float] = time.time) -> None:
-        self._clock = clock
+    def __init__(self, streams: Streams, clock: Callable[[], float] = time.time) -> None:
+        self._streams, self._clock = streams, clock
         self._running: dict[str, _Running] = {}
         self._lock = threading.Lock()
+        self._telling = threading.Lock()
 
     def poll(self) -> bool:
         """Start every invocation that is due; returns whether one was started."""
@@ -112,8 +118,9 @@ class StreamMappings:
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
             # ministack stores where a new mapping begins.
             position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)
+            marked = self._streams.position(mapping["UUID"], mapping["EventSourceArn"])
             running = self._running[mapping["UUID"]] = _Running(
-                account, region, mapping, Shard(settings), position
+                account, region, mapping, Shard(settings), position if marked is None else marked, marked
             )
         elif running.shard.settings != settings and not running.shard.size and not running.busy:
             running.shard = Shard(settings)
@@ -126,8 +133,9 @@ class StreamMappings:
             return
         running.position = max(running.position, dynamodb.stream_start_position(table))
         records = dynamodb.stream_records_since(table, running.position, _AHEAD - ahead)
-        running.position += len(records)
         running.shard.put(lambda_svc._apply_filter_criteria(records, running.mapping))
+        # After the records: `_tell` asks in the other order.
+        running.position += len(records)
 
     def _invoke(self, running: _Running, function: dict[str, Any], number: int, batch: list[Any]) -> None:
         with request_scope(running.account, running.region):
@@ -151,15 +159,26 @@ class StreamMappings:
             lambda_svc._esm_wake.set()
 
     def _tell(self, running: _Running, function: dict[str, Any]) -> None:
-        """Send discarded records to the mapping's destination."""
-        with self._lock:
-            discarded = running.shard.discarded()
+        """Send discarded records to the mapping's destination, and note how far the mapping is."""
         mapping = running.mapping
-        for one in discarded:
-            _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
-            lambda_svc._send_ddb_stream_failure_record(
-                mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
-            )
+        # No mark may pass records that are on their way to the destination.
+        with self._telling:
+            with self._lock:
+                discarded = running.shard.discarded()
+                position = running.position
+                oldest = running.shard.oldest
+            if oldest is not None:
+                position = position_of(oldest)
+            for one in discarded:
+                _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
+                lambda_svc._send_ddb_stream_failure_record(
+                    mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
+                )
+            if position != running.marked:
+                # A full disk: the records are read again after a restart.
+                with suppress(LedgerError):
+                    self._streams.mark(mapping["UUID"], mapping["EventSourceArn"], position)
+                    running.marked = position
 
 
 def _wake_at(due_s: float | None, now_s: float, windows: dict[int, float], number: int) -> None:
