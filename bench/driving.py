@@ -24,6 +24,7 @@ from bench.command import made, parser, write
 from bench.errors import BenchError
 from bench.load.course import LEASE_S, ROBOT, Course
 from bench.load.tabs import Tabs
+from bench.load.tries import Heard, Try
 from bench.report.result import Table
 from bench.ros.graph import python_with_rospy
 from local.errors import LocalError
@@ -34,8 +35,10 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserType, Page
 
 PRESSES, TRIES = 100, 50
-# A hold that a slow round trip ends before the failure is no try.
-_HOLDS = 60
+# A hold that a slow round trip ends before the failure is no try; so many for each that counts, at most.
+_HOLDS, _VOID = 60, 3
+# Before the failure, for what is told of a try.
+_SEEN_S = 1.0
 Failed = tuple[float, Callable[[], None]]
 _DRIVEN_S, _PAUSE_S, _START_MS = 0.3, 0.7, 60_000
 
@@ -191,24 +194,40 @@ FAILURES: dict[str, Callable[[Driver], Failed]] = {
 }
 
 
-def _stops(driver: Driver, failure: str, tries: int, progress: Callable[[str], None]) -> Stops:
-    course, within, after_ms, latest_s = driver.course, 0, [], 0.0
-    for done in range(tries):
+def _stops(
+    driver: Driver, failure: str, tries: int, progress: Callable[[str], None]
+) -> tuple[Stops, list[Try]]:
+    """The figures of all tries, and those that failed."""
+    course = driver.course
+    done: list[Try] = []
+    for _ in range(tries * _VOID):
         driver.drive()
+        began = time.monotonic() - _SEEN_S
         failed_at, again = FAILURES[failure](driver)
+        failed = Heard(failed_at, time.time() - (time.monotonic() - failed_at), 0.0)
         with suppress(BenchError):
-            stop = course.wait(failed_at, moving=False, within_s=LEASE_S * 6)
-            after_ms.append((stop.at - failed_at) * 1000)
+            course.wait(failed_at, moving=False, within_s=LEASE_S * 6)
             course.quiet(LEASE_S)
-            last = course.last_motion()
-            late_s = stop.at - max(last.at, failed_at)
-            within += last.at < stop.at and late_s <= LEASE_S
-            latest_s = max(latest_s, late_s)
+        heard = [one for one in course.heard if one.at >= began]
         again()
         with suppress(Exception):  # a page that is closed or still frozen has no keys
             driver.release()
-        progress(f"{failure}: {within} of {done + 1}")
-    return Stops(failure, tries, within, Spread.of(after_ms), round(latest_s * 1000, 1))
+        one = Try(failure, len(done) + 1, failed, heard, LEASE_S)
+        if not one.driven:
+            progress(f"{failure}: the car stood when it came: no try")
+            continue
+        done.append(one)
+        within = sum(not each.why for each in done)
+        progress(f"{failure}: {within} of {len(done)}" + (f": {one.why}" if one.why else ""))
+        if len(done) == tries:
+            break
+    else:
+        raise BenchError(f"{failure}: the car stood in {tries * _VOID - len(done)} of {tries * _VOID} tries")
+    after_ms = [(one.first.at - one.failed.at) * 1000 for one in done if one.first is not None]
+    latest_s = max((one.late_s for one in done if one.late_s is not None), default=0.0)
+    missed = [one for one in done if one.why]
+    spread = Spread.of(after_ms)
+    return Stops(failure, tries, tries - len(missed), spread, round(latest_s * 1000, 1)), missed
 
 
 def main() -> None:
@@ -233,10 +252,16 @@ def main() -> None:
             driver = Driver(course, tabs, play.chromium)
             console.print(f"{options.presses} key presses ...")
             press_ms = _press_ms(driver, options.presses)
-            found = [
-                _stops(driver, failure, options.tries, lambda text: console.print(f"  {text}", style="dim"))
-                for failure in options.only
-            ]
+            found: list[Stops] = []
+            for failure in options.only:
+                stops, missed = _stops(
+                    driver, failure, options.tries, lambda text: console.print(f"  {text}", style="dim")
+                )
+                found.append(stops)
+                for one in missed:
+                    console.print(f"try {one.number} of {one.failure}", style="bold")
+                    for line in one.lines(course.cloud, ROBOT):
+                        console.print(f"  {line}", soft_wrap=True)
     except (BenchError, LocalError) as error:
         sys.exit(f"bench-drive: {error}")
     _table(press_ms, found).show(console)

@@ -13,11 +13,11 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from typing_extensions import Self
 
 from bench.errors import BenchError
+from bench.load.tries import Heard
 from bench.ros.graph import RosGraph
 from iort_station.fleet import robots
 from iort_station.page import control, socket
@@ -48,14 +48,6 @@ SETTINGS = {
         "drive": {"command": "drive", "speed": "linear.x", "steering": "angular.z"},
     },
 }
-
-
-class Heard(NamedTuple):
-    """A motion command at the ROS subscriber: `time.monotonic`, `time.time`, and the speed."""
-
-    at: float
-    wall_s: float
-    speed: float
 
 
 class Course:

@@ -80,8 +80,9 @@ class Cloud:
         return cloud
 
     def save(self, path: Path) -> None:
-        """Write the file that `load` reads."""
-        path.write_text(json.dumps(asdict(self)))
+        """Write the file that `load` reads; it has a secret."""
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file)
 
     @cached_property
     def _session(self) -> boto3.Session:
@@ -152,6 +153,10 @@ class Cloud:
                 )
             except BotoCoreError as error:
                 raise StationError(f"no AWS client for {service}: {error}") from error
+            if service == "dynamodb":
+                from iort_contract.dynamodb import quick  # noqa: PLC0415 - as above
+
+                quick(self._clients[key])
         return self._clients[key]
 
     @property

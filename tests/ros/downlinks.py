@@ -3,7 +3,7 @@
 Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``, and ``--guard`` for the process that
 stops the robot if this one dies. Each line of input is a command: ``send MILLISECONDS JSON`` (a lease and a
 message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for subscribers, then prints ``heard``), ``guard``
-(waits for the guard, then prints ``guarded``), ``cut``, ``quit``.
+(waits for the guard, then prints ``guarded``), ``stop`` (the emergency stop), ``cut``, ``quit``.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ if "ask" in settings.get("downlink", {}):
     uploader = make_uploader(link, root_ca=None, rate_kb_s=0)
     questions = Questions(link, uploader, download=downloader(None), offset=lambda: None)
 config = load(DownlinkConfig, settings.get("downlink", {}), where)
-guard = Guard(f"{graph.base}_guard", config.motions(), clock) if "--guard" in sys.argv else None
+guard = Guard(graph.base, config.motions(), clock) if "--guard" in sys.argv else None
 downlink = Downlink(
     config,
     share_rule()(settings["share"], where) if "share" in settings else (),
@@ -81,6 +81,8 @@ for seq, line in zip(itertools.count(), sys.stdin):
         break
     if verb == "cut":
         uplink.cut()
+    elif verb == "stop":
+        downlink.set_stopped(True)
     elif verb == "guard":
         while not downlink.report()["guard"]:
             time.sleep(0.01)  # as above

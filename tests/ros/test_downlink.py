@@ -121,6 +121,31 @@ def test_a_killed_and_a_frozen_agent_are_stopped_by_the_guard(graph: Graph, end:
     downlink.signal(signal.SIGCONT)
 
 
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_an_emergency_stop_outlives_a_killed_and_a_frozen_agent(graph: Graph, end: signal.Signals) -> None:
+    downlink = start(graph, "--guard")
+    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink)
+    downlink.say("guard")
+    downlink.until(lambda: "guarded" in downlink.lines, "guard")
+    downlink.say("stop")
+    listener.until(lambda: has(listener, 0), "the stop")
+    downlink.signal(end)
+    before = len(speeds(listener))
+    listener.until(
+        lambda: len(speeds(listener)) > before + 20, "the guard's stops, more than of a lease's end"
+    )
+    if end == signal.SIGKILL:
+        downlink = start(graph, "--guard")
+        downlink.say("guard")
+        downlink.until(lambda: "guarded" in downlink.lines, "the guard of the agent that is back")
+    downlink.signal(signal.SIGCONT)
+    # An agent that was killed now would leave its guard.
+    downlink.say("quit")
+    downlink.until(lambda: downlink.lines[-1].startswith("["), "the end")
+    assert set(speeds(listener)) == {0}
+
+
 def test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile(graph: Graph) -> None:
     downlink = start(graph, "--guard")
     listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")

@@ -180,21 +180,28 @@ class DownlinkConfig:
         return bool(self.motions())
 
     def motions(self) -> dict[str, dict[str, Any]]:
-        """The commands that move the robot, by name: topic and type, and the message that stops it."""
+        """The ROS topics that move the robot: the type, and the message that stops it."""
         return {
-            name: {"topic": one.topic, "type": one.type, "stop": one.motion.stop}
-            for name, one in self.cmd
+            one.topic: {"type": one.type, "stop": one.motion.stop}
+            for _, one in self.cmd
             if one.motion is not None
         }
 
     def check_topics(self) -> None:
-        """Raise `ContractError` for a command without motion on a topic that moves the robot: neither a lease
-        nor the emergency stop would end what it began."""
-        moved = {one.topic: name for name, one in self.cmd if one.motion is not None}
+        """Raise `ContractError` for a command without motion on a topic that moves the robot, since neither a
+        lease nor the emergency stop would end what it began, and for two stops of one topic."""
+        moved = {one.topic: (name, one) for name, one in reversed(self.cmd) if one.motion is not None}
         for name, one in self.cmd:
-            if one.motion is None and one.topic in moved:
+            first, other = moved.get(one.topic, (name, one))
+            if one.motion is None and other.motion is not None:
                 raise ContractError(
-                    f"cmd.{name} must have motion, as cmd.{moved[one.topic]} has: {one.topic} moves the robot"
+                    f"cmd.{name} must have motion, as cmd.{first} has: {one.topic} moves the robot"
+                )
+            if other.motion is None or one.motion is None:
+                continue
+            if one.type != other.type or one.motion.stop != other.motion.stop:
+                raise ContractError(
+                    f"cmd.{name} must have the type and motion.stop of cmd.{first}: both are for {one.topic}"
                 )
 
     def drive_limits(self) -> DriveLimits | None:

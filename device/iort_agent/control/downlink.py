@@ -158,7 +158,7 @@ def make_downlink(
         graph = shared(node or DEFAULT_NODE, link.clock)
     guard = None
     if isinstance(graph, Node) and config.moves():
-        guard = Guard(f"{graph.base}_guard", config.motions(), link.clock)
+        guard = Guard(graph.base, config.motions(), link.clock)
     questions = None
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)

@@ -40,13 +40,28 @@ class Certificate(NamedTuple):
 
     def validity(self) -> Validity:
         """The validity. Raises `IdentityError` if this is no X.509 certificate."""
-        x509 = load_x509()
+        read = self._read()
+        first, last = read.not_valid_before_utc, read.not_valid_after_utc
+        return Validity(int(first.timestamp()), int(last.timestamp()))
+
+    def names(self) -> list[str]:
+        """The host names and addresses of a server's certificate. Raises `IdentityError` as `validity`."""
+        x509, read = load_x509(), self._read()
         try:
-            read = x509.load_der_x509_certificate(self.der)
-            first, last = read.not_valid_before_utc, read.not_valid_after_utc
+            found = read.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        except (x509.ExtensionNotFound, ValueError):
+            return []
+        return [str(name.value) for name in found.value]
+
+    def issuer(self) -> str:
+        """Who signed it. Raises `IdentityError` as `validity`."""
+        return str(self._read().issuer.rfc4514_string())
+
+    def _read(self) -> Any:
+        try:
+            return load_x509().load_der_x509_certificate(self.der)
         except ValueError as error:
             raise IdentityError(f"is not an X.509 certificate: {error}") from error
-        return Validity(int(first.timestamp()), int(last.timestamp()))
 
 
 def load_x509() -> Any:

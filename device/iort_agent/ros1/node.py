@@ -203,6 +203,15 @@ class Node:
         """How many subscribers an advertised topic is connected to."""
         return _connections(self._publishers.get(self.resolve(topic)))
 
+    def lives(self, base: str) -> bool:
+        """Whether a node of this name, in our namespace, is in the graph and answers."""
+        name = self._me[: -len(self.base)] + base
+        try:
+            uri = master.Master(self._uri, self._me).ask("lookupNode", name)
+        except master.ERRORS:
+            return False
+        return self._answers(uri, name)
+
     # All below runs in the node's own thread.
 
     def _run(self) -> None:
@@ -282,15 +291,15 @@ class Node:
                 return str(uri)
         return None
 
-    def _answers(self, uri: str) -> bool:
+    def _answers(self, uri: str, name: str | None = None) -> bool:
         try:
-            status, _, name = master.proxy(uri).getName(self._me)
+            status, _, told = master.proxy(uri).getName(self._me)
         except xmlrpc.client.Fault:
             return True  # only rospy's nodes tell their names
         except master.ERRORS:
             return False
         # Another node may have the port by now.
-        return bool(status == 1 and name == self._me)
+        return bool(status == 1 and told == (name or self._me))
 
     def _on_shutdown(self, reason: str) -> None:
         # The master ends a node only when another one takes its name.

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -66,6 +67,19 @@ class AsyncInvocations:
 
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for an unknown function."""
+        self.queue(account, region, function_arn, event)
+
+    def queue(
+        self,
+        account: str,
+        region: str,
+        function_arn: str,
+        event: Any,
+        *,
+        age_s: float = 0.0,
+        done: Callable[[], object] = lambda: None,
+    ) -> None:
+        """As `dispatch`, for an event of some age; ``done`` is called when it needs no more attempt."""
         function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(
             function_arn, account_id=account, region=region
         )
@@ -78,7 +92,13 @@ class AsyncInvocations:
             cores = os.cpu_count() or 1
             pool = Turns(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        pool.submit(_robot(event), invoke, account, region, record, event, time.monotonic())
+        queued_s = time.monotonic() - age_s
+
+        def run() -> None:
+            invoke(account, region, record, event, queued_s)
+            done()
+
+        pool.submit(_robot(event), run)
 
 
 def _robot(event: Any) -> str:

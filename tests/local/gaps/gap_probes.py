@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import hashlib
 import inspect
 import json
 import os
@@ -283,3 +284,15 @@ def unsigned_websocket() -> bool:
 def ttl_pass() -> bool:
     """Ask for the function."""
     return not hasattr(dynamodb, "_expire_items")
+
+
+def function_credentials() -> bool:
+    """Derive a secret from what is no secret."""
+    config = {
+        "FunctionArn": "arn:aws:lambda:eu-west-1:000000000000:function:one",
+        "Role": "arn:aws:iam::000000000000:role/one",
+    }
+    digest = hashlib.sha256("{FunctionArn}:{Role}".format(**config).encode()).hexdigest()
+    derived = hashlib.sha256(f"secret:{digest}".encode()).hexdigest()
+    with patch.object(ministack_app, "AUTH", True):
+        return bool(lambda_runtime.execution_credentials(config)["AWS_SECRET_ACCESS_KEY"] == derived)

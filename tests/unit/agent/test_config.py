@@ -94,6 +94,7 @@ def test_the_queues_path_is_relative_to_the_file(
 
 SIM = "  - type: sim\n"
 DRIVE = "topic: /drive, type: ackermann_msgs/AckermannDriveStamped"
+STOP, CRAWL = "motion: {stop: {}}", "motion: {stop: {drive: {speed: 0.1}}}"
 
 
 @pytest.mark.parametrize(
@@ -174,8 +175,12 @@ DRIVE = "topic: /drive, type: ackermann_msgs/AckermannDriveStamped"
             ["queue.path: must be ", "got 7 (a number)", "the path of a file"],
         ),
         (
-            (SIM, f"{SIM}downlink: {{cmd: {{a: {{{DRIVE}, motion: {{stop: {{}}}}}}, b: {{{DRIVE}}}}}}}\n"),
+            (SIM, f"{SIM}downlink: {{cmd: {{a: {{{DRIVE}, {STOP}}}, b: {{{DRIVE}}}}}}}\n"),
             ["downlink: cmd.b must have motion, as cmd.a has: /drive moves the robot"],
+        ),
+        (
+            (SIM, f"{SIM}downlink: {{cmd: {{a: {{{DRIVE}, {STOP}}}, b: {{{DRIVE}, {CRAWL}}}}}}}\n"),
+            ["downlink: cmd.b must have the type and motion.stop of cmd.a: both are for /drive"],
         ),
         ((SIM, SIM + "port: 88830\n"), ["port: must be ", "got 88830", "1 to 65535"]),
         ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),

@@ -9,7 +9,7 @@ import pytest
 
 from iort_agent.clock import SystemClock
 from iort_agent.common.state import ClockOffset
-from tests.unit.agent.downlink_rig import T0, Rig, doubles
+from tests.unit.agent.downlink_rig import CONFIG, T0, Rig, doubles
 
 
 def test_a_command_becomes_a_ros_message() -> None:
@@ -170,6 +170,24 @@ def test_a_lease_that_ends_stops_the_car(caplog: pytest.LogCaptureFixture) -> No
     assert caplog.text.count("nobody renews it, stopping") == 1
     rig.send({"data": 1.0})
     assert rig.graph.published[-1][1] == doubles(1.0)
+
+
+def test_two_names_of_one_topic_share_its_lease() -> None:
+    slow = {**CONFIG["cmd"]["speed"], "max_age_s": 0.5}
+    rig = Rig(cmd={**CONFIG["cmd"], "slow": slow})
+    rig.send({"data": 2.5})
+    rig.send({"data": 1.0}, name="slow", session="ffffffff")
+    assert rig.refused() == {"cmd/iort/car1/slow driven_by_another": 1}
+    rig.clock.advance(0.2)
+    rig.send({"data": 1.0}, name="slow")
+    rig.clock.advance(0.2)
+    rig.downlink.tick()
+    assert [data for _, data in rig.graph.published] == [doubles(2.5), doubles(1.0)], "the lease is renewed"
+    rig.clock.advance(0.1)
+    for _ in range(100):
+        rig.downlink.tick()
+        rig.clock.advance(0.05)
+    assert rig.graph.published[2:] == [STOP] * 5, "one stop for both"
 
 
 def test_a_lost_connection_stops_the_car_at_once() -> None:

@@ -45,7 +45,7 @@ def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
     for _ in range(3):
         guard.tick()
         assert not guard.ready()
-        assert not guard.tell("drive", 1.0)
+        assert not guard.tell("/drive", 1.0, held=False)
         clock.advance(2)
     monkeypatch.delenv("NO_PROCESS")
     guard.tick()
@@ -74,21 +74,22 @@ class Node:
         self.published.append(data)
         return True
 
+    def lives(self, _base: str) -> bool:
+        return False
+
     def advertise(self, *_: Any) -> None:
         pass
 
     start = close = advertise
 
 
-def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_with_stops(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    node = Node()
+def guarded(node: Node, monkeypatch: pytest.MonkeyPatch, *told: Any) -> None:
+    """Run the guard's process in the node, for an agent that has told this and was killed."""
     lines, written = os.pipe()
     nobody, answers = os.pipe()
     os.close(nobody)
-    stops = {"speed": {"topic": "/speed", "type": "std_msgs/Float64", "stop": {"data": 0.0}}}
-    for line in ({"node": "guard", "stops": stops}, ["speed", time.monotonic() + 100]):
+    stops = {"/speed": {"type": "std_msgs/Float64", "stop": {"data": 0.0}}}
+    for line in ({"agent": "car", "stops": stops}, *told):
         os.write(written, json.dumps(line).encode() + b"\n")
     os.close(written)
     monkeypatch.setattr(guard_process, "shared", lambda _name: node)
@@ -98,4 +99,23 @@ def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_w
         monkeypatch.setattr(sys, "stdout", stdout)
         assert guard_process.main() == 0
         monkeypatch.undo()
+
+
+def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_with_stops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = Node()
+    guarded(node, monkeypatch, ["/speed", time.monotonic() + 100, False])
     assert len(node.published) == 5
+
+
+def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = Node()
+    monkeypatch.setattr(node, "lives", lambda name: name == "car" and len(node.published) > 12)
+    monkeypatch.setattr(guard_process, "_LOOK_S", 0.01)
+    guarded(node, monkeypatch, ["/speed", None, True])
+    assert len(node.published) > 12, "more than at the end of a lease"
+    # The stop was released before the agent died.
+    before = len(node.published)
+    guarded(node, monkeypatch, ["/speed", None, True], ["/speed", None, False])
+    assert len(node.published) == before

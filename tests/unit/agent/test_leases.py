@@ -54,11 +54,11 @@ def command(seq: int = 0, **changes: Any) -> Command:
     ],
 )
 def test_a_single_command(changes: dict[str, Any], refusal: str | None) -> None:
-    assert Leases(LIMITS).offer(command(**changes), now_us=T0, uncertainty_us=0, now=0) == refusal
+    assert Leases().offer(command(**changes), LIMITS, now_us=T0, uncertainty_us=0, now=0) == refusal
 
 
 def test_only_a_later_command_passes() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     later, earlier = (
         {"started_us": T0, "session": "1badcafe", "takeover": True},
         {"started_us": T0 - 1_000_000},
@@ -73,20 +73,20 @@ def test_only_a_later_command_passes() -> None:
         (1, later, None),
     ]
     for seq, session, refusal in offers:
-        assert leases.offer(command(seq, **session), now_us=T0, uncertainty_us=0, now=0) == refusal
+        assert leases.offer(command(seq, **session), LIMITS, now_us=T0, uncertainty_us=0, now=0) == refusal
 
 
 def offered(leases: Leases, session: str, now: float = 0.0, **changes: Any) -> str | None:
     started_us = T0 - 1_000_000 + int(session[0], 16)
     one = command(session=session, started_us=started_us, sent_us=T0 + round(now * 1e6), **changes)
-    return leases.offer(one, now_us=T0 + round(now * 1e6), uncertainty_us=0, now=now)
+    return leases.offer(one, LIMITS, now_us=T0 + round(now * 1e6), uncertainty_us=0, now=now)
 
 
 A, B, C = "aaaaaaaa", "bbbbbbbb", "cccccccc"
 
 
 def test_one_session_drives_until_another_takes_over() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     assert offered(leases, A, seq=0) is None
     assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
     assert offered(leases, C, seq=0, takeover=True) is None
@@ -97,7 +97,7 @@ def test_one_session_drives_until_another_takes_over() -> None:
 
 
 def test_a_stick_held_while_another_drove_moves_nothing_when_that_one_lets_go() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     assert offered(leases, A, seq=0) is None
     assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
     assert offered(leases, B, 0.4, seq=1) == BEGIN_AGAIN
@@ -106,7 +106,7 @@ def test_a_stick_held_while_another_drove_moves_nothing_when_that_one_lets_go() 
 
 
 def test_a_motion_that_ends_its_lease_stops_the_robot_and_lets_others_drive() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     assert offered(leases, A, seq=0) is None
     assert offered(leases, A, 0.1, seq=1, ends=True) is None
     assert leases.driver(0.1) is None
@@ -116,7 +116,7 @@ def test_a_motion_that_ends_its_lease_stops_the_robot_and_lets_others_drive() ->
 
 
 def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     assert offered(leases, A, seq=0) is None
     leases.hold(0.1)
     assert leases.driver(0.1) is None
@@ -130,7 +130,7 @@ def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -
 
 
 def test_a_stick_that_is_held_is_refused_however_many_others_try() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     leases.hold(0.0)
     for i in range(200):
         assert offered(leases, A, 0.1, seq=i) == EMERGENCY_STOP
@@ -141,7 +141,7 @@ def test_a_stick_that_is_held_is_refused_however_many_others_try() -> None:
 
 def test_a_released_emergency_stop_ends_after_a_few_stops_and_so_does_a_closed_one() -> None:
     for end in (Leases.free, lambda leases: leases.close(0.0)):
-        leases = Leases(LIMITS)
+        leases = Leases()
         leases.hold(0.0)
         assert leases.stop_due(0.0)
         end(leases)
@@ -150,8 +150,8 @@ def test_a_released_emergency_stop_ends_after_a_few_stops_and_so_does_a_closed_o
 
 
 def test_a_command_without_motion_needs_no_lease_and_no_stop() -> None:
-    leases = Leases(Limits(1.0, 0.5))
-    assert leases.offer(command(lease_ms=None), now_us=T0, uncertainty_us=0, now=0) is None
+    leases = Leases()
+    assert leases.offer(command(lease_ms=None), Limits(1.0, 0.5), now_us=T0, uncertainty_us=0, now=0) is None
     assert leases.next_due() is None
     assert not leases.stop_due(1e9)
 
@@ -161,57 +161,60 @@ def stops(leases: Leases, until: float, step: float = 0.01) -> list[float]:
 
 
 def test_the_end_of_a_lease_repeats_the_stop_a_few_times() -> None:
-    leases = Leases(LIMITS)
-    leases.offer(command(), now_us=T0, uncertainty_us=0, now=0)
+    leases = Leases()
+    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
     assert stops(leases, 10) == [round(0.3 + i * STOP_REPEAT_S, 3) for i in range(STOP_REPEATS + 1)]
     assert leases.next_due() is None
 
 
 def test_the_robots_own_limit_is_the_shorter_one() -> None:
-    leases = Leases(LIMITS)
-    leases.offer(command(lease_ms=10_000), now_us=T0, uncertainty_us=0, now=0)
+    leases = Leases()
+    leases.offer(command(lease_ms=10_000), LIMITS, now_us=T0, uncertainty_us=0, now=0)
     assert leases.next_due() == 0.5
 
 
 @pytest.mark.parametrize(("age_us", "uncertainty_us"), [(200_000, 0), (50_000, 150_000), (0, 200_000)])
 def test_the_lease_runs_from_when_the_command_may_have_been_sent(age_us: int, uncertainty_us: int) -> None:
-    leases = Leases(LIMITS)
-    assert leases.offer(command(sent_us=T0 - age_us), now_us=T0, uncertainty_us=uncertainty_us, now=7) is None
+    leases = Leases()
+    assert (
+        leases.offer(command(sent_us=T0 - age_us), LIMITS, now_us=T0, uncertainty_us=uncertainty_us, now=7)
+        is None
+    )
     assert leases.next_due() == pytest.approx(7.1)
 
 
 def test_a_sender_whose_clock_is_ahead_gets_no_longer_lease() -> None:
-    leases = Leases(LIMITS)
-    assert leases.offer(command(sent_us=T0 + 500_000), now_us=T0, uncertainty_us=0, now=7) is None
+    leases = Leases()
+    assert leases.offer(command(sent_us=T0 + 500_000), LIMITS, now_us=T0, uncertainty_us=0, now=7) is None
     assert leases.next_due() == pytest.approx(7.3)
 
 
 def test_a_renewed_lease_has_no_stop() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     for i in range(10):
-        assert leases.offer(command(i), now_us=T0, uncertainty_us=0, now=i * 0.29) is None
+        assert leases.offer(command(i), LIMITS, now_us=T0, uncertainty_us=0, now=i * 0.29) is None
         assert not leases.stop_due(i * 0.29 + 0.28)
 
 
 def test_a_newer_command_ends_the_stops() -> None:
-    leases = Leases(LIMITS)
-    leases.offer(command(), now_us=T0, uncertainty_us=0, now=0)
+    leases = Leases()
+    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
     assert leases.stop_due(0.3)
-    assert leases.offer(command(1), now_us=T0, uncertainty_us=0, now=0.4) is None
+    assert leases.offer(command(1), LIMITS, now_us=T0, uncertainty_us=0, now=0.4) is None
     assert not leases.stop_due(0.6)
 
 
 def test_cut_and_closed() -> None:
-    leases = Leases(LIMITS)
+    leases = Leases()
     leases.cut(0)
     assert leases.next_due() is None, "nothing moved"
-    leases.offer(command(), now_us=T0, uncertainty_us=0, now=0)
+    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
     leases.cut(0.1)
     assert leases.stop_due(0.1)
-    leases.offer(command(1), now_us=T0, uncertainty_us=0, now=0.2)
+    leases.offer(command(1), LIMITS, now_us=T0, uncertainty_us=0, now=0.2)
     leases.close(0.25)
     assert leases.stop_due(0.25)
-    assert leases.offer(command(2), now_us=T0, uncertainty_us=0, now=0.3) == CLOSED
+    assert leases.offer(command(2), LIMITS, now_us=T0, uncertainty_us=0, now=0.3) == CLOSED
 
 
 # Any sequence of events of an operator, a network and a clock.
@@ -251,7 +254,7 @@ class Model:
     """The leases, and what must be true of them."""
 
     def __init__(self) -> None:
-        self.leases = Leases(LIMITS)
+        self.leases = Leases()
         self.now, self.offset_us = 0.0, 0
         self.uncertainty_us: int | None = 0
         self.closed = self.held = False
@@ -297,7 +300,10 @@ class Model:
     def offer(self, event: Command) -> None:
         now_us = T0 + round(self.now * 1e6) + self.offset_us
         uncertainty_us = self.uncertainty_us
-        if self.leases.offer(event, now_us=now_us, uncertainty_us=uncertainty_us, now=self.now) is not None:
+        if (
+            self.leases.offer(event, LIMITS, now_us=now_us, uncertainty_us=uncertainty_us, now=self.now)
+            is not None
+        ):
             return
         assert not self.closed
         assert not self.held

@@ -307,7 +307,7 @@ def test_status_and_check_by_command(
     assert findings["key's mode"]["todo"].startswith("chmod 600 ")
     assert findings["queue"]["level"] == "warn"
     assert findings["record lane"]["level"] == "ok"
-    assert findings["endpoint"]["level"] == "fail"
+    assert findings["name"]["level"] == "fail"
 
 
 def test_a_closed_output_is_not_an_error(tmp_path: Path) -> None:

@@ -8,17 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Callable, Mapping
 
 from iort_agent.control.bridge import Bridge
-from iort_agent.control.config import CommandConfig, DownlinkConfig
-from iort_agent.control.motion.driving import drive_sample, limited
+from iort_agent.control.config import DownlinkConfig
+from iort_agent.control.motion.driving import limited
 from iort_agent.control.motion.guard import Guard
-from iort_agent.control.motion.leases import Leases, Limits
-from iort_agent.errors import ConfigError
+from iort_agent.control.motion.named import Motion, Named
 from iort_agent.mqtt.uplink import MqttMessage
-from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.commands import Command, decode_command
-from iort_contract.messages.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED, DriveLimits
-from iort_contract.ros1.definition import Definition
+from iort_contract.messages.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)
@@ -41,58 +38,6 @@ class Operator:
     settings_known: Callable[[], bool]
 
 
-class _Command:
-    """The commands of one name. ``limits`` are those of a stick, if it drives this command."""
-
-    def __init__(
-        self,
-        name: str,
-        config: CommandConfig,
-        definition: Definition,
-        skew_s: float,
-        limits: DriveLimits | None,
-    ) -> None:
-        self.name, self.config, self.definition, self.limits = name, config, definition, limits
-        motion = config.motion
-        self.leases = Leases(Limits(config.max_age_s, skew_s, motion.lease_s if motion is not None else None))
-        self.passed = self.stops = self.limited = 0
-        self.stopping = False
-        # The end of the lease that the guard knows.
-        self.guarded: float | None = None
-        # When the next refused motion becomes a sample.
-        self.refused_due = 0.0
-
-    def check(self, now_us: int) -> None:
-        """Raise `ConfigError` if the stop, or what a stick drives, does not fit the ROS type."""
-        try:
-            self.stop(now_us)
-        except MessageError as error:
-            raise ConfigError(f"downlink.cmd.{self.name}.motion.stop: {error}") from error
-        if self.limits is not None:
-            try:
-                self.data(self.limits.message(0.0, 0.0), now_us)
-            except MessageError as error:
-                raise ConfigError(
-                    f"downlink.drive: {error}; downlink.cmd.{self.name}.partial must be true if the message "
-                    "has other fields"
-                ) from error
-
-    def stop(self, now_us: int) -> bytes:
-        fields = self.config.motion.stop if self.config.motion is not None else {}
-        return encode(self.definition, fields, now_us=now_us, partial=True)
-
-    def data(self, message: Mapping[str, Any], now_us: int) -> bytes:
-        return encode(self.definition, message, now_us=now_us, partial=self.config.partial)
-
-    def sample(self, command: Command, outcome: str, now: float) -> Mapping[str, Value]:
-        left_s = self.leases.left_s(now)
-        return drive_sample(command, outcome, self.leases.driver(now), left_s, self.limits)
-
-    def report(self) -> dict[str, int]:
-        counts = {"passed": self.passed, "stops": self.stops}
-        return {**counts, "limited": self.limited} if self.limits is not None else counts
-
-
 class Commands:
     """Publishes commands that may pass, and stops when a lease ends. ``wake`` is called when a stop may be
     due earlier. The ``guard`` knows the end of each lease before a command passes.
@@ -113,12 +58,19 @@ class Commands:
         self._bridge, self._graph, self._clock = bridge, bridge.graph, bridge.link.clock
         self._operator, self._guard, self._wake = operator, guard, wake
         self._lock = threading.Lock()
-        self._commands: dict[str, _Command] = {}
+        self._commands: dict[str, Named] = {}
+        self._motions: dict[str, Motion] = {}
         stick = config.drive_limits()
         for name, settings in config.cmd:
             limits = stick if stick is not None and stick.command == name else None
             definition = self._graph.definition(settings.type)
-            command = _Command(name, settings, definition, config.clock_skew_s, limits)
+            motion = None
+            if settings.motion is not None:
+                moved = Motion(settings.topic, settings.motion.stop, definition)
+                motion = self._motions.setdefault(settings.topic, moved)
+            command = Named(
+                name, settings, definition, skew_s=config.clock_skew_s, motion=motion, limits=limits
+            )
             command.check(self._clock.now_us())
             topic = bridge.link.topic(CMD, name)
             self._commands[topic] = command
@@ -130,13 +82,11 @@ class Commands:
         """Begin or release the emergency stop of every motion."""
         now = self._clock.monotonic()
         with self._lock:
-            for command in self._commands.values():
-                if command.config.motion is None:
-                    continue
+            for motion in self._motions.values():
                 if stopped:
-                    command.leases.hold(now)
+                    motion.leases.hold(now)
                 else:
-                    command.leases.free()
+                    motion.leases.free()
         self.tick()
         self._wake()
 
@@ -149,34 +99,27 @@ class Commands:
 
     def tick(self) -> float | None:
         """Publish the stops that are due. Returns when to call again; None while nothing moves."""
-        ended: set[str] = set()
         stopped: list[Mapping[str, Value]] = []
         with self._lock:
             now = self._clock.monotonic()
-            for command in self._commands.values():
-                if command.leases.stop_due(now):
-                    if not command.stopping:
-                        stopped += self._begin_stop(command, now)
-                    data = command.stop(self._clock.now_us())
-                    command.stops += self._graph.publish(command.config.topic, data)
-                elif command.stopping and command.leases.next_due() is None:
-                    command.stopping = False
-                    ended.add(command.config.topic)
-                self._tell_guard(command)
-            due = [
-                (at, command.config.topic)
-                for command in self._commands.values()
-                if (at := command.leases.next_due()) is not None
-            ]
-            # Under the lock, so that no command that has just passed is released.
-            for topic in ended.difference(topic for _, topic in due):
-                self._graph.release(topic)
+            for motion in self._motions.values():
+                if motion.leases.stop_due(now):
+                    if not motion.stopping:
+                        stopped += self._begin_stop(motion, now)
+                    data = motion.stop(self._clock.now_us())
+                    motion.stops += self._graph.publish(motion.topic, data)
+                elif motion.stopping and motion.leases.next_due() is None:
+                    motion.stopping = False
+                    # Under the lock, so that no command that has just passed is released.
+                    self._graph.release(motion.topic)
+                self._tell_guard(motion)
+            found = [motion.leases.next_due() for motion in self._motions.values()]
             # After the stops, since it may have to start a process.
             if self._guard is not None:
                 self._guard.tick()
         for sample in stopped:
             self._operator.drove(sample)
-        return min((at for at, _ in due), default=None)
+        return min((at for at in found if at is not None), default=None)
 
     def report(self) -> dict[str, Any]:
         """The passed and the limited commands and the published stops, by name."""
@@ -185,7 +128,7 @@ class Commands:
     def alarms(self) -> list[str]:
         """Why no motion may pass."""
         found = []
-        if any(command.leases.held for command in self._commands.values()):
+        if any(motion.leases.held for motion in self._motions.values()):
             found.append("emergency stop: no motion until an operator releases it")
         if self.guarded() is False:
             found.append("the guard does not run yet: no motion until it does")
@@ -196,20 +139,22 @@ class Commands:
         with self._lock:
             return None if self._guard is None else self._guard.ready()
 
-    def _tell_guard(self, command: _Command) -> bool:
-        """Tell the guard the end of the command's lease, if it is another; whether that was possible."""
-        ends = command.leases.ends
-        if self._guard is None or ends == command.guarded:
+    def _tell_guard(self, motion: Motion) -> bool:
+        """Tell the guard the motion's lease and emergency stop, if they are others; whether that was
+        possible."""
+        known = (motion.leases.ends, motion.leases.held)
+        if self._guard is None or known == motion.guarded:
             return True
-        command.guarded = ends
-        return self._guard.tell(command.name, ends)
+        motion.guarded = known
+        return self._guard.tell(motion.topic, motion.leases.ends, held=motion.leases.held)
 
-    def _begin_stop(self, command: _Command, now: float) -> list[Mapping[str, Value]]:
+    def _begin_stop(self, motion: Motion, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""
-        command.stopping = True
-        last = command.leases.last
-        _log.warning("command %s: %s, stopping", command.name, command.leases.why_stopped())
-        return [] if last is None else [command.sample(last, STOPPED, now)]
+        motion.stopping = True
+        command, last = motion.last, motion.leases.last
+        what = f"command {command.name}" if command is not None else motion.topic
+        _log.warning("%s: %s, stopping", what, motion.leases.why_stopped())
+        return [] if command is None or last is None else [command.sample(last, STOPPED, now)]
 
     def _unready(self) -> str | None:
         """Why no motion may pass yet."""
@@ -221,8 +166,8 @@ class Commands:
         if connected:
             return
         with self._lock:
-            for command in self._commands.values():
-                command.leases.cut(self._clock.monotonic())
+            for motion in self._motions.values():
+                motion.leases.cut(self._clock.monotonic())
         self.tick()
         self._wake()
 
@@ -247,7 +192,7 @@ class Commands:
         self._wake()
 
     def _offer(
-        self, command: _Command, offered: Command
+        self, command: Named, offered: Command
     ) -> tuple[tuple[str, str] | None, Mapping[str, Value] | None]:
         """Publish the command if it may pass. Returns the reason if not, as a word and as a text, and the
         sample of a motion."""
@@ -255,7 +200,7 @@ class Commands:
             data = command.data(offered.message, self._clock.now_us())
         except MessageError as error:
             return ("malformed", str(error)), None
-        moves = command.config.motion is not None
+        motion = command.motion
         # All times under the lock, for which the command may have waited.
         with self._lock:
             now, now_us = self._clock.monotonic(), self._clock.now_us()
@@ -264,18 +209,22 @@ class Commands:
             if offset is not None:
                 now_us += round(offset.offset_ms * 1000)
                 uncertainty_us = round(offset.uncertainty_ms * 1000)
-            reason = self._unready() if moves else None
+            reason = self._unready() if motion is not None else None
             if reason is None:
-                reason = command.leases.offer(offered, now_us=now_us, uncertainty_us=uncertainty_us, now=now)
-            # Before the robot moves.
-            if reason is None and not self._tell_guard(command):
-                command.leases.cut(now)
-                reason = NO_GUARD
+                reason = command.leases.offer(
+                    offered, command.allowed, now_us=now_us, uncertainty_us=uncertainty_us, now=now
+                )
+            if reason is None and motion is not None:
+                motion.last = command
+                # Before the robot moves.
+                if not self._tell_guard(motion):
+                    motion.leases.cut(now)
+                    reason = NO_GUARD
             if reason is None and not self._graph.publish(command.config.topic, data):
                 reason = NO_ROS
             command.passed += reason is None
             sample = None
-            if moves and (reason is None or now >= command.refused_due):
+            if motion is not None and (reason is None or now >= command.refused_due):
                 command.refused_due = now + _REFUSED_S if reason is not None else command.refused_due
                 sample = command.sample(offered, reason or ACCEPTED, now)
         if reason is None:

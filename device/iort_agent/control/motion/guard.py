@@ -1,8 +1,9 @@
 """The guard: a small process that stops the robot if the agent dies or freezes.
 
 It is a ROS node of its own, which the agent starts. The agent tells it the end of each lease before the
-command passes. If a lease ends that the agent has neither renewed nor ended, or if the agent is gone, the
-guard publishes the stop. `iort_agent.control.motion.guard_process` is the process itself.
+command passes, and each emergency stop. If a lease ends that the agent has neither renewed nor ended, or if
+the agent is gone, the guard publishes the stop; that of an emergency stop until the agent is back.
+`iort_agent.control.motion.guard_process` is the process itself.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ _CLOSE_S, _KILLED_S = 3.0, 0.2
 
 
 class Guard:
-    """``stops`` has the topic, the type and the message of each motion's stop. Not for several threads at
-    once."""
+    """``agent`` is the name of the agent's node; ``stops`` has the type and the message of each motion's
+    stop, by its topic. Not for several threads at once."""
 
-    def __init__(self, node: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock) -> None:
-        self._first = _line({"node": node, "stops": stops})
+    def __init__(self, agent: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock) -> None:
+        self._first = _line({"agent": agent, "stops": stops})
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
-        self._leases: dict[str, float] = {}
+        # What it must know after a restart, by topic.
+        self._told: dict[str, bytes] = {}
         # Lines that the guard has not answered, and since when. The first answer says: in the ROS graph.
         self._waiting = 0
         self._since = 0.0
@@ -53,14 +55,11 @@ class Guard:
         frozen = self._waiting > 0 and self._clock.monotonic() - self._since > _ANSWER_S
         return self._in_graph and not frozen and self._running()
 
-    def tell(self, name: str, until: float | None) -> bool:
-        """Tell the end of a motion's lease, by the monotonic clock; None if it has ended. Whether that was
-        possible."""
-        if until is None:
-            self._leases.pop(name, None)
-        else:
-            self._leases[name] = until
-        return self._write(_line([name, until]))
+    def tell(self, topic: str, until: float | None, *, held: bool) -> bool:
+        """Tell the end of a motion's lease, by the monotonic clock, None if it has ended; and whether an
+        emergency stop holds. Whether that was possible."""
+        self._told[topic] = _line([topic, until, held])
+        return self._write(self._told[topic])
 
     def tick(self) -> None:
         """Start it again if it has died or frozen; called at least every second or so."""
@@ -93,8 +92,8 @@ class Guard:
             os.set_blocking(pipe.fileno(), False)
         self._in_graph, self._waiting = False, 0
         self._write(self._first)
-        for name, until in self._leases.items():
-            self._write(_line([name, until]))
+        for line in self._told.values():
+            self._write(line)
 
     def close(self) -> None:
         """End the process; it publishes the stops that are due before."""

@@ -1,8 +1,9 @@
 """The guard's process: `iort_agent.control.motion.guard` starts it and explains it.
 
-Its input is lines of JSON: first its node's name and the stops, then the end of a motion's lease, by the
-machine's monotonic clock, or null. It answers each line with a byte, and begins once it is in the ROS graph.
-The end of the input is the agent's end.
+Its input is lines of JSON: first the name of the agent's node and the stops; then a motion's topic, the end
+of its lease by the machine's monotonic clock, or null, and whether an emergency stop holds. It answers each
+line with a byte, and begins once it is in the ROS graph. The end of the input is the agent's end. In an
+emergency stop the guard lives on until the agent's node is in the graph again, or until somebody ends it.
 """
 
 from __future__ import annotations
@@ -25,19 +26,24 @@ from iort_agent.ros1.node import Node, shared
 _log = logging.getLogger("iort_agent.guard")
 # The stop of a lease that the agent has certainly not ended.
 _UNANSWERED = 2
+# In an emergency stop the agent writes at least every `STOP_HOLD_S`.
+_SILENT_S = 0.5
 _POLL_S, _IDLE_S = 0.05, 4.0
+# Between two looks for the agent's node.
+_LOOK_S = 1.0
 _CONNECT_S = 2.0
 _BUFFER = 65_536
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _Motion:
     """One motion's stop, and when it is due."""
 
-    def __init__(self, node: Node, config: Mapping[str, Any]) -> None:
+    def __init__(self, node: Node, topic: str, config: Mapping[str, Any]) -> None:
         self.stops = Stops()
-        self._node, self._topic, self._stop = node, config["topic"], config["stop"]
+        self._node, self._topic, self._stop = node, topic, config["stop"]
         self._definition = node.definition(config["type"])
-        node.advertise(self._topic, config["type"])
+        node.advertise(topic, config["type"])
 
     def heard(self) -> bool:
         return self._node.listeners(self._topic) > 0
@@ -51,8 +57,9 @@ class _Motion:
 
 class _Guard:
     def __init__(self, config: Mapping[str, Any]) -> None:
-        self.node, self._clock = shared(config["node"]), SystemClock()
-        self._motions = {name: _Motion(self.node, one) for name, one in config["stops"].items()}
+        self._agent: str = config["agent"]
+        self.node, self._clock = shared(f"{self._agent}_guard"), SystemClock()
+        self._motions = {topic: _Motion(self.node, topic, one) for topic, one in config["stops"].items()}
         # Stops since the last news of a lease. At its end the agent publishes a stop itself, and tells it.
         self._stops = 0
         self._joined: float | None = None
@@ -65,22 +72,37 @@ class _Guard:
         self._joined = now if self._joined is None else self._joined
         return all(map(_Motion.heard, self._motions.values())) or now - self._joined > _CONNECT_S
 
+    def heard(self) -> None:
+        """Leave the stops of an emergency stop to the agent: it lives."""
+        for motion in self._motions.values():
+            motion.stops.put_off(self._clock.monotonic() + _SILENT_S)
+
     def take(self, line: bytes) -> None:
-        """Take the end of a lease; an empty line only asks for an answer."""
+        """Take what is known of a motion; an empty line only asks for an answer."""
         if not line.strip():
             return
-        name, until = json.loads(line)
-        stops = self._motions[name].stops
-        if until is None:
-            self._motions[name].stops = Stops()
-        else:
-            stops.move(until)
+        topic, until, held = json.loads(line)
+        motion = self._motions[topic]
+        if not held and (until is None or motion.stops.held):
+            motion.stops = Stops()
+        if held:
+            motion.stops.hold(self._clock.monotonic())
+        elif until is not None:
+            motion.stops.move(until)
         self._stops = 0
 
     def agent_gone(self) -> None:
-        """End every lease now."""
+        """End every lease now, and go on with an emergency stop."""
+        now = self._clock.monotonic()
         for motion in self._motions.values():
-            motion.stops.cut(self._clock.monotonic())
+            motion.stops.cut(now)
+            motion.stops.put_off(now)
+
+    def watch(self, over: threading.Event) -> None:
+        """Set ``over`` once the agent's node is in the graph again."""
+        while not over.wait(_LOOK_S):
+            if self.node.lives(self._agent):
+                over.set()
 
     def tick(self) -> float | None:
         """Publish the stops that are due. Returns the seconds until the next; None while nothing moves."""
@@ -98,7 +120,7 @@ def main() -> int:
     """Guard until the agent ends; 1 if the ROS node fails."""
     logging.basicConfig(stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # A supervisor or Ctrl-C ends the agent, which ends the guard.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     # Unbuffered, as `select` needs it.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as lines_in:
@@ -123,15 +145,22 @@ def main() -> int:
             for line in lines:
                 guard.take(line)
             waits += len(lines)
+        if readable or not answers:
+            guard.heard()
         left = guard.tick()
     _log.error("%s", guard.node.failed)
     return 1
 
 
 def _end(guard: _Guard) -> int:
+    over = threading.Event()
+    # Now it is nobody's child.
+    for number in _SIGNALS:
+        signal.signal(number, lambda *_: over.set())
     guard.agent_gone()
-    while (left := guard.tick()) is not None:
-        threading.Event().wait(left)
+    threading.Thread(target=guard.watch, args=(over,), daemon=True).start()
+    while not over.is_set() and (left := guard.tick()) is not None:
+        over.wait(left)
     guard.node.close()
     return 0
 

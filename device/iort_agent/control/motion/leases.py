@@ -47,24 +47,27 @@ class Limits(NamedTuple):
 
 
 class Leases(Stops):
-    """The commands of one name. Not safe to use from several threads at once."""
+    """The commands that move the robot by one ROS topic, or those of one name that move nothing. Not safe to
+    use from several threads at once."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._limits = limits
         # The newest command that passed.
         self.last: Command | None = None
         self._refused: deque[str] = deque(maxlen=_MAX_REFUSED)
         self._closed = False
 
-    def offer(self, command: Command, *, now_us: int, uncertainty_us: int | None, now: float) -> str | None:
+    def offer(
+        self, command: Command, limits: Limits, *, now_us: int, uncertainty_us: int | None, now: float
+    ) -> str | None:
         """None if the command may pass, and it counts as passed; otherwise the reason.
 
-        ``now_us`` is the cloud's time to within ``uncertainty_us``; the robot's own time if that is None.
+        ``limits`` are those of the command's name. ``now_us`` is the cloud's time to within
+        ``uncertainty_us``; the robot's own time if that is None.
         """
         age_us = now_us - command.sent_us + (uncertainty_us or 0)
-        lease_s = self._lease_s(command, age_us)
-        reason = self._rejection(command, age_us, uncertainty_us, lease_s)
+        lease_s = _lease_s(command, limits, age_us)
+        reason = self._rejection(command, limits, age_us, uncertainty_us, lease_s)
         if reason is None and lease_s is not None:
             reason = self._other_driver(command, now)
         if reason is not None:
@@ -122,17 +125,15 @@ class Leases(Stops):
             self._refuse(command.session)
         return reason
 
-    def _lease_s(self, command: Command, age_us: int) -> float | None:
-        """The rest of the lease; None for a command that moves nothing."""
-        if self._limits.lease_s is None or command.lease_ms is None:
-            return None
-        # A sender whose clock is ahead gets no more than the whole lease.
-        return min(command.lease_ms / 1000, self._limits.lease_s) - max(0, age_us) / 1e6
-
     def _rejection(
-        self, command: Command, age_us: int, uncertainty_us: int | None, lease_s: float | None
+        self,
+        command: Command,
+        limits: Limits,
+        age_us: int,
+        uncertainty_us: int | None,
+        lease_s: float | None,
     ) -> str | None:
-        limits, last = self._limits, self.last
+        last = self.last
         if self._closed:
             return CLOSED
         if limits.lease_s is not None and uncertainty_us is None:
@@ -148,3 +149,11 @@ class Leases(Stops):
         if last is not None and command.order <= last.order:
             return REPEATED if command.session == last.session else SUPERSEDED
         return None
+
+
+def _lease_s(command: Command, limits: Limits, age_us: int) -> float | None:
+    """The rest of the lease; None for a command that moves nothing."""
+    if limits.lease_s is None or command.lease_ms is None:
+        return None
+    # A sender whose clock is ahead gets no more than the whole lease.
+    return min(command.lease_ms / 1000, limits.lease_s) - max(0, age_us) / 1e6

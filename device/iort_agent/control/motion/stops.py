@@ -61,6 +61,11 @@ class Stops:
             self.held, self.ends = True, None
             self._stops, self._next_stop = math.inf, now
 
+    def put_off(self, until: float) -> None:
+        """Publish no stop of an emergency stop before then: somebody else does."""
+        if self.held:
+            self._next_stop = until
+
     def free(self) -> None:
         """Repeat the stop a few times more."""
         if self.held:

@@ -1,0 +1,219 @@
+"""The way from the robot to its cloud: name, route, port, TLS, the broker's answer, the rules', the clock.
+
+The first step that fails says what to do, and ends the way: the later ones would fail, too.
+"""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import socket
+import ssl
+import time
+from contextlib import closing, suppress
+from email.utils import parsedate_to_datetime
+from ipaddress import ip_address
+from typing import Any, Generator, Iterator, NamedTuple
+
+from iort_agent.common.state import Status
+from iort_agent.config import Config
+from iort_agent.mqtt.by_hand import RefusalError, Session
+from iort_agent.sources import FAIL, OK, WARN, Finding
+from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, refused_ours, secured, utc
+from iort_contract.limits import ContractError
+from iort_contract.messages.live import decode_pong, encode_ping
+from iort_contract.topics import PING, PONG, RULE, build_topic
+
+# A certificate that ends sooner should have been replaced by now.
+_ENDS_SOON_S = 3 * 86_400
+# This agent cannot run before 2026-01-01.
+_EARLIEST_S = 1_767_225_600
+_CLOCK_OFF_S = 5.0
+
+
+class _Offset(NamedTuple):
+    """The cloud's clock minus the robot's, and who says so."""
+
+    seconds: float
+    by: str
+
+
+def way(config: Config, running: Status | None = None) -> Iterator[Finding]:
+    """Go the way to the broker. Without ``running``, this ends a running agent's connection."""
+    offset: _Offset | None = None
+    try:
+        addresses = _addresses(config.endpoint, config.port)
+        literal = addresses == [config.endpoint]
+        yield Finding("name", OK, f"{config.endpoint} is {'an address' if literal else ', '.join(addresses)}")
+        yield Finding("route", OK, _route(addresses))
+        raw, address = _connected(addresses, config.port)
+        yield Finding("port", OK, f"{address} listens on {config.port}")
+        with closing(raw), closing(secured(config, raw, address)) as secure:
+            yield _served(secure)
+            if running is None:
+                offset = yield from _broker(config, secure)
+            elif running.connection.connected:
+                yield Finding("broker", OK, "the running agent is connected")
+            else:
+                why = running.connection.last_error
+                yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
+    except BlockedError as blocked:
+        yield blocked.finding
+    yield _clock(offset or _other_offset(config, running))
+
+
+def _addresses(endpoint: str, port: int) -> list[str]:
+    try:
+        found = socket.getaddrinfo(endpoint, port, type=socket.SOCK_STREAM)
+    except OSError as error:
+        if error.errno == socket.EAI_AGAIN:
+            todo = (
+                "is there a network? `ip route` must show a default route, `resolvectl status` a name server"
+            )
+            raise BlockedError("name", f"no name server answers for {endpoint}", todo) from error
+        todo = (
+            "is `endpoint` spelled right? The name of a laboratory's cloud must be in its DNS, or in this "
+            "robot's /etc/hosts; its IP address as `endpoint` needs neither"
+        )
+        raise BlockedError("name", f"{endpoint} does not resolve: {error.strerror or error}", todo) from error
+    return list(dict.fromkeys(str(one[4][0]) for one in found))
+
+
+def _route(addresses: list[str]) -> str:
+    """From which address of ours to which of theirs. To connect a UDP socket sends nothing."""
+    problem: OSError = OSError()
+    for address in addresses:
+        with socket.socket(_family(address), socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect((address, 9))
+            except OSError as error:
+                problem = error
+                continue
+            if ip_address(address).is_loopback:
+                return f"{address} is this machine itself"
+            return f"from {probe.getsockname()[0]} to {address}"
+    todo = "is the Wi-Fi or the cable connected, in the cloud's network? `ip address`, `ip route` show it"
+    raise BlockedError("route", f"none to {', '.join(addresses)}: {problem.strerror}", todo) from problem
+
+
+def _family(address: str) -> int:
+    return socket.AF_INET6 if ":" in address else socket.AF_INET
+
+
+def _connected(addresses: list[str], port: int) -> tuple[socket.socket, str]:
+    problem: OSError = OSError()
+    for address in addresses:
+        try:
+            return socket.create_connection((address, port), TIMEOUT_S), address
+        except OSError as error:  # noqa: PERF203 - the next address may answer
+            problem = error
+    address = addresses[-1]
+    if problem.errno == errno.ECONNREFUSED:
+        text = f"{address} answers, but nothing listens on {port}"
+        todo = "is the cloud running there (`make up`, `iort doctor`), and is `port` right?"
+        if ip_address(address).is_loopback:
+            todo = (
+                "no cloud runs on this machine. One on another machine lets cars in with "
+                "`make up LISTEN=ADDRESS`; `endpoint` is then that address"
+            )
+    elif problem.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):
+        text = f"no machine answers for {address}: {problem.strerror}"
+        todo = "is the cloud's machine on, in the same network, and do clients of this Wi-Fi see each other?"
+    else:
+        text = f"no answer from {address}:{port} in {TIMEOUT_S:g} s: {problem.strerror or problem}"
+        todo = (
+            f"a firewall drops it, or the machine is off: `ping {address}` tells; open port {port} on the "
+            "cloud's machine. AWS also listens on 443: `port: 443`"
+        )
+    raise BlockedError("port", text, todo) from problem
+
+
+def _served(secure: ssl.SSLSocket) -> Finding:
+    """The server's certificate, which is good."""
+    shown: Any = secure.getpeercert() or {}
+    names = ", ".join(name for _, name in shown.get("subjectAltName", ())) or "no name"
+    end_s = ssl.cert_time_to_seconds(shown["notAfter"])
+    issuer = {key: value for part in shown.get("issuer", ()) for key, value in part}
+    signer = issuer.get("commonName") or issuer.get("organizationName", "an unnamed authority")
+    text = f"{secure.version()}, for {names}, until {utc(end_s)[:10]}, signed by {signer}"
+    if end_s - time.time() < _ENDS_SOON_S:
+        todo = "the cloud should have renewed it by now: `iort doctor` there"
+        return Finding("server certificate", WARN, f"{text}: ends soon", todo)
+    return Finding("server certificate", OK, text)
+
+
+def _broker(config: Config, secure: ssl.SSLSocket) -> Generator[Finding, None, _Offset | None]:
+    """The broker's answer to the robot, then the cloud's to a ping. Returns the clock's offset, or None."""
+    robot = config.robot
+    with Session(secure) as session:
+        try:
+            session.connect(robot)
+        except RefusalError as refusal:
+            todo = (
+                f"the certificate is not active, not attached to the thing {robot}, or its policy refuses: "
+                "see `iort robots list`"
+            )
+            raise BlockedError("broker", f"refuses {robot}: {refusal}", todo) from refusal
+        except OSError as error:
+            raise BlockedError("broker", *_no_connack(config, error)) from error
+        yield Finding("broker", OK, f"accepts {robot}")
+        ping, pong = (build_topic(lane, robot, RULE, config.namespace) for lane in (PING, PONG))
+        sent_s, sent_us = time.monotonic(), time.time_ns() // 1000
+        why = f"no answer in {TIMEOUT_S:g} s"
+        try:
+            answer = session.round_trip(ping, encode_ping(0, sent_us), pong, TIMEOUT_S)
+            received_ms = None if answer is None else decode_pong(answer).received_ms
+        except (OSError, RefusalError, ContractError) as error:
+            received_ms, why = None, str(error)
+        trip_s = time.monotonic() - sent_s
+        if received_ms is None:
+            todo = (
+                f"is `namespace: {config.namespace}` the deployment's, and is it deployed whole? "
+                "`iort doctor` there"
+            )
+            yield Finding("rules", WARN, f"the cloud's rules do not answer a ping: {why}", todo)
+            return None
+        yield Finding("rules", OK, f"answer a ping in {trip_s * 1000:.0f} ms")
+        return _Offset(received_ms / 1000 - sent_us / 1e6 - trip_s / 2, "the answer to a ping")
+
+
+def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
+    # With TLS 1.3 the server's opinion of our certificate comes only now.
+    refused = refused_ours(config, str(getattr(error, "reason", None) or error))
+    if refused is not None:
+        return refused
+    if isinstance(error, socket.timeout):
+        text = f"gives {config.robot} no answer in {TIMEOUT_S:g} s"
+        return text, "the cloud hangs, or something between holds the bytes back: `iort doctor` at the cloud"
+    todo = (
+        "the certificate is unknown there, not active or revoked (`iort robots list`), or the broker is "
+        "being restarted: try again"
+    )
+    return f"hangs up on {config.robot}: {error}", todo
+
+
+def _other_offset(config: Config, running: Status | None) -> _Offset | None:
+    """The clock's offset by others than the broker."""
+    if running is not None and running.clock is not None:
+        return _Offset(running.clock.offset_ms / 1000, "the running agent's pings")
+    if not config.endpoint.endswith(".amazonaws.com"):
+        return None
+    # To the second; nothing without a valid answer.
+    connection = http.client.HTTPSConnection(config.endpoint, 443, timeout=TIMEOUT_S)
+    with suppress(OSError, http.client.HTTPException, TypeError, ValueError), closing(connection):
+        connection.request("HEAD", "/")
+        date = connection.getresponse().getheader("Date", "")
+        return _Offset(parsedate_to_datetime(date).timestamp() + 0.5 - time.time(), "AWS' answer over HTTPS")
+    return None
+
+
+def _clock(offset: _Offset | None) -> Finding:
+    shown = utc(time.time())
+    if offset is None:
+        if time.time() < _EARLIEST_S:
+            return Finding("clock", FAIL, f"says {shown}, which is long past", SET_CLOCK)
+        return Finding("clock", OK, f"says {shown}, which is plausible; nothing to compare it with yet")
+    if abs(offset.seconds) > _CLOCK_OFF_S:
+        text = f"is {-offset.seconds:+.1f} s off, by {offset.by}: samples are stamped wrong"
+        return Finding("clock", WARN, text, SET_CLOCK)
+    return Finding("clock", OK, f"is {-offset.seconds:+.3f} s off, by {offset.by}")

@@ -1,0 +1,1 @@
+"""The state of ministack's services, as documents in the ledger."""

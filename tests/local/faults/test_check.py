@@ -1,0 +1,55 @@
+"""`iort-agent check` of a robot of the embedded cloud, through a proxy with network faults."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from iort_agent.config import load_config
+from iort_agent.sources import FAIL, OK, WARN, Finding
+from iort_agent.verbs import tls, way
+from iort_station.fleet import robots
+from local.cloud import EmbeddedCloud
+from local.proxy import FREEZE, REFUSE, Proxy
+
+
+@pytest.fixture
+def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
+    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
+        yield proxy
+
+
+def go(bundle: robots.Bundle, proxy: Proxy) -> dict[str, Finding]:
+    robots.configure(bundle, {"port": proxy.port})
+    return {one.what: one for one in way.way(load_config(bundle.config))}
+
+
+def test_the_way_to_a_cloud_that_works(
+    bundle: Callable[..., robots.Bundle], proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    car = bundle()
+    findings = go(car, proxy)
+    assert {one.level for one in findings.values()} == {OK}
+    assert list(findings) == ["name", "route", "port", "server certificate", "broker", "rules", "clock"]
+    assert "by the answer to a ping" in findings["clock"].text
+    now_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() - 100_000_000_000)
+    clock = go(car, proxy)["clock"]
+    assert clock.level == WARN
+    assert clock.text.startswith("is -100.")
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"), [(REFUSE, "the connection ends before TLS"), (FREEZE, "says nothing for 0.5 s")]
+)
+def test_a_broken_network_is_named(
+    bundle: Callable[..., robots.Bundle], proxy: Proxy, mode: str, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tls, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(way, "TIMEOUT_S", 0.5)
+    proxy.mode = mode
+    failed = go(bundle(), proxy)["TLS"]
+    assert failed.level == FAIL
+    assert text in failed.text
