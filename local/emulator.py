@@ -14,6 +14,7 @@ from typing import cast
 from ministack import app
 
 from local import gaps
+from local.gaps.functions.async_invocations import AsyncInvocations
 from local.gaps.metrics import alarm_timer
 from local.keeping import kept, streams
 from local.keeping.ledger import Ledger, Sync
@@ -28,7 +29,7 @@ def main() -> None:
     streams.install(ledger)
     gaps.install()
     if path:
-        kept.install(ledger)
+        kept.install(ledger, AsyncInvocations())
     alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()
 
