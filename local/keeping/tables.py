@@ -56,7 +56,7 @@ class Tables:
 
     def adopt(self, table: Table) -> Items:
         """The table's items; those that it still has in memory are moved into the ledger."""
-        held = table.get("items") or {}
+        held = table.get("items")
         if isinstance(held, Items):
             return held
         name = f"{table['TableArn']} {table.get('TableId', '')}"
@@ -65,7 +65,7 @@ class Tables:
             ((number, ttl),) = connection.execute("SELECT id, ttl FROM tables WHERE name = ?", (name,))
             items = table["items"] = self._items[name] = Items(self.ledger, self.encode, table, number, ttl)
             self._learn_ttl(items)
-            for partition, bucket in held.items():
+            for partition, bucket in (held or {}).items():
                 for key, item in bucket.items():
                     items[partition][key] = item
         return items
