@@ -2,9 +2,9 @@
 
 AWS: does not apply; what a request costs AWS does not show
   (https://docs.aws.amazon.com/amazondynamodb/latest/APIReference/API_BatchWriteItem.html).
-ministack: parses the body of every request four times for IAM and once more to serve it, and goes through each
-  item of a BatchWriteItem six times. A body of 25 summaries has 100 KB. Here a body is parsed once, an item is
-  checked once, and capacity is counted where it is asked for.
+ministack: parses the body of every request four times for IAM and once more to serve it, and goes through
+  each item of a BatchWriteItem six times. A body of 25 summaries has 100 KB. Here a body is parsed once, an
+  item is checked once, and capacity is counted where it is asked for.
 Test: tests/local/gaps/test_time_gaps.py::test_a_batch_write_reads_its_items_once
 Patch: none; it is about speed only, so that upstream should measure it with its own load
 """
