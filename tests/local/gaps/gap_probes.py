@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import hashlib
 import inspect
 import json
 import os
@@ -17,7 +18,7 @@ from unittest.mock import MagicMock, Mock, patch
 from ministack import app as ministack_app
 from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
-from ministack.services import cloudwatch_logs, iot, iot_data, lambda_svc, sqs
+from ministack.services import cloudwatch_logs, dynamodb, iot, iot_data, lambda_svc, sqs
 
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",
@@ -278,3 +279,20 @@ def unsigned_websocket() -> bool:
     """Ask whether an unsigned upgrade is refused where requests are checked."""
     with patch.object(ministack_app, "AUTH", True):
         return iot._ws_handshake_check(HANDSHAKE) is None
+
+
+def ttl_pass() -> bool:
+    """Ask for the function."""
+    return not hasattr(dynamodb, "_expire_items")
+
+
+def function_credentials() -> bool:
+    """Derive a secret from what is no secret."""
+    config = {
+        "FunctionArn": "arn:aws:lambda:eu-west-1:000000000000:function:one",
+        "Role": "arn:aws:iam::000000000000:role/one",
+    }
+    digest = hashlib.sha256("{FunctionArn}:{Role}".format(**config).encode()).hexdigest()
+    derived = hashlib.sha256(f"secret:{digest}".encode()).hexdigest()
+    with patch.object(ministack_app, "AUTH", True):
+        return bool(lambda_runtime.execution_credentials(config)["AWS_SECRET_ACCESS_KEY"] == derived)
