@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import sqlite3
 import subprocess
@@ -98,7 +99,9 @@ def test_a_damaged_backup_changes_nothing(state: Path, tmp_path: Path) -> None:
     (state / "s3" / "drive.bag").write_bytes(b"drive" * 1000)
     back_up(state, archive)
     good = archive.read_bytes()
-    verify(archive)
+    archive.write_bytes(gzip.compress(good))
+    assert verify(archive).files.keys() == {"VERSION", "authority.key", "s3/drive.bag"}
+    archive.write_bytes(good)
     with tarfile.open(archive) as tar:
         manifest_at = tar.getmember("manifest.json").offset
     for damaged, reason in (
@@ -108,6 +111,7 @@ def test_a_damaged_backup_changes_nothing(state: Path, tmp_path: Path) -> None:
         ),
         (good[:2000], "is damaged, or no backup"),
         (good[:manifest_at] + bytes(1024), "its list of hashes is missing"),
+        (gzip.compress(good)[:-100], "is damaged, or no backup"),
         (b"anything", "is damaged, or no backup"),
     ):
         archive.write_bytes(damaged)
