@@ -132,8 +132,10 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         assert laboratory.listeners() == reached
         # Its second connection; the batches in between have waited in its queue.
         until(lambda: agent.tail().count(f"connected to {address}") == 2)
+        until(lambda: "online since" in laboratory.iort("robots", "list"))
         agent.interrupt()
         assert agent.wait(30.0) == 0, agent.tail()
+        until(lambda: "offline since" in laboratory.iort("robots", "list"))
         until(lambda: "vesc: complete" in laboratory.iort("audit", "car1"))
         upload = laboratory.folder / "drive.bag"
         upload.write_bytes(os.urandom(100_000))
