@@ -18,6 +18,7 @@ NAMES = (
     "functions.async_invocations",
     "functions.stream_retries",
     "functions.log_end",
+    "functions.log_retention",
     "storage.query_time",
     "storage.number_checks",
     "metrics.embedded_metrics",
