@@ -6,7 +6,7 @@ import io
 import secrets
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,9 +98,16 @@ def open_target(
 
 @contextmanager
 def temporary_function(
-    target: Target, name: str, source: str, *, memory_mb: int, timeout_s: int = 3, like: str = "Echo"
+    target: Target,
+    name: str,
+    source: str,
+    *,
+    memory_mb: int,
+    timeout_s: int = 3,
+    like: str = "Echo",
+    variables: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """Deploy a function, yield its name, and delete it at the end.
+    """Deploy a function with environment variables, yield its name, and delete it at the end.
 
     ``source`` defines `handler`. Runtime, role, architecture and log are those of the function ``like``.
     """
@@ -121,6 +128,7 @@ def temporary_function(
         MemorySize=memory_mb,
         Timeout=timeout_s,
         LoggingConfig={"LogGroup": logging["LogGroup"]} if logging else {},
+        Environment={"Variables": dict(variables or {})},
         Code={"ZipFile": packed.getvalue()},
     )
     try:

@@ -21,7 +21,7 @@ from iort_contract import expression
 from iort_contract.catalog.derived import DERIVED, derive
 from iort_contract.catalog.environments import QueryEnvironment
 from iort_contract.cloud import RESULTS_PREFIX
-from iort_contract.dynamodb import plain, with_samples_between
+from iort_contract.dynamodb import plain, quick, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import decode_batch
@@ -198,7 +198,9 @@ def _answer(
 def _tables() -> Tables:
     given = variables(QueryEnvironment)
     # It may not read the summary table.
-    return Tables(clients.dynamodb(), telemetry=given.telemetry_table, summary="", robots=given.robots_table)
+    return Tables(
+        quick(clients.dynamodb()), telemetry=given.telemetry_table, summary="", robots=given.robots_table
+    )
 
 
 def _store(samples: bytes) -> str:

@@ -3,36 +3,38 @@
 Durations come from Lambda's REPORT lines. The embedded cloud gives every function a whole core, whatever its
 memory size. So there the operating system also measures processor time, which is projected to each memory
 size. On AWS each size is set and measured.
+
+Beside the functions run their floors (`bench.floors.functions`), with the same events in turns.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
 from dataclasses import asdict
+from itertools import count
 from statistics import median
 from typing import Any
 
 from bench import ROOT
 from bench.errors import BenchError
+from bench.floors.functions import live as live_floor
+from bench.floors.functions import summarize as summarize_floor
 from bench.load import stored_drive
+from bench.load.events import live_event, stream_event
 from bench.load.simulated import RATE_HZ
 from bench.meters.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
-from bench.report.spread import spread
+from bench.report.spread import ratio, spread
 from bench.target import Say, Target, temporary_function
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.event import rule_event
-from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.tables import BATCH, REPLAY, TOPIC
-from iort_contract.topics import LIVE, build_topic
+from iort_contract.cloud import pubnub_parameter
+from iort_contract.codec.columns import DICTIONARY
+from iort_contract.topics import LIVE, RECORD, build_topic
 
 SIZES_MB = (128, 256, 512, 1024, 1769)
 # "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".
@@ -43,6 +45,14 @@ CALLS = 60
 BATCHES = 100
 _LIVE, _ONE, _EMPTY = "Lambda 1 (live)", "Lambda 2, an event of 1 batch", "empty function"
 _BACKLOG = f"Lambda 2, an event of {BATCHES} batches"
+_LIVE_FLOOR, _ONE_FLOOR, _BACKLOG_FLOOR = (f"floor of {name}" for name in (_LIVE, _ONE, _BACKLOG))
+# A function, its floor, and the most that it may take of the floor's processor time, without the empty
+# function's.
+_RATIOS = (
+    (_LIVE, _LIVE_FLOOR, 3.0),
+    (_ONE, _ONE_FLOOR, None),
+    (_BACKLOG, _BACKLOG_FLOOR, 3.0),
+)
 _THESIS = {_LIVE: f"{thesis.LAMBDA_1[256]} (256 MB)", _ONE: thesis.LAMBDA_2}
 # What an invocation costs by itself.
 _NOTHING = "def handler(event, context):\n    return None\n"
@@ -54,31 +64,43 @@ def run(target: Target, say: Say) -> Section:
     say("storing a drive")
     batches = stored_drive.store(target, target.name(ROBOT), stored_drive.simulated(BATCHES * RATE_HZ))
     # The newest batch alone is what a driving car makes of the stream; all of them, a backlog.
-    one, many = _stream_event(batches[-1:]), _stream_event(batches)
-    events: dict[str, Event] = {
-        _LIVE: lambda i: _live_event(target, i),
-        _ONE: lambda _: one,
-        _BACKLOG: lambda _: many,
-    }
-    live = target.cloud.output("processing", "LiveFunction")
-    summarize = target.cloud.output("processing", "SummarizeFunction")
-    with temporary_function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
-        names = dict(zip(events, (live, summarize, summarize), strict=True))
-        events[_EMPTY], names[_EMPTY] = (lambda _: {}), empty
+    arrivals = count()
+
+    def live(number: int) -> dict[str, Any]:
+        topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
+        return live_event(topic, number)
+
+    def one(_: int) -> dict[str, Any]:
+        return stream_event(batches[-1:], next(arrivals))
+
+    def many(_: int) -> dict[str, Any]:
+        return stream_event(batches, next(arrivals))
+
+    names = {_LIVE: target.cloud.output("processing", "LiveFunction")}
+    names[_ONE] = names[_BACKLOG] = target.cloud.output("processing", "SummarizeFunction")
+    with ExitStack() as stack:
+        names |= _floors(target, stack)
+        events: dict[str, Event] = {
+            _LIVE: live,
+            _LIVE_FLOOR: live,
+            _ONE: one,
+            _ONE_FLOOR: one,
+            _BACKLOG: many,
+            _BACKLOG_FLOOR: many,
+            _EMPTY: lambda _: {},
+        }
         for name in sorted(set(names.values())):
-            reports.enter_context(reporting(target, name))
+            stack.enter_context(reporting(target, name))
         found = {name: Measured() for name in events}
         for name, event in events.items():
             invoke(target, names[name], event(0))
         for turn in range(ROUNDS):
             for name, event in events.items():
                 say(f"{name}, warm, {turn + 1} of {ROUNDS}")
-                calls = CALLS // 10 if name == _BACKLOG else CALLS
+                calls = CALLS // 10 if name in {_BACKLOG, _BACKLOG_FLOOR} else CALLS
                 measure(target, names[name], event, calls, found[name])
-        sizes = _memory_sizes(target, live, events[_LIVE], say)
-        cold = {
-            name: _cold(target, names[name], event, say) for name, event in events.items() if name != _BACKLOG
-        }
+        sizes = _memory_sizes(target, names[_LIVE], live, say)
+        cold = {name: _cold(target, names[name], events[name], say) for name in (_LIVE, _ONE, _EMPTY)}
     say("the node's cycle")
     cycle = _cycle()
     report(section, found, cold, sizes, cycle)
@@ -127,15 +149,9 @@ def report(
             f"{ONE_VCPU_MB} MB / memory, by AWS' word that {ONE_VCPU_MB} MB have one vCPU; waiting for "
             "DynamoDB or PubNub is not in it, and this machine's core is not AWS'."
         )
-    empty_ms = found[_EMPTY].cpu_ms
-    for name, spent_ms, shared_by, most_ms in (
-        ("Lambda 1 warm, processor time beyond an empty function", found[_LIVE].cpu_ms, 1, 3.0),
-        ("Lambda 2, processor time a batch of 50 samples", found[_BACKLOG].cpu_ms, BATCHES, 1.0),
-    ):
-        if spent_ms and empty_ms:
-            beyond_ms = median(a - b for a, b in zip(spent_ms, empty_ms, strict=True)) / shared_by
-            settings = {"unit": "ms", "tolerance": 1.6, "by_machine": True}
-            section.ratio(name, round(beyond_ms, 3), most_ms, **settings)
+    for name, floor, most in _RATIOS:
+        times = ratio(_beyond(found, name), _beyond(found, floor))
+        section.ratio(f"{name}: processor / its floor", times and round(times, 2), most, tolerance=1.6)
     cycles = round(cycle["p50"] / thesis.NODE_CYCLE_MS, 5)
     section.ratio("node's cycle / thesis' 2 ms", cycles, 0.05, tolerance=3, by_machine=True)
     if figures := {name: median(one.cpu_ms) for name, one in found.items() if one.cpu_ms}:
@@ -146,6 +162,11 @@ def report(
         "memory": {str(mb): asdict(one) for mb, one in sizes.items()},
         "cycle_ms": cycle,
     }
+
+
+def _beyond(found: dict[str, Measured], name: str) -> list[list[float]]:
+    """The processor time of an invocation beyond an empty one, in ms for each round."""
+    return [[ours - empty] for ours, empty in zip(found[name].cpu_ms, found[_EMPTY].cpu_ms, strict=True)]
 
 
 def _projected(found: dict[str, Measured]) -> dict[str, list[float]]:
@@ -203,32 +224,27 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
     return found
 
 
-def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:
-    records = [
-        {
-            "eventID": f"bench-{i}",
-            "eventName": "INSERT",
-            "eventSource": "aws:dynamodb",
-            "dynamodb": {
-                "Keys": {name: item[name] for name in (TOPIC, BATCH)},
-                "NewImage": item,
-                "SequenceNumber": f"{i + 1:021}",
-                "StreamViewType": "NEW_IMAGE",
-            },
-        }
-        for i, item in enumerate(items)
-    ]
-    # As an operator's: a robot that sent so many would be over its share.
-    return {REPLAY: True, "Records": records}
+def _floors(target: Target, stack: ExitStack) -> dict[str, str]:
+    """Deploy the floors and the empty function until the stack ends; their names."""
+    cloud = target.cloud
+    live = {"PUBNUB_PARAMETER": pubnub_parameter(cloud.namespace)}
+    summarize = {
+        "DICTIONARY": DICTIONARY.decode(),
+        "TABLE": cloud.output("storage", "SummaryTable"),
+        "TOPIC": build_topic(RECORD, target.name(f"{ROBOT}-floor"), VESC_STREAM, cloud.namespace),
+    }
 
+    def deployed(name: str, source: str, like: str, variables: dict[str, str]) -> str:
+        function = temporary_function(target, name, source, memory_mb=256, like=like, variables=variables)
+        return stack.enter_context(function)
 
-def _live_event(target: Target, i: int) -> dict[str, Any]:
-    """Return an event as the live rule sends it to Lambda 1."""
-    now_us = time.time_ns() // 1000
-    sample = Sensors(Vehicle(VehicleConfig(), seed=1), seed=1).vesc()
-    message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
-    topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
-    return rule_event(message, topic, now_us // 1000)
+    floor = deployed("summarize_floor", inspect.getsource(summarize_floor), "Summarize", summarize)
+    return {
+        _LIVE_FLOOR: deployed("live_floor", inspect.getsource(live_floor), "Live", live),
+        _ONE_FLOOR: floor,
+        _BACKLOG_FLOOR: floor,
+        _EMPTY: deployed("empty", _NOTHING, "Echo", {}),
+    }
 
 
 def _cycle() -> dict[str, float]:

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -15,7 +16,7 @@ from functions.shared.archive.marks import Marks
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
-from iort_contract.limits import ContractError
+from iort_contract.limits import MAX_FIELD_CHARACTERS, ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, OMITTED, ROBOT, SECOND, STREAMS, TOPIC, VEHICLE_CACHE_S
 
@@ -29,6 +30,8 @@ MAX_STREAMS, _NOTED = 200, 50_000
 _MAX_ITEM_BYTES = 380 * 1024
 # The longest text of a float; its stored number is shorter.
 _MAX_NUMBER_BYTES = 25
+# So many attributes of numbers alone always fit: a name with a statistic's suffix, and a list of four.
+_FIT_WITHOUT_TEXT = _MAX_ITEM_BYTES // (MAX_FIELD_CHARACTERS + 8 + 4 * _MAX_NUMBER_BYTES)
 # The range of a DynamoDB number, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
@@ -39,7 +42,15 @@ def attribute(value: Statistics) -> dict[str, Any]:
     A number too small becomes 0, one too large becomes text.
     """
     if isinstance(value, list):
-        return {"L": list(map(attribute, value))}
+        # Nearly all values of a second are here.
+        return {
+            "L": [
+                {"N": repr(one)}
+                if type(one) is int or (type(one) is float and _SMALLEST <= abs(one) <= _LARGEST)
+                else attribute(one)
+                for one in value
+            ]
+        }
     if isinstance(value, float):
         if _SMALLEST <= abs(value) <= _LARGEST:
             return {"N": repr(value)}
@@ -65,13 +76,15 @@ class Tables:
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches from a start time on, in order of time. The first page has ``at_once``
-        batches, later ones a hundred: callers rarely want a whole drive."""
-        keys = starting_between(first_us, None)
-        few = next(self.telemetry.pages(topic, keys, page_items=at_once))
-        yield from map(plain, few.items)
-        if few.after is not None:
-            for page in self.telemetry.pages(topic, keys, page_items=_MANY, after=few.after):
-                yield from map(plain, page.items)
+        batches, and each one after it four times as many: callers rarely want a whole drive. While summaries
+        are late, what was stored since comes after what they want."""
+        keys, after = starting_between(first_us, None), None
+        for pages in count():
+            size = min(at_once << 2 * pages, max(at_once, _MANY))
+            page = next(self.telemetry.pages(topic, keys, page_items=size, after=after))
+            yield from map(plain, page.items)
+            if (after := page.after) is None:
+                return
 
     def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches before a time, the nearest first. Each is read on demand, since the first
@@ -141,6 +154,8 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
     A stream may have 512 fields of texts of 4096 characters, and the summary keeps the last of each; the
     samples themselves are in the telemetry table.
     """
+    if len(item) <= _FIT_WITHOUT_TEXT and not any("S" in value for value in item.values()):
+        return item
     sizes = list(map(_size, item, item.values()))
     total, dropped = sum(sizes), set()
     if total <= _MAX_ITEM_BYTES:

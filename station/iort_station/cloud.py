@@ -152,6 +152,10 @@ class Cloud:
                 )
             except BotoCoreError as error:
                 raise StationError(f"no AWS client for {service}: {error}") from error
+            if service == "dynamodb":
+                from iort_contract.dynamodb import quick  # noqa: PLC0415 - as above
+
+                quick(self._clients[key])
         return self._clients[key]
 
     @property

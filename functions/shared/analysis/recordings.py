@@ -17,7 +17,7 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.dynamodb import Item, TelemetryTable, plain, with_samples_between
+from iort_contract.dynamodb import Item, TelemetryTable, plain, quick, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import decode_batch
 from iort_contract.tables import BATCH, ROBOT, STREAMS
@@ -118,7 +118,7 @@ def _is_number(value: Any) -> bool:
 def deployed() -> Recordings:
     """The recordings of this function's deployment."""
     given = variables(PlanEnvironment)
-    dynamodb = clients.dynamodb()
+    dynamodb = quick(clients.dynamodb())
     return Recordings(
         dynamodb,
         Expired(ArchiveTable(dynamodb, given.archive_table), clients.s3(), given.files_bucket),

@@ -12,7 +12,7 @@ from functions.shared.archive.objects import Objects
 from functions.shared.environment import variables
 from iort_contract.archive import HOUR, ArchivedHour, ArchiveTable, Hour, archived_hour
 from iort_contract.catalog.environments import ArchiveEnvironment
-from iort_contract.dynamodb import TelemetryTable
+from iort_contract.dynamodb import TelemetryTable, quick
 from iort_contract.tables import TOPIC
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Archive:
 def archive() -> Archive:
     """The archive of this environment's deployment."""
     given = variables(ArchiveEnvironment)
-    client = clients.dynamodb()
+    client = quick(clients.dynamodb())
     return Archive(
         client,
         TelemetryTable(client, given.telemetry_table),

@@ -27,7 +27,8 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
         backlog = _numbers(batches, "backlog_batches")
         return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
     volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
-    found = (measured_degc(name, value) for name in TEMPERATURES for value in _numbers(batches, name))
+    # A temperature has few different values.
+    found = (measured_degc(name, value) for name in TEMPERATURES for value in set(_numbers(batches, name)))
     degc = [value for value in found if value is not None]
     return {
         "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),

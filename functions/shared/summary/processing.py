@@ -34,7 +34,7 @@ from functions.shared.summary.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
 from iort_contract.codec.seconds import Statistics
-from iort_contract.dynamodb import TableError
+from iort_contract.dynamodb import TableError, quick
 from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
 from iort_contract.topics import parse_topic
 
@@ -213,7 +213,7 @@ def stored_tables() -> Tables:
     """The tables of this environment's deployment."""
     given = variables(LaterEnvironment)
     # Requests come from this code only. Validating them took a third of Lambda 2's CPU time.
-    client = boto3.client("dynamodb", config=Config(parameter_validation=False))
+    client = quick(boto3.client("dynamodb", config=Config(parameter_validation=False)))
     tables = Tables(
         client,
         telemetry=given.telemetry_table,

@@ -21,8 +21,8 @@ SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
 _TOGETHER_BYTES = _SECOND_BYTES
 # The number of a second's neighbours to read: as many as the seconds beside it may hold.
 _NUMBERS = SECOND_BATCHES * (2 * ASIDE_US // _SECOND_US + 1)
-# Beside those of the event: the one before and the one after.
-_BESIDE = 2
+# Beside those of the event: the one before, the one after, and the one that shows that its second is whole.
+_BESIDE = 3
 # An undecodable neighbour is skipped; this many of them end the search.
 _NEIGHBOURS = 10
 
@@ -152,6 +152,7 @@ def _time_of(item: Mapping[str, Any], otherwise: int) -> int:
 def _bytes(batch: Batch) -> int:
     """Estimated memory of the columns."""
     return sum(
-        8 * len(column) + sum(len(value) for value in column if isinstance(value, str))
+        8 * len(column)
+        + (sum(len(value) for value in column if type(value) is str) if str in set(map(type, column)) else 0)
         for column in batch.columns.values()
     )

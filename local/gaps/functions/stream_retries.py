@@ -3,8 +3,9 @@
 AWS: splits a failed batch, gives it up after its retries or its age, and tells the destination
   (https://docs.aws.amazon.com/lambda/latest/dg/services-dynamodb-errors.html).
 ministack: invokes the function with the same batch until it succeeds, in the thread that also serves the
-  queues. Each mapping has here a thread for each of its concurrent batches. After a restart of the emulator
-  it reads the stream from its beginning again, which AWS too does after a lost acknowledgement.
+  queues. A stream has here a shard for each core, and a mapping a thread for each of its concurrent batches.
+  After a restart of the emulator it reads the stream from its beginning again, which AWS too does after a
+  lost acknowledgement.
 Test:
   tests/local/gaps/test_stream_gap.py::test_only_the_failing_record_goes_to_the_destination
 Patch: none; it replaces the whole poller by local/gaps/parts/stream_mapping.py
@@ -15,6 +16,7 @@ from __future__ import annotations
 import inspect
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -24,15 +26,18 @@ from typing import Any
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
-from local.gaps.parts.stream_mapping import Answer, Settings, Shard
+from local.gaps.parts.stream_mapping import Answer, Settings, Stream
 
 _log = logging.getLogger(__name__)
 # AWS waits longer between attempts; tests must not.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
 # The two clocks differ by less than this.
 _SLACK_S = 0.005
-# Records to read ahead; at least as many as one event may hold.
-_AHEAD = 2_000
+# The stream of a new on-demand table has four shards, which Lambda reads at once. More shards than cores
+# would only make smaller events.
+_SHARDS = min(4, os.cpu_count() or 1)
+# Records to read ahead; for each shard at least as many as one event may hold.
+_AHEAD = 2_000 * _SHARDS
 
 
 def install() -> None:
@@ -52,7 +57,7 @@ class _Running:
     account: str
     region: str
     mapping: dict[str, Any]
-    shard: Shard
+    stream: Stream
     position: int
     busy: set[int] = field(default_factory=set)
     pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -86,7 +91,7 @@ class StreamMappings:
         running = self._of(account, region, mapping, table)
         self._read(running, table)
         started = False
-        for number, lane in enumerate(running.shard.lanes):
+        for number, lane in enumerate(running.stream.lanes):
             with self._lock:
                 pause_until, _ = running.pauses.get(number, (0.0, 0.0))
                 if number in running.busy or time.monotonic() < pause_until:
@@ -106,35 +111,35 @@ class StreamMappings:
 
     def _of(self, account: str, region: str, mapping: dict[str, Any], table: str) -> _Running:
         running = self._running.get(mapping["UUID"])
-        settings = Settings.of(mapping)
+        settings, partition = Settings.of(mapping), dynamodb._tables[table]["pk_name"]
         if running is None:
             latest = mapping.get("StartingPosition") == "LATEST"
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
             # ministack stores where a new mapping begins.
             position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)
             running = self._running[mapping["UUID"]] = _Running(
-                account, region, mapping, Shard(settings), position
+                account, region, mapping, Stream(settings, partition, _SHARDS), position
             )
-        elif running.shard.settings != settings and not running.shard.size and not running.busy:
-            running.shard = Shard(settings)
+        elif running.stream.settings != settings and not running.stream.size and not running.busy:
+            running.stream = Stream(settings, partition, _SHARDS)
         return running
 
     @staticmethod
     def _read(running: _Running, table: str) -> None:
-        ahead = running.shard.size
+        ahead = running.stream.size
         if ahead >= _AHEAD:
             return
         running.position = max(running.position, dynamodb.stream_start_position(table))
         records = dynamodb.stream_records_since(table, running.position, _AHEAD - ahead)
         running.position += len(records)
-        running.shard.put(lambda_svc._apply_filter_criteria(records, running.mapping))
+        running.stream.put(lambda_svc._apply_filter_criteria(records, running.mapping))
 
     def _invoke(self, running: _Running, function: dict[str, Any], number: int, batch: list[Any]) -> None:
         with request_scope(running.account, running.region):
             answer = _answer(lambda_svc._execute_function(function, {"Records": batch}))
             failed = answer.error or answer.throttled
             with self._lock:
-                running.shard.lanes[number].answered(answer)
+                running.stream.lanes[number].answered(answer)
                 _, last_s = running.pauses.get(number, (0.0, _FIRST_PAUSE_S / 2))
                 pause_s = min(2 * last_s, _LONGEST_PAUSE_S)
                 if failed:
@@ -153,7 +158,7 @@ class StreamMappings:
     def _tell(self, running: _Running, function: dict[str, Any]) -> None:
         """Send discarded records to the mapping's destination."""
         with self._lock:
-            discarded = running.shard.discarded()
+            discarded = running.stream.discarded()
         mapping = running.mapping
         for one in discarded:
             _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])

@@ -224,14 +224,14 @@ class Shard:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.settings = settings
         self.lanes = [Lane(settings) for _ in range(settings.parallel)]
 
     def put(self, records: Iterable[Record]) -> None:
         """Add records in the order of the stream."""
         for record in records:
-            keys = json.dumps(record["dynamodb"]["Keys"], sort_keys=True)
-            self.lanes[zlib.crc32(keys.encode()) % len(self.lanes)].put(record)
+            keys = record["dynamodb"]["Keys"]
+            lane = _place(keys, len(self.lanes)) if len(self.lanes) > 1 else 0
+            self.lanes[lane].put(record)
 
     @property
     def size(self) -> int:
@@ -244,3 +244,34 @@ class Shard:
         for lane in self.lanes:
             lane.discarded.clear()
         return found
+
+
+class Stream:
+    """A stream's shards: each has the records of some partitions, keeps their order, and is read by itself.
+
+    ``partition`` is the name of the table's partition key.
+    """
+
+    def __init__(self, settings: Settings, partition: str, shards: int) -> None:
+        self.settings, self._partition = settings, partition
+        self._shards = [Shard(settings) for _ in range(shards)]
+        self.lanes = [lane for shard in self._shards for lane in shard.lanes]
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Add records in the order of the stream."""
+        for record in records:
+            key = record["dynamodb"]["Keys"][self._partition]
+            self._shards[_place(key, len(self._shards))].put([record])
+
+    @property
+    def size(self) -> int:
+        """The number of records that are neither done nor discarded."""
+        return sum(shard.size for shard in self._shards)
+
+    def discarded(self) -> list[Discarded]:
+        """The records discarded since the last call."""
+        return [one for shard in self._shards for one in shard.discarded()]
+
+
+def _place(key: Any, places: int) -> int:
+    return zlib.crc32(json.dumps(key, sort_keys=True).encode()) % places

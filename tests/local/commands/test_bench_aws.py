@@ -10,6 +10,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from bench import run, spending
+from bench.load.events import live_event
 from bench.sections import SECTIONS, utilisation
 from bench.target import AWS, open_target
 from iort_station.fleet import certificates, robots
@@ -60,7 +61,7 @@ def test_an_interrupt_restores_the_memory_size(embedded):
     with open_target(AWS, cloud=cloud) as target:
         live = cloud.output("processing", "LiveFunction")
         with pytest.raises(KeyboardInterrupt):
-            utilisation._memory_sizes(target, live, lambda i: utilisation._live_event(target, i), say)
+            utilisation._memory_sizes(target, live, lambda i: live_event("live/iort/bench/vesc", i), say)
     assert seen == [was, utilisation.SIZES_MB[0]]
     assert memory_mb(cloud) == was
 

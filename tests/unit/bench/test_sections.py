@@ -51,19 +51,25 @@ def test_the_projection_scales_with_the_cpu_share_of_the_memory_size():
     assert projected["f"][0] == pytest.approx(2.0 * 1769 / 128)
 
 
-def test_functions_are_compared_with_their_targets_beyond_an_empty_function():
+def test_functions_are_compared_with_their_floors_beyond_an_empty_function():
+    live, one = "Lambda 1 (live)", "Lambda 2, an event of 1 batch"
     many = f"Lambda 2, an event of {BATCHES} batches"
-    found = {
-        "Lambda 1 (live)": Measured([[1.0]], [2.0, 2.2, 2.1]),
-        "Lambda 2, an event of 1 batch": Measured([[1.0]], [9.2] * 3),
-        many: Measured([[1.0]], [50.2] * 3),
-        "empty function": Measured([[1.0]], [0.2] * 3),
+    cpu_ms = {
+        live: [2.0, 2.2, 2.1],
+        f"floor of {live}": [1.2, 1.2, 1.2],
+        one: [9.2] * 3,
+        f"floor of {one}": [1.2] * 3,
+        many: [50.2] * 3,
+        f"floor of {many}": [20.2] * 3,
+        "empty function": [0.2] * 3,
     }
     section = Section("utilisation", "")
+    found = {name: Measured([[1.0]], values) for name, values in cpu_ms.items()}
     utilisation.report(section, found, {}, {}, {"p50": 0.004, "p95": 0.005})
     values = {ratio.name: ratio.value for ratio in section.ratios}
-    assert values["Lambda 1 warm, processor time beyond an empty function"] == 1.9
-    assert values["Lambda 2, processor time a batch of 50 samples"] == 0.5
+    assert values[f"{live}: processor / its floor"] == 1.9
+    assert values[f"{one}: processor / its floor"] == 9.0
+    assert values[f"{many}: processor / its floor"] == 2.5
     assert values["node's cycle / thesis' 2 ms"] == 0.002
     assert all(ratio.reached for ratio in section.ratios if ratio.target is not None)
 

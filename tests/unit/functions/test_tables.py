@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 
+import boto3
 import pytest
+from botocore.config import Config
+from botocore.exceptions import ClientError
 from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.shared import tables as tables_module
 from functions.shared.tables import attribute
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.dynamodb import TableError, plain
+from iort_contract.dynamodb import TableError, plain, quick
 from iort_contract.messages.batch import Batch, BatchId, batch_id
 from iort_contract.tables import BATCH, EXPIRES_S, SECOND, TOPIC
 from tests.fakes import (
@@ -49,6 +52,37 @@ def put(client, table, item):
         client.put_item(TableName=table, Item=item)
 
 
+def test_a_quick_client_writes_and_reads_what_botocore_does(dynamodb):
+    quickly = quick(boto3.client("dynamodb", config=Config(parameter_validation=False)))
+    calls = [quickly.query, dynamodb.query, quickly.scan, dynamodb.scan]
+    for samples in (
+        {"S": "\u00e4\n"},
+        {"L": [{"N": "1.50"}, {"NULL": True}]},
+        {"BS": [b"\x00"]},
+        {"B": b"\xff"},
+    ):
+        item = {TOPIC: {"S": "t"}, BATCH: {"S": str(samples)}, "samples": samples}
+        quickly.batch_write_item(RequestItems={TELEMETRY: [{"PutRequest": {"Item": item}}]})
+        key = {name: item[name] for name in (TOPIC, BATCH)}
+        assert dynamodb.get_item(TableName=TELEMETRY, Key=key)["Item"] == item
+        condition = {
+            "ExpressionAttributeNames": {"#t": TOPIC},
+            "ExpressionAttributeValues": {":t": key[TOPIC]},
+        }
+        query, scan = ({name: "#t = :t"} for name in ("KeyConditionExpression", "FilterExpression"))
+        pages = [
+            read(TableName=TELEMETRY, **condition, **how)
+            for read, how in zip(calls, (query, query, scan, scan), strict=True)
+        ]
+        for page in pages:
+            assert page.pop("ResponseMetadata")["HTTPStatusCode"] == 200
+        assert item in pages[0]["Items"]
+        assert pages[0] == pages[1]
+        assert pages[2] == pages[3]
+    with pytest.raises(ClientError):
+        quickly.query(TableName="none", **condition, **query)
+
+
 def times_of(items):
     return [batch_id(item[BATCH]).t_us for item in items]
 
@@ -74,7 +108,7 @@ def test_all_pages_are_read():
     store(client, *range(T0, T0 + 103))
     assert len(list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2))) == 103
     # Nearly every caller wants a few items; the others want many.
-    assert client.calls["query"] == 3
+    assert client.calls["query"] == 4
 
 
 def test_an_iterator_reads_only_the_batches_taken_from_it():

@@ -16,7 +16,7 @@ from functions.shared import tables as tables_module
 from functions.shared.summary.processing import process
 from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
-from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard
+from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard, Stream
 from tests.examples import examples
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 
@@ -33,8 +33,8 @@ DEPLOYED = Settings(
 )
 
 
-def record(n, *, at_s=0.0):
-    keys = {"topic": {"S": "dt/iort/car/vesc"}, "batch": {"S": f"{n:016}-0badcafe-0"}}
+def record(n, *, at_s=0.0, topic="dt/iort/car/vesc"):
+    keys = {"topic": {"S": topic}, "batch": {"S": f"{n:016}-0badcafe-0"}}
     return {
         "dynamodb": {"Keys": keys, "SequenceNumber": f"{n:06}", "ApproximateCreationDateTime": at_s},
         "n": n,
@@ -217,6 +217,24 @@ def test_concurrent_batches_keep_only_the_order_of_an_item():
             seen += numbers(batch)
             lane.answered(Answer())
         assert Counter(seen) == dict.fromkeys(set(seen), 4)
+
+
+def test_shards_keep_the_order_of_a_partition_and_hold_up_no_other():
+    stream = Stream(Settings(batch_size=4), "topic", shards=4)
+    stream.put(record(n, topic=f"car{n % 9}") for n in range(90))
+    blocked = max(stream.lanes, key=lambda lane: lane.size)
+    seen = []
+    for lane in stream.lanes:
+        while lane is not blocked and (batch := lane.batch(0)):
+            seen += numbers(batch)
+            lane.answered(Answer())
+    assert len({n % 9 for n in seen}) > 1
+    assert stream.size == 90 - len(seen) == blocked.size
+    while batch := blocked.batch(0):
+        seen += numbers(batch)
+        blocked.answered(Answer())
+    for car in range(9):
+        assert [n for n in seen if n % 9 == car] == list(range(car, 90, 9))
 
 
 # --- Lambda 2 in it -------------------------------------------------------------------------------------

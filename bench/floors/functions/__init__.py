@@ -1,0 +1,1 @@
+"""The floors of functions: each is deployed alone, with the standard library and what AWS' runtime has."""
