@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -18,6 +18,22 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
 		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT)) \
 		$(if $(LIVE),--live $(LIVE))
+
+# The options of the cloud that is kept.
+STATE_OPTION = $(if $(STATE),--state "$(STATE)")
+UP_OPTIONS = $(STATE_OPTION) $(if $(LISTEN),--listen "$(LISTEN)") $(if $(PAGE),--page "$(PAGE)") $(if $(POWER_CUT),--power-cut $(POWER_CUT))
+
+up: setup ## run a cloud of your own that is kept, until Ctrl-C: STATE=folder LISTEN=address,name PAGE=address,name POWER_CUT=1
+	@exec $(BIN)/python -m local.up.run $(UP_OPTIONS)
+
+down: ## stop the cloud of `make up`, which is kept: STATE=folder
+	@$(BIN)/python -m local.up.down $(STATE_OPTION)
+
+up-service: setup ## let systemd run `make up`, also after a reboot; options as for up, REMOVE=1
+	@$(BIN)/python -m local.up.service $(UP_OPTIONS) $(if $(REMOVE),--remove)
+
+up-password: setup ## set the password of the page that PAGE= opens: STATE=folder
+	@$(BIN)/python -m local.up.password $(STATE_OPTION)
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder

@@ -153,7 +153,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, Any] | None:
         return operators(event)
     given = variables(AnswerEnvironment)
     queue = DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue)
-    bodies = Bodies(clients.s3(), given.files_bucket)
+    bodies = Bodies(clients.s3(), given.files_bucket, clients.s3_for_robots())
     desk = Desk(work_of, _quota_of, bodies, _reply, queue.keep)
     serve(event, context.invoked_function_arn, desk, time.time())
     return None

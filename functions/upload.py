@@ -129,7 +129,7 @@ def handler(event: dict[str, Any], context: Any) -> None:
     serve(
         event,
         context.invoked_function_arn,
-        bucket=Bucket(clients.s3(), given.files_bucket),
+        bucket=Bucket(clients.s3(), given.files_bucket, clients.s3_for_robots()),
         quota=Quota(
             clients.dynamodb(),
             table=given.robots_table,

@@ -2,32 +2,156 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import ssl
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import trustme
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+
+# A server's certificate in the network, and what is left of it when it gets a new one.
+LASTS_S = 90 * 86_400.0
+RENEWED_S = 30 * 86_400.0
 
 
 class Authority:
-    """Signs certificates that nobody trusts unless told to."""
+    """Signs certificates that nobody trusts unless told to. With a ``folder`` it is kept there."""
 
-    def __init__(self) -> None:
-        self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
+    def __init__(self, folder: Path | None = None) -> None:
+        if folder is None or not (folder / "authority.key").exists():
+            self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
+            if folder is not None:
+                self.write_own(folder / "authority.pem")
+                # The key last: without it both are made anew.
+                write_private(folder / "authority.key", self._authority.private_key_pem.bytes())
+        else:
+            own, key = (folder / f"authority.{kind}" for kind in ("pem", "key"))
+            self._authority = trustme.CA.from_pem(own.read_bytes(), key.read_bytes())
 
-    def write(self, folder: Path, name: str, host: str) -> tuple[Path, Path]:
-        """Write ``<name>.pem`` and ``<name>.key`` for an IP address and return their paths.
+    @property
+    def pem(self) -> str:
+        """The authority's own certificate, which its clients trust."""
+        return self._authority.cert_pem.bytes().decode()
+
+    def write(self, folder: Path, name: str, *hosts: str) -> tuple[Path, Path]:
+        """Write ``<name>.pem`` and ``<name>.key`` for IP addresses and names, and return their paths.
 
         The authority's certificate is behind the other one, so that clients may trust the same file. Only the
         owner may read the key.
         """
-        leaf = self._authority.issue_cert(host, common_name=name)
+        leaf = self.issue(name, *hosts)
         certificate_path, key_path = folder / f"{name}.pem", folder / f"{name}.key"
-        leaf.cert_chain_pems[0].write_to_path(certificate_path)
-        self._authority.cert_pem.write_to_path(certificate_path, append=True)
-        with os.fdopen(os.open(key_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
-            file.write(leaf.private_key_pem.bytes())
+        certificate_path.write_bytes(leaf.cert_chain_pems[0].bytes() + self.pem.encode())
+        write_private(key_path, leaf.private_key_pem.bytes())
         return certificate_path, key_path
+
+    def issue(self, name: str, *hosts: str, lasts_s: float | None = None) -> trustme.LeafCert:
+        """A certificate for IP addresses and names; it ends after ``lasts_s``, or in a thousand years."""
+        end = None if lasts_s is None else datetime.now(timezone.utc) + timedelta(seconds=lasts_s)
+        return self._authority.issue_cert(*hosts, common_name=name, not_after=end)
 
     def write_own(self, path: Path) -> None:
         """Write the authority's own certificate."""
         self._authority.cert_pem.write_to_path(path)
+
+    def signed(self, certificate: x509.Certificate) -> bool:
+        """Whether this authority has signed a certificate."""
+        own = x509.load_pem_x509_certificate(self.pem.encode())
+        try:
+            certificate.verify_directly_issued_by(own)
+        except (ValueError, TypeError, InvalidSignature):
+            return False
+        return True
+
+
+@dataclass(frozen=True)
+class ServerCertificate:
+    """A file with a server's key and certificate, for the hosts by which clients reach the server."""
+
+    authority: Authority
+    path: Path
+    hosts: tuple[str, ...]
+    lasts_s: float = LASTS_S
+    renewed_s: float = RENEWED_S
+
+    @property
+    def name(self) -> str:
+        """The server's name."""
+        return self.path.stem
+
+    def ends_s(self) -> float:
+        """When it ends, since the epoch."""
+        return self._read().not_valid_after_utc.timestamp()
+
+    def renew(self) -> bool:
+        """Write a certificate if there is none, if it ends soon, or if it is for other hosts; whether it
+        did."""
+        if self.path.exists() and self._good():
+            return False
+        leaf = self.authority.issue(self.name, *self.hosts, lasts_s=self.lasts_s)
+        write_private(self.path, leaf.private_key_and_cert_chain_pem.bytes() + self.authority.pem.encode())
+        return True
+
+    def context(self) -> ssl.SSLContext:
+        """A server's context, which takes over a renewed certificate by itself."""
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.load_cert_chain(self.path)
+        loaded = self.path.stat().st_mtime_ns
+
+        def look(_connection: ssl.SSLObject, _name: str | None, context: ssl.SSLContext) -> None:
+            nonlocal loaded
+            # This connection has the old one still. An error here would end it.
+            with suppress(OSError):
+                found = self.path.stat().st_mtime_ns
+                if found != loaded:
+                    context.load_cert_chain(self.path)
+                    loaded = found
+
+        # OpenSSL calls it at every handshake, whether the client names a server or not.
+        context.sni_callback = look
+        return context
+
+    def _good(self) -> bool:
+        try:
+            there = self._read()
+            names = there.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except (ValueError, x509.ExtensionNotFound):
+            return False
+        hosts = {str(one.value) for one in names}
+        left_s = there.not_valid_after_utc.timestamp() - datetime.now(timezone.utc).timestamp()
+        return hosts == set(self.hosts) and left_s > self.renewed_s and self.authority.signed(there)
+
+    def _read(self) -> x509.Certificate:
+        return x509.load_pem_x509_certificate(self.path.read_bytes())
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """Write a file that only its owner can read; a reader sees the old one or the new one."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def is_address(host: str) -> bool:
+    """Whether a host is an IP address, and not a name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def spelled(hosts: Iterable[str]) -> tuple[str, ...]:
+    """Hosts in their one spelling, each once."""
+    return tuple(
+        dict.fromkeys(str(ipaddress.ip_address(one)) if is_address(one) else one.lower() for one in hosts)
+    )

@@ -4,19 +4,15 @@
         embedded.cloud.client("dynamodb")...
 
 It writes below its folder only and stops on exit what it has started. Every socket listens on loopback,
-unless the caller gives another host.
+but for the two that robots need with ``listen``.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import secrets
-import shutil
 import signal
-import socket
 import ssl
 import sys
 import urllib.error
@@ -37,20 +33,23 @@ from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
+from iort_station.kept import LEDGER
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
 from local import patched
-from local.certificates import Authority
+from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
+from local.network.file_door import FileDoor
+from local.network.listen import Listen
 from local.processes import Child
 from local.pubnub.standin import PubNubStandIn
 from local.relay import Relay
+from local.state import StateFolder
 
 FOLDER = ROOT / EMBEDDED.parent
 
 _REGION = "eu-west-1"
-_LEAST_FREE_BYTES = 500 * 1024 * 1024
 _READY_S = 120.0
 _POLL_S = 0.05
 
@@ -62,8 +61,13 @@ class EmbeddedCloud:
 
     With ``live="iot"`` it has nothing of PubNub: no stand-in, no Lambda 1, neither `pubnub` nor `keys`.
 
-    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub`` and ``relay``; the others are free ports. ``progress``
-    is called with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
+    A ``kept`` cloud goes on from what its folder has, and what it acknowledges survives the end of its
+    processes; with ``power_cut`` that of the machine, too. ``listen`` opens the broker and the files to a
+    network. With ``journal`` the emulator writes its log to our own output.
+
+    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub``, ``relay`` and ``files``; the others are free ports.
+    ``progress`` is called with the name of each step when it begins. `__enter__` raises `LocalError` if it
+    cannot start.
     """
 
     def __init__(
@@ -75,10 +79,20 @@ class EmbeddedCloud:
         host: str = "127.0.0.1",
         ports: dict[str, int] | None = None,
         progress: Progress = lambda _step: None,
+        kept: bool = False,
+        power_cut: bool = False,
+        listen: Listen | None = None,
+        journal: bool = False,
     ) -> None:
         self.folder, self.namespace, self.host = folder, namespace, host
-        self.live = live
-        self._ports, self._progress = ports or {}, progress
+        self.live, self.kept, self.listen = live, kept, listen
+        self.state = StateFolder(folder, kept=kept)
+        self.ports = ports or {}
+        self.authority: Authority
+        self.certificates: list[ServerCertificate] = []
+        self.ledger = folder / LEDGER
+        self.power_cut, self._journal = power_cut, journal
+        self._progress = progress
         self._exit = ExitStack()
         self.cloud: Cloud
         self.pubnub: PubNubStandIn
@@ -99,37 +113,77 @@ class EmbeddedCloud:
         self._exit.close()
 
     def _start(self) -> None:
-        self._take_folder()
+        self.state.take(self._exit)
         without_proxy(self.host)
-        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub", "relay")}
-        certificate, key = Authority().write(self.folder, "gateway", self.host)
+        self.ports = self._find_ports()
+        self.authority = Authority(self.folder if self.kept else None)
+        # Only this machine reaches the gateway, and it reads its certificate once.
+        certificate, key = self.authority.write(self.folder, "gateway", self.host)
+        robots = self.listen.hosts if self.listen else (self.host,)
+        broker = self.certificate("broker", robots)
         self.cloud = Cloud(
             namespace=self.namespace,
             region=_REGION,
-            endpoint_url=f"https://{self.host}:{ports['gateway']}",
+            endpoint_url=f"https://{self.host}:{self.ports['gateway']}",
             ca_bundle=str(certificate),
             access_key_id="test",
             secret_access_key="test",  # noqa: S106 - the emulator's name for its root user
-            mqtt_host=self.host,
-            mqtt_port=ports["mqtt"],
+            mqtt_host=self.listen.host if self.listen else self.host,
+            mqtt_port=self.ports["mqtt"],
+            root_ca_pem=self.authority.pem,
         )
         self._progress("emulator")
-        self.start_emulator(certificate, key)
-        root_ca = self._get("/_ministack/iot/ca.pem").decode()
-        # Robots also send files to the gateway, which has a certificate of its own.
-        self.cloud = replace(self.cloud, root_ca_pem=root_ca + certificate.read_text())
+        self.start_emulator(certificate, key, broker)
         gateway = self.cloud.endpoint_url or ""
-        relay = Relay(self.host, ports["relay"], gateway=gateway, authority=str(certificate))
+        relay = Relay(self.host, self.ports["relay"], gateway=gateway, authority=str(certificate))
         self._exit.enter_context(relay)
         self.cloud = replace(self.cloud, websocket=relay.url)
         if self.live == PUBNUB:
-            self._start_pubnub(ports["pubnub"])
-        deploy(self.cloud, self.folder, self._progress, live=self.live)
+            self._start_pubnub(self.ports["pubnub"])
+        deploy(self.cloud, self.folder, self._progress, live=self.live, kept=self.kept)
         if self.live == PUBNUB:
             keys.store(self.cloud, self.keys)
         self._warm_up()
+        if self.listen:
+            door = FileDoor(
+                self.listen.address,
+                self.ports["files"],
+                gateway=gateway,
+                authority=certificate,
+                bucket=self.cloud.output("storage", "FilesBucket"),
+                certificate=self.certificate("files", self.listen.hosts),
+            )
+            self._exit.enter_context(door)
         self.cloud.save(self.folder / EMBEDDED.name)
         self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
+
+    def _find_ports(self) -> dict[str, int]:
+        inside = dict.fromkeys(("gateway", "mqtt", "pubnub", "relay"), self.host)
+        # What robots connect to.
+        outside = dict.fromkeys(("mqtt", "files"), self.listen.address) if self.listen else {}
+        return {
+            name: self.state.port(name, host, self.ports.get(name, 0))
+            for name, host in {**inside, **outside}.items()
+        }
+
+    def certificate(self, name: str, hosts: tuple[str, ...]) -> ServerCertificate:
+        """A server's certificate, for as long as this cloud runs: see `renew`."""
+        made = ServerCertificate(self.authority, self.folder / f"{name}.pem", hosts)
+        made.renew()
+        self.certificates.append(made)
+        return made
+
+    def renew(self) -> bool:
+        """Renew the certificates that end soon; whether there was one. Servers notice a new file by
+        themselves."""
+        renewed = [one.renew() for one in self.certificates]
+        return any(renewed)
+
+    @property
+    def files_url(self) -> str:
+        """Where robots in the network store files and get answers."""
+        host = self.listen.in_url if self.listen else self.host
+        return f"https://{host}:{self.ports['files']}"
 
     @property
     def page_ports(self) -> list[int]:
@@ -147,43 +201,8 @@ class EmbeddedCloud:
             publish_key=publish_key, subscribe_key=subscribe_key, origin=self.pubnub.origin, tls=False
         )
 
-    def _take_folder(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(self.folder).free < _LEAST_FREE_BYTES:
-            raise LocalError(f"{self.folder} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
-        # The file stays open and locked while this cloud runs.
-        lock = self._exit.enter_context((self.folder.parent / f"{self.folder.name}.lock").open("a+"))
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            lock.seek(0)
-            owner = lock.read().strip()
-            raise LocalError(
-                f"an embedded cloud is already running in {self.folder} (process {owner}): "
-                f"use it, or stop it with Ctrl-C in its terminal or `kill {owner}`"
-            ) from error
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
-        # Files of an earlier run remain after a kill -9.
-        shutil.rmtree(self.folder)
-        (self.folder / "tmp").mkdir(parents=True, mode=0o700)
-
-    def _port(self, name: str) -> int:
-        wanted = self._ports.get(name, 0)
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((self.host, wanted))
-            except OSError as error:
-                if error.errno == errno.EADDRINUSE:
-                    raise LocalError(f"port {wanted} ({name}) is in use: give another, or none") from error
-                raise LocalError(f"cannot listen on {self.host}:{wanted} ({name}): {error}") from error
-            return int(probe.getsockname()[1])
-
-    def start_emulator(self, certificate: Path, key: Path) -> None:
+    def start_emulator(self, certificate: Path, key: Path, broker: ServerCertificate) -> None:
         """Start the emulator and wait until it is ready."""
-        gateway = (self.cloud.endpoint_url or "").rsplit(":", 1)[-1]
         environment = {
             # Not our own environment: the functions would inherit the operator's credentials.
             "PATH": os.environ.get("PATH", os.defpath),
@@ -195,8 +214,12 @@ class EmbeddedCloud:
             "BIND_HOST": self.host,
             "MINISTACK_HOST": self.host,
             "MINISTACK_REGION": _REGION,
-            "GATEWAY_PORT": gateway,
-            "IOT_MTLS_PORT": str(self.cloud.mqtt_port),
+            "GATEWAY_PORT": str(self.ports["gateway"]),
+            "IOT_MTLS_PORT": str(self.ports["mqtt"]),
+            "IOT_MTLS_HOST": self.listen.address if self.listen else self.host,
+            "IORT_BROKER_CERTIFICATE": str(broker.path),
+            **(self._kept_variables() if self.kept else {}),
+            **({"ROBOTS_S3_ENDPOINT": self.files_url} if self.listen else {}),
             "SFTP_ENABLED": "0",
             "USE_SSL": "1",
             "MINISTACK_SSL_CERT": str(certificate),
@@ -210,8 +233,8 @@ class EmbeddedCloud:
             [sys.executable, "-m", "local.emulator"],
             environment=environment,
             cwd=ROOT,
-            log=self.folder / "emulator.log",
-            # It has no state to save, and its workers end with it.
+            log=None if self._journal else self.folder / "emulator.log",
+            # What it must not lose is on the disk already, and its workers end with it.
             orphaned=signal.SIGKILL,
         )
         self._exit.callback(self.emulator.kill)
@@ -225,6 +248,14 @@ class EmbeddedCloud:
             else:
                 return
         raise LocalError(f"the emulator was not ready after {_READY_S:.0f} s:\n{self.emulator.tail()}")
+
+    def _kept_variables(self) -> dict[str, str]:
+        return {
+            "IORT_LEDGER": str(self.ledger),
+            "IORT_LEDGER_SYNC": "full" if self.power_cut else "normal",
+            # For weeks, at dozens of requests a second.
+            "LOG_LEVEL": "WARNING",
+        }
 
     def _get(self, path: str) -> bytes:
         context = ssl.create_default_context(cafile=self.cloud.ca_bundle)

@@ -23,8 +23,11 @@ _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.tx
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract", "analysis/iort_analysis")
 
 
-def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None], *, live: str = PUBNUB) -> None:
-    """Bootstrap and deploy every stack, with the way ``live`` to the page; logs go into ``folder``.
+def deploy(
+    cloud: Cloud, folder: Path, progress: Callable[[str], None], *, live: str = PUBNUB, kept: bool = False
+) -> None:
+    """Bootstrap and deploy every stack, with the way ``live`` to the page; logs go into ``folder``. What a
+    ``kept`` cloud has already is not deployed again.
 
     Raises `LocalError` if that fails.
     """
@@ -45,7 +48,26 @@ def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None], *, live:
         cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *given)
 
     stacks = assembly(ROOT, ROOT / "build" / "assembly", settings=" ".join(context), synthesize=synthesize)
+    if kept and _deployed(cloud) == stacks.name:
+        return
     cdk.put(stacks, account=_ACCOUNT)
+    if kept:
+        name = _marker(cloud.namespace)
+        cloud.client("ssm").put_parameter(Name=name, Value=stacks.name, Type="String", Overwrite=True)
+
+
+def _deployed(cloud: Cloud) -> str | None:
+    """The assembly that a kept cloud has; it is told in the cloud itself, so that a restored backup has its
+    own."""
+    ssm = cloud.client("ssm")
+    try:
+        return str(ssm.get_parameter(Name=_marker(cloud.namespace))["Parameter"]["Value"])
+    except ssm.exceptions.ParameterNotFound:
+        return None
+
+
+def _marker(namespace: str) -> str:
+    return f"/{namespace}/assembly"
 
 
 class CommandLine:

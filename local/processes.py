@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from local.errors import LocalError
@@ -19,7 +20,7 @@ _LOG_TAIL_LINES = 15
 
 
 class Child:
-    """A process in a session of its own, with its output in a log file.
+    """A process in a session of its own, with its output in a log file, or in our own output without one.
 
     It gets the signal ``orphaned`` if we end without stopping it.
     """
@@ -31,11 +32,16 @@ class Child:
         *,
         environment: Mapping[str, str],
         cwd: Path,
-        log: Path,
+        log: Path | None,
         orphaned: signal.Signals = signal.SIGTERM,
     ) -> None:
         self.name, self.log = name, log
-        with log.open("wb") as output:
+        with ExitStack() as stack:
+            output = None
+            if log is not None:
+                log.write_bytes(b"")
+                # To its end, wherever that is: see `shorten_log`.
+                output = stack.enter_context(log.open("ab"))
             try:
                 self._process = subprocess.Popen(  # noqa: S603 - the command is ours
                     list(command),
@@ -73,8 +79,16 @@ class Child:
 
     def tail(self) -> str:
         """The last lines of its log."""
+        if self.log is None:
+            return "  (its output is above)"
         lines = self.log.read_text(errors="replace").splitlines()[-_LOG_TAIL_LINES:]
         return "\n".join(f"  {line[:300]}" for line in lines) + f"\n  ({self.log})"
+
+    def shorten_log(self, most_bytes: int) -> None:
+        """Begin the log anew once it is larger; one older part is kept, as ``<log>.1``."""
+        if self.log is not None and self.log.stat().st_size > most_bytes:
+            shutil.copyfile(self.log, f"{self.log}.1")
+            os.truncate(self.log, 0)
 
     def interrupt(self) -> None:
         """Send SIGINT, on which it finishes its work."""

@@ -56,43 +56,59 @@ class Relay(BackgroundServer):
             return web.Response(status=403, text="only a page of this machine may connect\n")
         if request.method == "OPTIONS":
             return web.Response(status=204, headers=_CORS)
-        async with ClientSession(connector=TCPConnector(ssl=self._trusts), auto_decompress=False) as session:
-            try:
-                if request.path == "/mqtt":
-                    return await self._socket(request, session)
-                if request.method == "POST" and request.headers.get("X-Amz-Target") in _TARGETS:
-                    return await self._call(request, session)
-            except WSServerHandshakeError as refused:
-                return web.Response(status=refused.status)
-            except ClientError as error:
-                return web.Response(status=502, text=f"the embedded cloud does not answer: {error}\n")
+        if request.path == "/mqtt":
+            return await pass_socket(request, self._gateway, self._trusts)
+        if request.method == "POST" and request.headers.get("X-Amz-Target") in _TARGETS:
+            return await self._call(request)
         return web.Response(status=404)
 
-    async def _socket(self, request: web.BaseRequest, session: ClientSession) -> web.StreamResponse:
-        # The signature covers the Host that the browser sent, and the query as it is.
-        address = URL(f"{self._gateway}{request.raw_path}", encoded=True)
-        asked = [one.strip() for one in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
-        headers = {"Host": request.headers["Host"]}
-        async with session.ws_connect(address, protocols=asked, headers=headers, max_msg_size=0) as there:
+    async def _call(self, request: web.BaseRequest) -> web.StreamResponse:
+        kept = {name: request.headers[name] for name in ("Content-Type", "X-Amz-Target")}
+        try:
+            async with (
+                ClientSession(connector=TCPConnector(ssl=self._trusts), auto_decompress=False) as session,
+                session.post(f"{self._gateway}/", data=await request.read(), headers=kept) as answer,
+            ):
+                return web.Response(
+                    status=answer.status,
+                    body=await answer.read(),
+                    headers={**_CORS, "Content-Type": answer.headers.get("Content-Type", "")},
+                )
+        except ClientError as error:
+            return _silent(error)
+
+
+async def pass_socket(
+    request: web.BaseRequest, gateway: str, trusts: ssl.SSLContext, ended: asyncio.Future[None] | None = None
+) -> web.StreamResponse:
+    """Pass on a WebSocket of the broker's, until either side ends it, or until ``ended`` is done."""
+    # The signature covers the Host that the browser sent, and the query as it is.
+    address = URL(f"{gateway}{request.raw_path}", encoded=True)
+    asked = [one.strip() for one in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+    headers = {"Host": request.headers["Host"]}
+    try:
+        async with (
+            ClientSession(connector=TCPConnector(ssl=trusts)) as session,
+            session.ws_connect(address, protocols=asked, headers=headers, max_msg_size=0) as there,
+        ):
             here = web.WebSocketResponse(protocols=asked, max_msg_size=0)
             await here.prepare(request)
             ways = [asyncio.create_task(_pass_on(*way)) for way in ((here, there), (there, here))]
             try:
-                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait([*ways, *([ended] if ended else [])], return_when=asyncio.FIRST_COMPLETED)
             finally:
                 for way in ways:
                     way.cancel()
                 await here.close()
             return here
+    except WSServerHandshakeError as refused:
+        return web.Response(status=refused.status)
+    except ClientError as error:
+        return _silent(error)
 
-    async def _call(self, request: web.BaseRequest, session: ClientSession) -> web.StreamResponse:
-        kept = {name: request.headers[name] for name in ("Content-Type", "X-Amz-Target")}
-        async with session.post(f"{self._gateway}/", data=await request.read(), headers=kept) as answer:
-            return web.Response(
-                status=answer.status,
-                body=await answer.read(),
-                headers={**_CORS, "Content-Type": answer.headers.get("Content-Type", "")},
-            )
+
+def _silent(error: ClientError) -> web.Response:
+    return web.Response(status=502, text=f"the embedded cloud does not answer: {error}\n")
 
 
 async def _pass_on(source: _Side, target: _Side) -> None:

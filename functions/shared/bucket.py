@@ -24,10 +24,10 @@ class Part(NamedTuple):
 
 
 class Bucket:
-    """The files' bucket."""
+    """The files' bucket. ``signer`` signs robots' addresses, unless ``client`` does."""
 
-    def __init__(self, client: S3Client, name: str) -> None:
-        self._client, self._name = client, name
+    def __init__(self, client: S3Client, name: str, signer: S3Client | None = None) -> None:
+        self._client, self._name, self._signer = client, name, signer or client
 
     def has(self, key: str) -> bool:
         """Whether an object with the key exists."""
@@ -128,7 +128,7 @@ class Bucket:
         self._client.abort_multipart_upload(Bucket=self._name, Key=key, UploadId=upload_id)
 
     def _sign(self, operation: str, **parameters: Any) -> str:
-        url: str = self._client.generate_presigned_url(
+        url: str = self._signer.generate_presigned_url(
             operation, Params={"Bucket": self._name, **parameters}, ExpiresIn=UPLOAD_URL_S
         )
         return url

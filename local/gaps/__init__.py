@@ -15,6 +15,7 @@ from typing import Protocol, cast
 NAMES = (
     "broker.client_certificate",
     "broker.https_port",
+    "broker.server_certificate",
     "functions.async_invocations",
     "functions.stream_retries",
     "functions.log_end",

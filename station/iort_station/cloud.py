@@ -80,8 +80,9 @@ class Cloud:
         return cloud
 
     def save(self, path: Path) -> None:
-        """Write the file that `load` reads."""
-        path.write_text(json.dumps(asdict(self)))
+        """Write the file that `load` reads; it has a secret."""
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file)
 
     @cached_property
     def _session(self) -> boto3.Session:

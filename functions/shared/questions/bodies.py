@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 
 class Bodies:
-    """Reads questions from the bucket, and writes answers there."""
+    """Reads questions from the bucket, and writes answers there. ``signer`` signs their addresses, unless
+    ``client`` does."""
 
-    def __init__(self, client: S3Client, bucket: str) -> None:
-        self._client, self._bucket = client, bucket
+    def __init__(self, client: S3Client, bucket: str, signer: S3Client | None = None) -> None:
+        self._client, self._bucket, self._signer = client, bucket, signer or client
 
     def read(self, robot: str, question: Question, content: Content) -> Mapping[str, Any]:
         """The body of a question; raises `RefusedError`. A robot can name only its own files."""
@@ -48,7 +49,7 @@ class Bodies:
         key = f"{RESULTS_PREFIX}{ASK_FOLDER}/{robot}/{request_id}.json"
         self._client.put_object(Bucket=self._bucket, Key=key, Body=text, ContentType="application/json")
         place = {"Bucket": self._bucket, "Key": key}
-        url = self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=ANSWER_URL_S)
+        url = self._signer.generate_presigned_url("get_object", Params=place, ExpiresIn=ANSWER_URL_S)
         return Content(url, hashlib.sha256(text).hexdigest(), len(text))
 
 

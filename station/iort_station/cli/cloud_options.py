@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError
 
+from iort_station import kept
 from iort_station.cli.words import say
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud, find_embedded
 from iort_station.errors import StationError
@@ -36,12 +37,12 @@ class CloudOptions:
         Raises `StationError` if none runs and AWS' credentials are missing.
         """
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
-        embedded = self.embedded or find_embedded(Path.cwd())
+        embedded = self.embedded or find_embedded(Path.cwd()) or _kept()
         if self.local and embedded is None:
             raise StationError(
-                f"no embedded cloud is running: {Path.cwd()} and the folders above it have no {EMBEDDED}. "
-                "`make demo` starts one in a checkout of iort; --embedded or "
-                f"{EMBEDDED_VARIABLE} names its file from anywhere else"
+                f"no embedded cloud is running: {Path.cwd()} and the folders above it have no {EMBEDDED}, "
+                f"and {kept.folder()} no {kept.CLOUD}. `make up` or `make demo` starts one in a checkout of "
+                f"iort; --embedded or {EMBEDDED_VARIABLE} names its file from anywhere else"
             )
         if embedded and (self.local or (not said and embedded.exists())):
             if not self.local:
@@ -56,6 +57,13 @@ class CloudOptions:
             raise StationError(
                 f"{error}. No embedded cloud runs here either; `make demo` starts one"
             ) from error
+
+    def means_kept(self, folder: Path) -> bool:
+        """Whether the cloud of `make up` in this folder is meant, be it up or not."""
+        if self.embedded is not None:
+            return self.embedded.absolute().parent == folder
+        said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
+        return folder.is_dir() and (self.local or not said) and find_embedded(Path.cwd()) is None
 
     def account(self, *, region: str) -> Cloud:
         """An AWS account, never an embedded cloud; ``region`` is the default.
@@ -72,6 +80,12 @@ class CloudOptions:
         return replace(cloud, region=named or region).check()
 
 
+def _kept() -> Path | None:
+    """The file of the cloud of `make up`; None if it is not up."""
+    path = kept.folder() / kept.CLOUD
+    return path if path.is_file() else None
+
+
 def _alive(cloud: Cloud, path: Path) -> Cloud:
     """The embedded cloud; raises `StationError` if it has ended without removing its file."""
     address = urlsplit(cloud.endpoint_url or "")
@@ -79,6 +93,7 @@ def _alive(cloud: Cloud, path: Path) -> Cloud:
         socket.create_connection((address.hostname or "", address.port or 0), _CONNECT_S).close()
     except OSError as error:
         raise StationError(
-            f"the embedded cloud of {path} does not answer: was it killed? `make demo` starts another"
+            f"the embedded cloud of {path} does not answer: was it killed? `make up` or `make "
+            "demo` starts one"
         ) from error
     return cloud

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import typer
 
 from iort_contract.catalog.derived import DERIVED
+from iort_station import kept
 from iort_station.cli import completion
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
@@ -49,6 +50,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. A script must give it.")]
+State = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="IORT_STATE", metavar="FOLDER", help="The state folder of `make up`. Default: the user's own."
+    ),
+]
 Token = Annotated[
     str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
 ]
@@ -70,6 +77,14 @@ SHORT = "5m"
 def to_file(help_text: str) -> Any:
     """The option --out, where a verb writes; its help says what."""
     return typer.Option("--out", "-o", help=help_text)
+
+
+def state_folder(context: typer.Context, state: Path | None) -> Path:
+    """The state folder of the kept cloud that is meant: --state, that of --embedded, or the user's own."""
+    embedded: Path | None = context.obj.embedded
+    if state is None and embedded is not None and (embedded.parent / kept.UP).exists():
+        state = embedded.parent
+    return (state or kept.folder()).expanduser().absolute()
 
 
 def agreed(question: str, *, yes: bool) -> None:

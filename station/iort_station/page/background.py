@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import ssl
 import threading
 from types import TracebackType
 from typing import Any
@@ -17,12 +18,13 @@ from typing_extensions import Self
 class BackgroundServer:
     """Calls `handle` for every request, from `start` to `stop` or within a ``with`` block.
 
-    ``port=0`` takes a free port. ``options`` are those of `aiohttp.web.Server`.
+    ``port=0`` takes a free port. With ``tls`` it speaks HTTPS. ``options`` are those of `aiohttp.web.Server`.
     """
 
-    def __init__(self, host: str, port: int, **options: Any) -> None:
+    def __init__(self, host: str, port: int, *, tls: ssl.SSLContext | None = None, **options: Any) -> None:
         self.host, self.port = host, port
-        self._options = options
+        self._tls, self._options = tls, options
+        self._scheme = "http" if tls is None else "https"
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stopping: asyncio.Event
@@ -71,7 +73,7 @@ class BackgroundServer:
         )
         runner = web.ServerRunner(server, shutdown_timeout=1)
         await runner.setup()
-        await web.SockSite(runner, listening).start()
+        await web.SockSite(runner, listening, ssl_context=self._tls).start()
         started.set()
         await self._stopping.wait()
         # Stop accepting before dropping connections: asyncio loses one that comes while it closes.

@@ -14,10 +14,12 @@ import ipaddress
 import json
 import re
 import secrets
+import ssl
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeVar
@@ -47,6 +49,7 @@ from iort_station.page.page import BUILT, TYPES, built_files, config
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
+Vehicles = Mapping[str, Mapping[str, float]]
 _T = TypeVar("_T")
 
 # A connection without a request is closed after this time.
@@ -67,11 +70,12 @@ class PageServer(BackgroundServer):
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
     from the parameters of the request. ``open_actions`` change something that everybody who reaches the page
     may change; they need a POST with the page's own origin. ``actions`` need the server's key, too: a browser
-    gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``downloads`` maps
-    a name to the function that writes the file ``/<name>``. ``broker`` is the broker's
-    address for WebSockets, without a path. The server accepts a Host that is localhost, an
-    address or one of ``names``, and no other. Raises `StationError` if the page is not built, if the port is
-    in use, and for a configuration that it must not serve.
+    gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``vehicles`` may be
+    a function, for a server during which robots come. ``downloads`` maps a name to the function that writes
+    the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server
+    accepts a Host that is localhost, an address or one of ``names``, and no other. With a ``context`` it
+    speaks HTTPS. Raises `StationError` if the page is not built, if the port is in use, and for a
+    configuration that it must not serve.
     """
 
     def __init__(
@@ -84,7 +88,7 @@ class PageServer(BackgroundServer):
         subscribe_key: str = "",
         origin: str = PUBNUB_ORIGIN,
         tls: bool = True,
-        vehicles: Mapping[str, Mapping[str, float]] | None = None,
+        vehicles: Vehicles | Callable[[], Vehicles] | None = None,
         token: str = "",
         answers: Mapping[str, Answer] | None = None,
         actions: Mapping[str, Answer] | None = None,
@@ -96,8 +100,9 @@ class PageServer(BackgroundServer):
         port: int = 0,
         names: Iterable[str] = (),
         built: Path = BUILT,
+        context: ssl.SSLContext | None = None,
     ) -> None:
-        super().__init__(host, port, keepalive_timeout=IDLE_S)
+        super().__init__(host, port, tls=context, keepalive_timeout=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
         keyed, free = actions or {}, open_actions or {}
         self._actions = {f"/{name}.json": action for name, action in {**free, **keyed}.items()}
@@ -110,14 +115,14 @@ class PageServer(BackgroundServer):
         self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._free_to_write = asyncio.Semaphore(MOST_DOWNLOADS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
-        told = config(
+        told = partial(
+            config,
             namespace=namespace,
             live=live,
             identity=identity,
             subscribe_key=subscribe_key,
             origin=origin,
             tls=tls,
-            vehicles=vehicles,
             token=token,
             answers=bool(answers),
             actions=[*free, *keyed],
@@ -134,7 +139,10 @@ class PageServer(BackgroundServer):
             for name, content in built_files(built).items()
         }
         self._files["/"] = self._files["/index.html"]
-        self._files["/config.json"] = as_json(told)
+        if callable(vehicles):
+            self._answers["/config.json"] = lambda _: told(vehicles=vehicles())
+        else:
+            self._files["/config.json"] = as_json(told(vehicles=vehicles))
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
@@ -147,7 +155,7 @@ class PageServer(BackgroundServer):
     def url(self) -> str:
         """The page's address for a browser on this machine."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)  # noqa: S104 - compared
-        return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
+        return f"{self._scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
     def invitation(self, view: str = "#/") -> str:
         """An address that gives one browser the key, once; the page's plain address if no action needs it."""

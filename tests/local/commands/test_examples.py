@@ -23,7 +23,10 @@ from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
 # Laps need minutes of driving, and `iort drive` a terminal.
-NOT_RUN = {"adopt", "dashboard", "drive", "files empty", "laps", "pubnub", "robots revoke-claims", "site"}
+NOT_RUN = {
+    *("adopt", "backup", "dashboard", "drive", "files empty", "laps", "pubnub", "restore"),
+    *("robots revoke-claims", "site"),
+}
 # Runs until Ctrl-C.
 ENDLESS = "iort watch"
 # These need a car that drives; audit counts what is still in a car.

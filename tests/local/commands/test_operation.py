@@ -1,4 +1,4 @@
-"""`iort-agent check`, `status` and the agent's own stream, on the embedded cloud."""
+"""`iort-agent check`, `status`, the agent's own stream and `iort doctor`, on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_check_reports_a_revoked_certificate(embedded, bundle):
     car = bundle()
     set_status(embedded, car.robot, "REVOKED")
     found = findings(car.config, status=1)
-    assert found["certificate"]["level"] == found["TLS"]["level"] == OK
+    assert found["certificate"]["level"] == found["server certificate"]["level"] == OK
     assert found["broker"]["level"] == "fail"
     assert "not active" in found["broker"]["todo"]
 
@@ -71,12 +71,22 @@ def test_the_check_reports_a_wrong_authority_a_readable_key_and_failing_sources(
     shutil.copy(tmp_path / "certificate.pem", car.folder / "root-ca.pem")
     (car.folder / "private.key").chmod(0o644)
     found = findings(car.config, status=1)
-    assert found["TLS"]["level"] == "fail"
-    assert "root_ca" in found["TLS"]["todo"]
+    assert found["server certificate"]["level"] == "fail"
+    assert "root_ca" in found["server certificate"]["todo"]
     assert found["key's mode"]["level"] == "warn"
     vesc, rosbridge = (one for what, one in found.items() if what.startswith("source"))
     assert "is not there" in vesc["text"]
     assert rosbridge["level"] == "fail"
+
+
+def test_the_doctor_of_a_cloud_that_is_thrown_away(iort):
+    asked = iort("doctor", "--json")
+    found = {one["what"]: one for one in json.loads(asked.stdout)}
+    assert asked.exit_code == 0, found
+    assert list(found) == ["machine", "stacks", "robots", "summaries", "alarms"]
+    assert found["machine"]["level"] == "warn"
+    assert "`make up`" in found["machine"]["todo"]
+    assert "are connected" in found["robots"]["text"]
 
 
 @pytest.fixture

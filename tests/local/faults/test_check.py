@@ -13,7 +13,6 @@ from iort_agent.verbs import tls, way
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, REFUSE, Proxy
-from tests.local.faults.test_uplink import set_status
 
 
 @pytest.fixture
@@ -54,14 +53,3 @@ def test_a_broken_network_is_named(
     failed = go(bundle(), proxy)["TLS"]
     assert failed.level == FAIL
     assert text in failed.text
-
-
-def test_a_certificate_that_the_cloud_does_not_accept(
-    embedded: EmbeddedCloud, bundle: Callable[..., robots.Bundle], proxy: Proxy
-) -> None:
-    car = bundle()
-    set_status(embedded, car.robot, "INACTIVE")
-    findings = go(car, proxy)
-    assert findings["server certificate"].level == OK
-    assert findings["broker"].level == FAIL
-    assert "not active" in findings["broker"].todo

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import hashlib
 import inspect
 import json
 import os
@@ -278,3 +279,15 @@ def unsigned_websocket() -> bool:
     """Ask whether an unsigned upgrade is refused where requests are checked."""
     with patch.object(ministack_app, "AUTH", True):
         return iot._ws_handshake_check(HANDSHAKE) is None
+
+
+def function_credentials() -> bool:
+    """Derive a secret from what is no secret."""
+    config = {
+        "FunctionArn": "arn:aws:lambda:eu-west-1:000000000000:function:one",
+        "Role": "arn:aws:iam::000000000000:role/one",
+    }
+    digest = hashlib.sha256("{FunctionArn}:{Role}".format(**config).encode()).hexdigest()
+    derived = hashlib.sha256(f"secret:{digest}".encode()).hexdigest()
+    with patch.object(ministack_app, "AUTH", True):
+        return bool(lambda_runtime.execution_credentials(config)["AWS_SECRET_ACCESS_KEY"] == derived)

@@ -14,6 +14,7 @@ from ministack.services import cloudwatch, iot, lambda_svc
 from local import gaps
 from local.deployment import ROOT
 from local.gaps.functions import async_invocations
+from tests.local.gaps import gap_probes
 
 FOLDER = ROOT / "local" / "gaps"
 FORM = re.compile(
@@ -144,3 +145,7 @@ def test_an_event_that_breaks_the_emulator_goes_to_its_destination(monkeypatch):
     ((destination, name, event, result),) = told
     assert (destination, name, event) == ("arn:queue", "live", {"n": 1})
     assert result["body"]["errorMessage"] == "OSError: no space left on device"
+
+
+def test_a_functions_credentials_cannot_be_derived():
+    assert not gap_probes.function_credentials()

@@ -35,6 +35,19 @@ def test_every_listener_of_the_emulator_is_on_loopback(embedded):
     assert {address for address, _ in found} == {"127.0.0.1"}
 
 
+def test_the_broker_takes_over_a_renewed_certificate(embedded):
+    def shown():
+        return ssl.get_server_certificate((embedded.host, embedded.cloud.mqtt_port)).strip()
+
+    (broker,) = embedded.certificates
+    before = shown()
+    assert before in broker.path.read_text()
+    broker.path.unlink()
+    assert embedded.renew()
+    assert before not in broker.path.read_text()
+    assert shown() in broker.path.read_text()
+
+
 WAIT_S = 0.5
 # MQTT 3.1.1, clean session, a keep-alive of 60 s, client id "a"; and its answer, accepted.
 CONNECT = b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a"

@@ -1,0 +1,132 @@
+"""The folder of an embedded cloud: a throw-away one begins empty, a kept one goes on."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import secrets
+import shutil
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from local.certificates import write_private
+from local.errors import LocalError
+
+# Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.
+VERSION = 1
+_LEAST_FREE_BYTES = 500 * 1024 * 1024
+# The ports that a new kept cloud takes if they are free; the others are any free ones.
+_USUAL = {"mqtt": 8883, "files": 8443, "page": 8080, "network page": 8444}
+
+
+class StateFolder:
+    """The folder, once `take` has locked it."""
+
+    def __init__(self, path: Path, *, kept: bool) -> None:
+        self.path, self.kept = path, kept
+        self._settings_path = path / "settings.json"
+
+    def take(self, stack: ExitStack) -> None:
+        """Lock the folder until the stack closes, and clean it. Raises `LocalError` if that is not
+        possible."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(self.path).free < _LEAST_FREE_BYTES:
+            raise LocalError(f"{self.path} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
+        # The file stays open and locked while this cloud runs.
+        lock = stack.enter_context(lock_of(self.path).open("a+"))
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            lock.seek(0)
+            owner = lock.read().strip()
+            stop = "`make down`" if self.kept else f"Ctrl-C in its terminal or `kill {owner}`"
+            raise LocalError(
+                f"an embedded cloud is already running in {self.path} (process {owner}): "
+                f"use it, or stop it with {stop}"
+            ) from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        if self.kept:
+            self._check_version()
+            self.path.chmod(0o700)
+            # Files of an earlier run remain after a kill -9.
+            shutil.rmtree(self.path / "tmp", ignore_errors=True)
+        else:
+            shutil.rmtree(self.path)
+        (self.path / "tmp").mkdir(parents=True, mode=0o700)
+
+    def _check_version(self) -> None:
+        version = self.path / "VERSION"
+        if not version.exists():
+            if unknown := [one.name for one in self.path.iterdir()]:
+                raise LocalError(
+                    f"STATE must be an empty folder or one of `make up`, got {self.path} with {unknown[0]}"
+                )
+            version.write_text(f"{VERSION}\n")
+        found = version.read_text().strip()
+        if not found.isdecimal() or int(found) > VERSION:
+            raise LocalError(
+                f"{self.path} must have version {VERSION} or older, got {found}: a newer iort wrote it; "
+                "update this checkout, or name another folder with STATE="
+            )
+
+    def settings(self) -> dict[str, Any]:
+        """What a kept cloud remembers of its last start."""
+        if not self.kept or not self._settings_path.exists():
+            return {}
+        found: dict[str, Any] = json.loads(self._settings_path.read_text())
+        return found
+
+    def remember(self, **settings: Any) -> None:
+        """Change what `settings` returns."""
+        if self.kept:
+            text = json.dumps({**self.settings(), **settings}, indent=2)
+            write_private(self._settings_path, f"{text}\n".encode())
+
+    def port(self, name: str, host: str, wanted: int = 0) -> int:
+        """The port ``wanted``, or the one of the last start, or a free one. Raises `LocalError` if it is in
+        use."""
+        known = self.settings().get("ports", {})
+        asked = wanted or known.get(name, 0)
+        usual = _USUAL.get(name, 0) if self.kept and not asked else 0
+        found = _free(host, usual) if usual else None
+        if found is None:
+            found = _free(host, asked)
+        if found is None:
+            # A kept port is in the cars' bundles.
+            advice = "give another, or none"
+            if asked == known.get(name):
+                advice = f"or choose another in {self._settings_path}"
+            raise LocalError(f"port {asked} ({name}) is in use on {host}: free it, {advice}")
+        self.remember(ports={**known, name: found})
+        return found
+
+    def secret(self, name: str, size: int = 20) -> str:
+        """A random text, the same one at each start of a kept cloud."""
+        path = self.path / name
+        if not path.exists():
+            write_private(path, secrets.token_hex(size).encode())
+        return path.read_text()
+
+
+def lock_of(folder: Path) -> Path:
+    """The file that an embedded cloud locks while it runs; it has its process id."""
+    return folder.parent / f"{folder.name}.lock"
+
+
+def _free(host: str, port: int) -> int | None:
+    """The port, or a free one for 0; None if it is in use."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                return None
+            raise LocalError(f"cannot listen on {host}:{port}: {error}") from error
+        return int(probe.getsockname()[1])

@@ -1,0 +1,69 @@
+"""`make down`: stop the cloud of `make up`, and wait until it has ended."""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from local.errors import LocalError
+from local.state import lock_of
+from local.up.run import add_state
+
+_ENDS_S = 60.0
+_POLL_S = 0.1
+
+
+def main() -> None:
+    """Stop it. The exit status is 0 if it has ended, and 1 otherwise."""
+    parser = argparse.ArgumentParser(
+        prog="make down",
+        usage="make down [STATE=folder]",
+        description="Stop the cloud of `make up`; it is kept.",
+    )
+    add_state(parser)
+    folder = parser.parse_args().state
+    try:
+        stopped = stop(folder)
+    except LocalError as error:
+        sys.exit(f"down: {error}")
+    print(f"stopped; everything is kept in {folder}" if stopped else f"nothing is up in {folder}")  # noqa: T201 - as `make up`
+
+
+def stop(folder: Path) -> bool:
+    """Stop the cloud of a folder; whether one was up. Raises `LocalError` if it does not end."""
+    pid = owner(folder)
+    if pid is None:
+        return False
+    # It may end by itself meanwhile.
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGTERM)
+    deadline = time.monotonic() + _ENDS_S
+    while owner(folder) is not None:
+        if time.monotonic() > deadline:
+            raise LocalError(f"process {pid} has not ended in {_ENDS_S:.0f} s")
+        # It is no child of ours, so nothing tells its end.
+        time.sleep(_POLL_S)
+    return True
+
+
+def owner(folder: Path) -> int | None:
+    """The process that holds a folder's lock, if there is one."""
+    try:
+        with lock_of(folder).open() as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError:
+                return int(lock.read())
+    except (FileNotFoundError, ValueError):
+        pass
+    return None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""The password of the page in the network, who has given it, and how often it may be tried."""
+
+from __future__ import annotations
+
+import ipaddress
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+from argon2 import PasswordHasher
+from argon2.exceptions import InvalidHashError, VerificationError
+
+from local.certificates import write_private
+from local.errors import LocalError
+
+LEAST_CHARACTERS = 10
+_MOST_CHARACTERS = 1_000
+# A session ends after this time without a request, and the oldest one if there are too many.
+SESSION_S = 12 * 3600.0
+_MOST_SESSIONS = 1_000
+# An address may try so often at once, and once more each time these seconds have passed. So may all together.
+TRIES, TRY_S = 5, 30.0
+ALL_TRIES, ALL_TRY_S = 30, 2.0
+_MOST_ADDRESSES = 10_000
+_FILE = "page-password"
+
+
+class Password:
+    """The hash of a password, by argon2id, in a file that only its owner reads."""
+
+    def __init__(self, folder: Path, hasher: PasswordHasher | None = None) -> None:
+        self._path, self._hasher = folder / _FILE, hasher or PasswordHasher()
+
+    def make(self) -> str | None:
+        """Make a random password unless there is one; returns a new one, which nobody can read later."""
+        if self._path.exists():
+            return None
+        new = secrets.token_urlsafe(12)
+        self.set(new)
+        return new
+
+    def set(self, new: str) -> None:
+        """Change the password; raises `LocalError` for one that is too short or too long."""
+        if not LEAST_CHARACTERS <= len(new) <= _MOST_CHARACTERS:
+            raise LocalError(
+                f"the password must have {LEAST_CHARACTERS} to {_MOST_CHARACTERS} characters, got {len(new)}"
+            )
+        write_private(self._path, self._hasher.hash(new).encode())
+
+    def is_right(self, told: str) -> bool:
+        """Whether it is the password; takes a tenth of a second, so that guesses take time."""
+        if len(told) > _MOST_CHARACTERS:
+            return False
+        try:
+            return self._hasher.verify(self._path.read_text(), told)
+        except (VerificationError, InvalidHashError):
+            return False
+
+    def version(self) -> int:
+        """Changes with the password."""
+        return self._path.stat().st_mtime_ns
+
+
+class Sessions:
+    """Browsers that have given the password. The server's loop alone uses it."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._ends: OrderedDict[str, float] = OrderedDict()
+
+    def begin(self) -> str:
+        """A new session's secret name."""
+        name = secrets.token_urlsafe(32)
+        self._ends[name] = self._now() + SESSION_S
+        if len(self._ends) > _MOST_SESSIONS:
+            self._ends.popitem(last=False)
+        return name
+
+    def goes_on(self, name: str) -> bool:
+        """Whether there is such a session; it is used now."""
+        if self._ends.get(name, 0.0) < self._now():
+            self._ends.pop(name, None)
+            return False
+        self._ends[name] = self._now() + SESSION_S
+        self._ends.move_to_end(name)
+        return True
+
+    def end(self, name: str) -> None:
+        """End a session."""
+        self._ends.pop(name, None)
+
+    def end_all(self) -> None:
+        """End every session."""
+        self._ends.clear()
+
+
+class Tries:
+    """How often an address may still try a password."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._of_all = (float(ALL_TRIES), now())
+
+    def wait_s(self, address: str) -> float:
+        """Count a try; returns 0, or the seconds until the next one, and then it must not be made."""
+        now, network = self._now(), _network(address)
+        own = _filled(self._left.get(network, (float(TRIES), now)), now, TRIES, TRY_S)
+        of_all = _filled(self._of_all, now, ALL_TRIES, ALL_TRY_S)
+        wait_s = max((1 - own) * TRY_S, (1 - of_all) * ALL_TRY_S, 0.0)
+        if wait_s > 0:
+            return wait_s
+        self._left[network], self._of_all = (own - 1, now), (of_all - 1, now)
+        self._left.move_to_end(network)
+        if len(self._left) > _MOST_ADDRESSES:
+            self._left.popitem(last=False)
+        return 0.0
+
+
+def _filled(left: tuple[float, float], now: float, most: int, each_s: float) -> float:
+    return min(float(most), left[0] + (now - left[1]) / each_s)
+
+
+def _network(address: str) -> str:
+    """An IPv4 address, or the network of an IPv6 address: whoever has one of it has them all."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    return str(found) if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))

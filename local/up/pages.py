@@ -1,0 +1,79 @@
+"""The pages of a kept cloud: one for this machine, and with ``PAGE=`` one for a network."""
+
+from __future__ import annotations
+
+import ssl
+from contextlib import ExitStack
+from dataclasses import replace
+from types import TracebackType
+from typing import Any
+
+from typing_extensions import Self
+
+from iort_contract.cloud import IOT
+from iort_station.cloud import Cloud
+from iort_station.fleet import registry
+from iort_station.page import control
+from iort_station.page.answers import actions, answers
+from iort_station.page.downloads import downloads
+from iort_station.page.server import PageServer
+from iort_station.page.socket import reaching
+from local.cloud import EmbeddedCloud
+from local.network.listen import Listen
+from local.up.login import Password
+from local.up.network_page import SOCKET, NetworkPage
+
+
+class Pages:
+    """Serves within a ``with`` block. ``new_password`` is set if the network's page has got its first one."""
+
+    def __init__(self, embedded: EmbeddedCloud, listen: Listen | None) -> None:
+        self._embedded, self._listen = embedded, listen
+        self._exit = ExitStack()
+        self.new_password: str | None = None
+        self.here: PageServer
+        self.network: NetworkPage | None = None
+
+    def __enter__(self) -> Self:
+        embedded, listen = self._embedded, self._listen
+        with ExitStack() as stack:
+            port = embedded.state.port("page", embedded.host)
+            self.here = stack.enter_context(PageServer(port=port, **_shown(embedded.cloud)))
+            if listen is not None:
+                port = embedded.state.port("network page", listen.address)
+                password = Password(embedded.folder)
+                self.new_password = password.make()
+                # The broker is at the page's own address, behind the same login.
+                socket = f"wss://{listen.in_url}:{port}{SOCKET}"
+                self.network = stack.enter_context(
+                    NetworkPage(
+                        listen,
+                        port,
+                        password=password,
+                        gateway=embedded.cloud.endpoint_url or "",
+                        trusts=ssl.create_default_context(cafile=embedded.cloud.ca_bundle),
+                        context=embedded.certificate("page", listen.hosts).context(),
+                        **_shown(replace(embedded.cloud, websocket=socket)),
+                    )
+                )
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.close()
+
+
+def _shown(cloud: Cloud) -> dict[str, Any]:
+    """What a page shows and does, as `iort dashboard` on this machine."""
+    return {
+        "namespace": cloud.namespace,
+        **reaching(cloud, IOT),
+        # Robots come while it runs.
+        "vehicles": lambda: registry.vehicles(cloud),
+        "answers": answers(cloud),
+        "downloads": downloads(cloud),
+        "open_actions": actions(cloud),
+        "actions": control.actions(cloud),
+    }

@@ -1,0 +1,40 @@
+"""`make up-password`: set the password of the page in the network; whoever is logged in must log in again."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import sys
+from pathlib import Path
+
+from local.errors import LocalError
+from local.up.login import LEAST_CHARACTERS, Password
+from local.up.run import add_state
+
+
+def main() -> None:
+    """Ask for a password twice, and keep its hash."""
+    parser = argparse.ArgumentParser(
+        prog="make up-password",
+        usage="make up-password [STATE=folder]",
+        description="Set the password of the page in the network.",
+    )
+    add_state(parser)
+    folder = parser.parse_args().state
+    try:
+        _change(folder)
+    except (LocalError, EOFError) as error:
+        sys.exit(f"password: {error or 'nothing was typed'}")
+
+
+def _change(folder: Path) -> None:
+    if not folder.is_dir():
+        raise LocalError(f"{folder} must be a folder of `make up`")
+    new = getpass.getpass(f"New password, at least {LEAST_CHARACTERS} characters: ")
+    if getpass.getpass("Again: ") != new:
+        raise LocalError("the two passwords must be the same")
+    Password(folder).set(new)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""`make up`: the project's stacks in an embedded cloud that is kept, until Ctrl-C or `make down`.
+
+python -m local.up.run --state ~/.local/share/iort/cloud --listen 192.168.1.10,iort.lab
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import signal
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NoReturn
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.cloud import IOT
+from iort_station import kept
+from iort_station.cloud import EMBEDDED_VARIABLE
+from iort_station.errors import StationError
+from local.certificates import write_private
+from local.cloud import EmbeddedCloud
+from local.errors import LocalError
+from local.network.listen import Listen
+from local.state import VERSION, StateFolder
+from local.up import notify
+from local.up.pages import Pages
+
+# Closes again what an earlier start has opened.
+NO = "no"
+_LOOK_S = 1.0
+_RENEW_S = 3600.0
+# An emulator that ends by itself is started again, unless that happens so often in this time.
+_MOST_ENDS, _ENDS_S = 3, 600.0
+_MOST_LOG_BYTES = 20 * 1024 * 1024
+
+
+class _EmulatorError(LocalError):
+    """The emulator ended, and nobody has stopped it."""
+
+
+def main() -> None:
+    """Run until SIGINT, SIGTERM or SIGHUP. The exit status is 0 then, and 1 if the cloud cannot run."""
+    options, stopped = _options(), threading.Event()
+
+    def stop(_signal: int, _frame: object) -> NoReturn:
+        # Python drops an exception that is raised while it forks, so the event is set too.
+        stopped.set()
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, stop)
+    try:
+        _Kept(options, stopped).run()
+    except (LocalError, StationError) as error:
+        sys.exit(f"up: {error}")
+    except (BotoCoreError, ClientError) as error:
+        sys.exit(f"up: the embedded cloud refused a call: {error}")
+    except KeyboardInterrupt:
+        _say("stopped; everything is kept")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="make up",
+        usage="make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1]",
+        description="Run the stacks in a cloud of your own, which is kept.",
+    )
+    add_state(parser)
+    add_network(parser)
+    return parser.parse_args()
+
+
+def add_state(parser: argparse.ArgumentParser) -> None:
+    """The option of every command: the folder."""
+    parser.add_argument(
+        "--state",
+        type=lambda text: Path(text).expanduser().absolute(),
+        default=kept.folder(),
+        metavar="FOLDER",
+        help="where the cloud is kept (default: %(default)s)",
+    )
+
+
+def add_network(parser: argparse.ArgumentParser) -> None:
+    """The options that a start remembers for the next one."""
+    network = f"an address of this machine, and names for it; remembered, until {NO}"
+    parser.add_argument("--listen", metavar="HOSTS", help=f"open broker and files to a network: {network}")
+    parser.add_argument("--page", metavar="HOSTS", help=f"open the page, with a password: {network}")
+    parser.add_argument(
+        "--power-cut",
+        choices=["0", "1"],
+        help="let what was acknowledged survive a power cut, too; remembered",
+    )
+
+
+class _Kept:
+    def __init__(self, options: argparse.Namespace, stopped: threading.Event) -> None:
+        self._options, self._stopped = options, stopped
+        self._state = StateFolder(options.state, kept=True)
+        self._began, self._started_s = time.monotonic(), time.time()
+
+    def run(self) -> None:
+        """Run the cloud, and start it again when its emulator has ended."""
+        ends: list[float] = []
+        while not self._stopped.is_set():
+            try:
+                self._once()
+            except _EmulatorError as ended:  # noqa: PERF203 - once a start
+                ends = [at for at in ends if time.monotonic() - at < _ENDS_S] + [time.monotonic()]
+                if len(ends) >= _MOST_ENDS:
+                    raise LocalError(f"{ended}\nThis was the {len(ends)}th time in a short while") from ended
+                _say(f"{ended}\nIt is started again")
+
+    def _once(self) -> None:
+        settings = self._settings()
+        listen, page = (_listen(settings[name], name.upper()) for name in ("listen", "page"))
+        embedded = EmbeddedCloud(
+            self._state.path,
+            live=IOT,
+            progress=self._step,
+            kept=True,
+            power_cut=settings["power_cut"],
+            listen=listen,
+            # systemd tells a service so that its output is the journal's.
+            journal="JOURNAL_STREAM" in os.environ,
+        )
+        with embedded, Pages(embedded, page) as pages, ExitStack() as stack:
+            self._state.remember(**settings)
+            stack.callback((embedded.folder / kept.UP).unlink, missing_ok=True)
+            self._write(embedded, page)
+            _say(f"\n{self._told(embedded, pages)}\n")
+            notify.tell("READY=1")
+            self._watch(embedded, page)
+
+    def _watch(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
+        renewed = time.monotonic()
+        while not self._stopped.is_set():
+            if embedded.emulator.wait(_LOOK_S) is not None:
+                raise _EmulatorError(f"the emulator has ended:\n{embedded.emulator.tail()}")
+            embedded.emulator.shorten_log(_MOST_LOG_BYTES)
+            if time.monotonic() - renewed > _RENEW_S:
+                renewed = time.monotonic()
+                if embedded.renew():
+                    self._write(embedded, page)
+
+    def _settings(self) -> dict[str, Any]:
+        """The options, and what an earlier start remembers where they say nothing."""
+        options, known = self._options, self._state.settings()
+        given = {"listen": options.listen, "page": options.page}
+        found = {name: known.get(name, NO) if text is None else text for name, text in given.items()}
+        power_cut = known.get("power_cut", False) if options.power_cut is None else options.power_cut == "1"
+        return {**found, "power_cut": power_cut}
+
+    def _write(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
+        up = kept.Up(
+            version=VERSION,
+            versions={
+                "iort": version("iort-station"),
+                "ministack": version("ministack"),
+                "python": platform.python_version(),
+            },
+            started_s=self._started_s,
+            pids={"up": os.getpid(), "emulator": embedded.emulator.pid},
+            ports=embedded.state.settings()["ports"],
+            listen=list(embedded.listen.hosts) if embedded.listen else [],
+            page=list(page.hosts) if page else [],
+            certificates=[
+                kept.Certificate(
+                    name=one.name, file=str(one.path), hosts=list(one.hosts), ends_s=one.ends_s()
+                )
+                for one in embedded.certificates
+            ],
+            ledger=str(embedded.ledger),
+            power_cut=embedded.power_cut,
+        )
+        write_private(embedded.folder / kept.UP, up.text().encode())
+
+    def _step(self, name: str) -> None:
+        _say(f"{time.monotonic() - self._began:5.1f} s  {name}")
+
+    def _told(self, embedded: EmbeddedCloud, pages: Pages) -> str:
+        state = "" if embedded.folder == kept.folder() else f" STATE={embedded.folder}"
+        robots = ".venv/bin/iort robots add car1"
+        if state:
+            robots = f"{EMBEDDED_VARIABLE}={embedded.folder / kept.CLOUD} {robots}"
+        told = [("kept in", str(embedded.folder)), ("page here", pages.here.invitation())]
+        if pages.network is not None:
+            how = f"the password of `make up-password{state}`"
+            if pages.new_password:
+                how = f"password {pages.new_password} (shown once; `make up-password{state}` sets another)"
+            told.append(("page, network", f"{pages.network.url}, {how}"))
+        if embedded.listen:
+            where = f"{embedded.listen.host}:{embedded.ports['mqtt']}"
+            told.append(
+                ("cars", f"connect to {where} on {embedded.listen.address}; files go to {embedded.files_url}")
+            )
+        else:
+            told.append(("cars", "of this machine only; LISTEN=address opens it to the network"))
+        told += [
+            ("a new car", robots),
+            ("to stop", f"Ctrl-C, or `make down{state}`; `make up{state}` goes on"),
+        ]
+        return "\n".join(f"{name:>14}  {text}" for name, text in told)
+
+
+def _listen(text: str, what: str) -> Listen | None:
+    if text == NO:
+        return None
+    listen = Listen.parse(text, what)
+    listen.check(what)
+    return listen
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)  # noqa: T201 - a command's words to its user
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""`make up-service`: `make up` as a service of systemd, which starts it at a boot and after a failure."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from string import Template
+
+from local.deployment import ROOT
+from local.errors import LocalError
+from local.up.run import add_network, add_state
+
+NAME = "iort-cloud.service"
+_UNIT = Template("""\
+# Written by `make up-service`.
+[Unit]
+Description=iort: the laboratory's own cloud
+After=network-online.target
+Wants=network-online.target
+
+[Service]
+Type=notify
+WorkingDirectory=$root
+ExecStart=$command
+${user}Restart=on-failure
+RestartSec=5
+# The first start deploys everything.
+TimeoutStartSec=900
+TimeoutStopSec=60
+KillMode=mixed
+# Only what the cloud needs.
+NoNewPrivileges=yes
+UMask=0077
+
+[Install]
+WantedBy=$wanted
+""")
+
+
+def main() -> None:
+    """Write the unit, and start it: a service of the machine for root, and of the user for others."""
+    parser = argparse.ArgumentParser(
+        prog="make up-service",
+        usage="make up-service [STATE=folder] [LISTEN=...] [PAGE=...] [POWER_CUT=1] [REMOVE=1]",
+        description="Run `make up` as a service of systemd.",
+    )
+    add_state(parser)
+    add_network(parser)
+    parser.add_argument(
+        "--remove", action="store_true", help="stop the service and remove it; the cloud is kept"
+    )
+    parser.add_argument("--print", action="store_true", help="print the unit, and change nothing")
+    options = parser.parse_args()
+    given = ["--state", str(options.state)]
+    for name in ("listen", "page", "power_cut"):
+        if getattr(options, name) is not None:
+            given += [f"--{name.replace('_', '-')}", getattr(options, name)]
+    of_machine = os.geteuid() == 0
+    text = unit(given, of_machine=of_machine, user=os.environ.get("SUDO_USER", ""))
+    try:
+        if options.print:
+            _say(text)
+        elif options.remove:
+            _remove(of_machine=of_machine)
+        else:
+            _install(text, of_machine=of_machine)
+    except LocalError as error:
+        sys.exit(f"up-service: {error}")
+
+
+def unit(options: list[str], *, of_machine: bool, user: str = "") -> str:
+    """The text of the unit."""
+    command = [sys.executable, "-m", "local.up.run", *options]
+    return _UNIT.substitute(
+        root=_quoted(str(ROOT), inner=True),
+        command=" ".join(_quoted(one) for one in command),
+        # Nothing in it needs root's rights.
+        user=f"User={user}\n" if of_machine and user else "",
+        wanted="multi-user.target" if of_machine else "default.target",
+    )
+
+
+def _install(text: str, *, of_machine: bool) -> None:
+    path = _folder(of_machine=of_machine) / NAME
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    _systemctl("daemon-reload", of_machine=of_machine)
+    _systemctl("enable", NAME, of_machine=of_machine)
+    _say(f"{path} is written; starting it (the first time takes a minute or two)")
+    _systemctl("restart", NAME, of_machine=of_machine)
+    user = "" if of_machine else " --user"
+    _say(
+        f"up, and started with the machine from now on\n"
+        f"  its state   systemctl{user} status {NAME}\n"
+        f"  its log     journalctl{user} --unit {NAME} --follow\n"
+        f"  to stop     systemctl{user} stop {NAME}\n"
+        f"  to remove   make up-service REMOVE=1"
+    )
+    if not of_machine:
+        _linger()
+
+
+def _remove(*, of_machine: bool) -> None:
+    _systemctl("disable", "--now", NAME, of_machine=of_machine)
+    (_folder(of_machine=of_machine) / NAME).unlink(missing_ok=True)
+    _systemctl("daemon-reload", of_machine=of_machine)
+    _say("removed; the cloud is kept")
+
+
+def _folder(*, of_machine: bool) -> Path:
+    if of_machine:
+        return Path("/etc/systemd/system")
+    home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(home) / "systemd" / "user"
+
+
+def _linger() -> None:
+    """A user's services end with the last login, unless the user lingers."""
+    user = getpass.getuser()
+    if subprocess.run(["loginctl", "enable-linger", user], check=False, capture_output=True).returncode:  # noqa: S603, S607 - systemd's own
+        _say(f"It ends when {user} logs out: `sudo loginctl enable-linger {user}` changes that")
+
+
+def _systemctl(*arguments: str, of_machine: bool) -> None:
+    systemctl = shutil.which("systemctl")
+    if systemctl is None:
+        raise LocalError("this machine has no systemd: run `make up` in a terminal that stays, such as tmux")
+    command = [systemctl, *([] if of_machine else ["--user"]), *arguments]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)  # noqa: S603 - as above
+    if done.returncode:
+        raise LocalError(f"`{' '.join(command)}` failed: {done.stderr.strip()}")
+
+
+def _quoted(text: str, *, inner: bool = False) -> str:
+    """A text as systemd reads it: % and $ begin something else there."""
+    escaped = text.replace("%", "%%")
+    if inner:
+        return escaped
+    escaped = escaped.replace("$", "$$").replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)  # noqa: T201 - a command's words to its user
+
+
+if __name__ == "__main__":
+    main()

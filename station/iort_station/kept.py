@@ -1,0 +1,74 @@
+"""The kept cloud of `make up`, as other programs on this machine find it: its folder, and `up.json` in it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from iort_station.errors import StationError
+
+UP = "up.json"
+CLOUD = "cloud.json"
+LEDGER = "ledger.db"
+
+
+def folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where `make up` keeps its cloud, unless told otherwise by ``STATE=``."""
+    home = (
+        environment.get("XDG_DATA_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".local/share"
+    )
+    return Path(home) / "iort" / "cloud"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certificate:
+    """A server's certificate: its name, its file, the hosts that it is for, and its end since the epoch."""
+
+    name: str
+    file: str
+    hosts: list[str]
+    ends_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Up:
+    """A running kept cloud. It is written again whenever something in it changes, and removed at the end;
+    after a kill its processes are gone.
+
+    ``version`` is that of the state folder, ``versions`` those of the programs. ``pids`` has ``up``, the
+    process that started the others, and ``emulator``. ``ports`` are by name: ``gateway``, ``relay`` and
+    ``page`` on loopback, ``mqtt`` and ``files`` on the first host of ``listen``, if there is one, and
+    ``network page`` on that of ``page``. ``ledger`` is the path of its SQLite file. With ``power_cut`` it
+    survives that, too.
+    """
+
+    version: int
+    versions: dict[str, str]
+    started_s: float
+    pids: dict[str, int]
+    ports: dict[str, int]
+    listen: list[str]
+    page: list[str]
+    certificates: list[Certificate]
+    ledger: str
+    power_cut: bool
+
+    @classmethod
+    def load(cls, folder: Path) -> Up:
+        """The kept cloud of a folder; raises `StationError` if none is up, or has been."""
+        path = folder / UP
+        try:
+            told = json.loads(path.read_text())
+            certificates = [Certificate(**one) for one in told.pop("certificates")]
+            return cls(**told, certificates=certificates)
+        except FileNotFoundError as error:
+            raise StationError(f"no cloud is up in {folder}: `make up` starts one") from error
+        except (OSError, TypeError, ValueError, KeyError) as error:
+            raise StationError(f"{path} must describe a kept cloud: {error}") from error
+
+    def text(self) -> str:
+        """The content of its file."""
+        return json.dumps(asdict(self), indent=2) + "\n"

@@ -1,0 +1,120 @@
+"""What the doctor finds in a deployment, on AWS or embedded: stacks, robots, lag, alarms."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from datetime import datetime, timezone
+from email.utils import parsedate_to_datetime
+from typing import Any, NamedTuple
+
+from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS
+from iort_contract.tables import ONLINE
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from iort_station.operations import alarms
+from iort_station.upkeep.finding import FAIL, OK, Finding, graded
+
+_MINUTES = 5
+# Summaries later than this are late; a user sees it, and the stream of a table keeps 24 h.
+_LATE_S, _FAR_BEHIND_S = 10.0, 300.0
+_CLOCK_OFF_S = 5.0
+_NAMED = 4
+
+
+class Load(NamedTuple):
+    """The last minutes of Lambda 2; None where CloudWatch has no point."""
+
+    behind_s: float | None
+    batches_s: float | None
+    samples_s: float | None
+
+
+def findings(cloud: Cloud) -> Iterator[Finding]:
+    """Look at everything; ends at stacks that cannot be read."""
+    try:
+        function = cloud.output("processing", "SummarizeFunction")
+        for table in ("TelemetryTable", "RobotsTable"):
+            cloud.output("storage", table)
+    except StationError as error:
+        yield Finding("stacks", FAIL, str(error), "deploy them: `make deploy`, or `make up` on this machine")
+        return
+    yield Finding("stacks", OK, f"of {cloud.namespace} are deployed")
+    yield from _robots(cloud)
+    yield lag(load(cloud, function))
+    yield from _alarms(cloud)
+
+
+def load(cloud: Cloud, function: str) -> Load:
+    """Lambda 2's figures of the last minutes."""
+    ours = {METRIC_DEPLOYMENT: cloud.namespace}
+    now_s = int(time.time())
+    queries = [_query("behind", "AWS/Lambda", "IteratorAge", "Maximum", {"FunctionName": function})]
+    for key, name in (("batches", "BatchesSummarized"), ("samples", "SamplesSummarized")):
+        of = {**ours, METRIC_FUNCTION: METRICS[name].function}
+        queries.append(_query(key, METRIC_NAMESPACE, name, "Sum", of))
+    answer = cloud.client("cloudwatch").get_metric_data(
+        MetricDataQueries=queries,
+        StartTime=datetime.fromtimestamp(now_s // 60 * 60 - 60 * _MINUTES, timezone.utc),
+        EndTime=datetime.fromtimestamp(now_s, timezone.utc),
+        ScanBy="TimestampDescending",
+    )
+    found: dict[str, list[float]] = {one["Id"]: one["Values"] for one in answer["MetricDataResults"]}
+    # The newest point is of a minute that has not ended.
+    rates = {key: sum(values[1:]) / len(values[1:]) / 60 for key, values in found.items() if values[1:]}
+    # Of the newest two minutes: what was late before has been caught up.
+    newest = found["behind"][:2]
+    return Load(max(newest) / 1000 if newest else None, rates.get("batches"), rates.get("samples"))
+
+
+def _query(key: str, namespace: str, name: str, statistic: str, of: Mapping[str, str]) -> dict[str, Any]:
+    dimensions = [{"Name": name, "Value": value} for name, value in of.items()]
+    metric = {"Namespace": namespace, "MetricName": name, "Dimensions": dimensions}
+    return {"Id": key, "MetricStat": {"Metric": metric, "Period": 60, "Stat": statistic}}
+
+
+def lag(found: Load) -> Finding:
+    """How far the summaries are behind the recordings."""
+    if found.behind_s is None:
+        return Finding("summaries", OK, f"Lambda 2 had nothing to do in the last {_MINUTES} minutes")
+    rates = ""
+    if found.batches_s is not None and found.samples_s is not None:
+        rates = f", {found.batches_s:,.1f} batches and {found.samples_s:,.0f} samples a second"
+    return graded(
+        "summaries",
+        f"{found.behind_s:.1f} s behind the recordings at most{rates}",
+        "nothing is lost, and charts are late. If it grows, this deployment takes no more: fewer or slower "
+        "streams; a function that fails is in `iort errors` and `iort alarms`",
+        warn=found.behind_s > _LATE_S,
+        fail=found.behind_s > _FAR_BEHIND_S,
+    )
+
+
+def clock(cloud: Cloud) -> Finding:
+    """The clock of this machine, by the date of AWS' answer."""
+    answer = cloud.client("cloudwatch").describe_alarms(MaxRecords=1)
+    said = answer["ResponseMetadata"]["HTTPHeaders"].get("date", "")
+    try:
+        off_s = time.time() - parsedate_to_datetime(said).timestamp() - 0.5
+    except (TypeError, ValueError):
+        return Finding("clock", OK, "AWS' answer has no date to compare it with")
+    return graded(
+        "clock",
+        f"this machine's is {off_s:+.1f} s off, by AWS' answer",
+        "set the clock: `timedatectl set-ntp true`. `--last` and the page's ages are wrong",
+        warn=abs(off_s) > _CLOCK_OFF_S,
+    )
+
+
+def _robots(cloud: Cloud) -> Iterator[Finding]:
+    rows = list(registry.listed(cloud))
+    connected = sum(bool(row.get(ONLINE)) for row in rows)
+    yield Finding("robots", OK, f"{connected} of {len(rows)} are connected")
+
+
+def _alarms(cloud: Cloud) -> Iterator[Finding]:
+    raised = [alarm["key"] for alarm in alarms.alarms(cloud) if alarm["state"] == alarms.RAISED]
+    named = ", ".join(raised[:_NAMED]) + (", ..." if len(raised) > _NAMED else "")
+    text = f"{len(raised)} raised: {named}" if raised else "none is raised"
+    yield graded("alarms", text, "`iort alarms` says what each means, and what to do", warn=bool(raised))

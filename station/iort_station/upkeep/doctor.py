@@ -1,0 +1,200 @@
+"""What the doctor finds on the machine that keeps a cloud, before it looks into the deployment."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import ssl
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from importlib.metadata import version
+from pathlib import Path
+
+from botocore.exceptions import BotoCoreError, ClientError
+from cryptography import x509
+
+from iort_station import kept
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.kept import Up
+from iort_station.upkeep import deployment, machine
+from iort_station.upkeep.finding import FAIL, OK, WARN, Finding, graded
+from iort_station.upkeep.state import LAST_BACKUP
+
+_CONNECT_S = 3.0
+# `make up` needs the second to start; below 200 MB the record lane is refused, and the cars keep it.
+_LOW_BYTES, _FULL_BYTES = 5_000_000_000, 500_000_000
+# Shares of the machine's memory.
+_LEAST_AVAILABLE, _MOST_OURS = 0.1, 0.5
+# A server's certificate gets a successor 30 days before its end.
+_NOT_RENEWED_S, _BACKUP_S = 25 * 86_400, 7 * 86_400
+
+
+def of_kept(folder: Path) -> Iterator[Finding]:
+    """Look at the cloud of `make up` and at its machine."""
+    try:
+        up = Up.load(folder)
+    except StationError as error:
+        yield Finding("processes", FAIL, str(error), "`make up`")
+        yield _backup(folder)
+        return
+    yield from _processes(folder, up)
+    yield from _addresses(up)
+    yield _disk(folder, up)
+    yield _memory(up)
+    yield from _certificates(up)
+    yield _clock()
+    yield _backup(folder)
+    if not all(map(machine.runs, up.pids.values())):
+        return
+    try:
+        yield from deployment.findings(Cloud.load(folder / kept.CLOUD))
+    except (StationError, ClientError, BotoCoreError) as error:
+        yield Finding("deployment", FAIL, f"does not answer: {error}", "`make down`, then `make up`")
+
+
+def of_cloud(cloud: Cloud) -> Iterator[Finding]:
+    """Look at a deployment on AWS, or at an embedded cloud that is thrown away."""
+    if cloud.endpoint_url is None:
+        text = f"AWS runs this deployment, in {cloud.region_name}: processes, disk and servers are its own"
+        yield Finding("machine", OK, text)
+        yield deployment.clock(cloud)
+    else:
+        text = "this cloud is thrown away when it ends: its processes, disk and backups are not looked at"
+        yield Finding("machine", WARN, text, "`make up` runs one that is kept")
+    yield from deployment.findings(cloud)
+
+
+def _processes(folder: Path, up: Up) -> Iterator[Finding]:
+    ended = [f"{name} (process {pid})" for name, pid in up.pids.items() if not machine.runs(pid)]
+    if ended:
+        # A cloud that is stopped removes this file.
+        killed = ": killed, or the machine was switched off" if (folder / kept.CLOUD).exists() else ""
+        todo = f"`make up` starts it again; what it acknowledged is in {folder}"
+        yield Finding("processes", FAIL, f"{', '.join(ended)} ended{killed}", todo)
+    else:
+        names = ", ".join(f"{name} {pid}" for name, pid in up.pids.items())
+        yield Finding("processes", OK, f"{names}, for {_span(time.time() - up.started_s)}")
+    installed, running = version("iort-station"), up.versions.get("iort")
+    yield graded(
+        "version",
+        f"{running} runs" + ("" if running == installed else f", and {installed} is installed"),
+        "`make down`, then `make up`, to run the installed one",
+        warn=running != installed,
+    )
+
+
+def _addresses(up: Up) -> Iterator[Finding]:
+    """Whether every server answers, and which certificate the broker shows."""
+    cars, pages = (hosts[0] if hosts else "127.0.0.1" for hosts in (up.listen, up.page))
+    hosts = {"gateway": "127.0.0.1", "relay": "127.0.0.1", "mqtt": cars, "page": "127.0.0.1"}
+    hosts |= ({"files": cars} if up.listen else {}) | ({"network page": pages} if up.page else {})
+    silent = []
+    for name, host in hosts.items():
+        if name in up.ports:
+            try:
+                socket.create_connection((host, up.ports[name]), _CONNECT_S).close()
+            except OSError as error:
+                silent.append(f"{name} at {host}:{up.ports[name]} ({error.strerror or error})")
+    if silent:
+        todo = "`make down`, then `make up`; does this machine still have the address of LISTEN or PAGE?"
+        yield Finding("servers", FAIL, f"no answer from {', '.join(silent)}", todo)
+        return
+    where = f"cars connect to {cars}:{up.ports['mqtt']}" if up.listen else "cars of this machine only"
+    yield Finding("servers", OK, f"all answer; {where}")
+    shown_s = _shown_end_s(cars, up.ports["mqtt"])
+    written_s = next((one.ends_s for one in up.certificates if one.name == "broker"), None)
+    if shown_s is not None and written_s is not None and abs(shown_s - written_s) > 1:
+        text = f"the broker shows a certificate that ends on {_day(shown_s)}, not the one in its file"
+        yield Finding("broker", WARN, text, "`make down`, then `make up`, before that day")
+
+
+def _shown_end_s(host: str, port: int) -> float | None:
+    """The end of the certificate that a server shows; None if it shows none to us."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with suppress(OSError, ValueError):
+        raw = socket.create_connection((host, port), _CONNECT_S)
+        with closing(raw), closing(context.wrap_socket(raw)) as secure:
+            der = secure.getpeercert(binary_form=True) or b""
+        return x509.load_der_x509_certificate(der).not_valid_after_utc.timestamp()
+    return None
+
+
+def _disk(folder: Path, up: Up) -> Finding:
+    free = shutil.disk_usage(folder).free
+    ledger = Path(up.ledger)
+    wal = ledger.with_name(f"{ledger.name}-wal")
+    parts = [one.stat().st_size for one in (ledger, wal) if one.exists()]
+    safe = "survives a power cut" if up.power_cut else "survives a kill, not a power cut (POWER_CUT=1)"
+    return graded(
+        "disk",
+        f"{free / 1e9:,.1f} GB free for {folder}; the ledger has {sum(parts) / 1e6:,.1f} MB and {safe}",
+        "free some of it, or move the state: `make down`, `iort backup`, `iort restore`. A full disk loses "
+        "nothing: recordings are refused, and the cars keep them",
+        warn=free < _LOW_BYTES,
+        fail=free < _FULL_BYTES,
+    )
+
+
+def _memory(up: Up) -> Finding:
+    ours, whole = machine.resident_bytes(up.pids.get("emulator", 0)), machine.memory()
+    if ours is None or whole is None:
+        return Finding("memory", OK, "cannot be told on this system, or of a process that has ended")
+    return graded(
+        "memory",
+        f"the emulator has {ours / 1e6:,.0f} MB; {whole.available / 1e9:,.1f} of {whole.total / 1e9:,.1f} GB "
+        "are available",
+        "`make down`, then `make up`, gives it back and loses nothing; look at this machine's other programs",
+        warn=ours > _MOST_OURS * whole.total or whole.available < _LEAST_AVAILABLE * whole.total,
+    )
+
+
+def _certificates(up: Up) -> Iterator[Finding]:
+    for one in up.certificates:
+        left_s = one.ends_s - time.time()
+        yield graded(
+            f"certificate of {one.name}",
+            f"for {', '.join(one.hosts)}, until {_day(one.ends_s)}",
+            "it should have been renewed 30 days before: `make down`, then `make up`, renews it",
+            warn=left_s < _NOT_RENEWED_S,
+            fail=left_s < 0,
+        )
+
+
+def _clock() -> Finding:
+    is_set = machine.clock_is_set()
+    if is_set is None:
+        return Finding("clock", OK, "this system does not tell whether a server of time sets it")
+    return graded(
+        "clock",
+        "a server of time sets it" if is_set else "no server of time sets it, so it drifts",
+        "`timedatectl set-ntp true`. Cars compare their clocks with this one",
+        warn=not is_set,
+    )
+
+
+def _backup(folder: Path) -> Finding:
+    todo = "`iort backup FILE`, to another disk"
+    try:
+        told = json.loads((folder / LAST_BACKUP).read_text())
+        age_s, file = time.time() - told["made_s"], told["file"]
+    except FileNotFoundError:
+        return Finding("backup", WARN, "there was none yet", todo)
+    except (OSError, TypeError, ValueError, KeyError) as error:
+        return Finding("backup", WARN, f"{folder / LAST_BACKUP} is damaged: {error}", todo)
+    return graded("backup", f"{_span(age_s)} ago, to {file}", todo, warn=age_s > _BACKUP_S)
+
+
+def _day(at_s: float) -> str:
+    return time.strftime("%Y-%m-%d", time.gmtime(at_s))
+
+
+def _span(seconds: float) -> str:
+    """A time in its largest whole unit."""
+    for name, size in (("days", 86_400), ("hours", 3600), ("minutes", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {name}"
+    return f"{max(0.0, seconds):.0f} seconds"

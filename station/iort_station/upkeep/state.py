@@ -1,0 +1,35 @@
+"""The state folder of a kept cloud, for those who copy or replace it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from iort_station import kept
+from iort_station.errors import StationError
+
+VERSION, LAST_BACKUP = "VERSION", "last-backup.json"
+# A start makes these anew, so no backup has them: the running cloud's addresses, logs, files in use.
+MADE_ANEW = (kept.UP, kept.CLOUD, LAST_BACKUP, "tmp", "*.tmp", "*.log", "*.sock", "*-wal", "*-shm")
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the state folder, as a running cloud does. Raises `StationError` if another process holds it."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the folder, which a restore replaces.
+    with (folder.parent / f"{folder.name}.lock").open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            lock.seek(0)
+            raise StationError(
+                f"a cloud runs in {folder} (process {lock.read().strip()}): stop it first, with `make down`"
+            ) from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield

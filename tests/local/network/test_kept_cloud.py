@@ -1,0 +1,144 @@
+"""A kept cloud's folder, its certificates, and LISTEN=."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from iort_station import kept
+from iort_station.errors import StationError
+from local.certificates import Authority, ServerCertificate
+from local.deployment import ROOT
+from local.errors import LocalError
+from local.network.listen import Listen
+from local.state import StateFolder
+from local.up import service
+from local.up.down import owner, stop
+
+
+@pytest.fixture
+def state(tmp_path):
+    with ExitStack() as stack:
+        state = StateFolder(tmp_path / "cloud", kept=True)
+        state.take(stack)
+        yield state
+
+
+def test_a_kept_folder_keeps_its_ports_and_a_second_cloud_is_refused(state):
+    port = state.port("mqtt", "127.0.0.1")
+    again = StateFolder(state.path, kept=True)
+    assert again.port("mqtt", "127.0.0.1") == port
+    with ExitStack() as stack, pytest.raises(LocalError, match=r"already running in .*`make down`"):
+        again.take(stack)
+    with (
+        socket.create_server(("127.0.0.1", port)),
+        pytest.raises(LocalError, match=r"is in use .*settings\.json"),
+    ):
+        again.port("mqtt", "127.0.0.1")
+
+
+@pytest.mark.parametrize("version", ["2", "beta"])
+def test_a_folder_of_a_newer_version_is_refused_with_a_reason(tmp_path, version):
+    (tmp_path / "cloud").mkdir()
+    (tmp_path / "cloud" / "VERSION").write_text(version)
+    with (
+        ExitStack() as stack,
+        pytest.raises(
+            LocalError, match=rf"must have version 1 or older, got {version}: a newer iort wrote it"
+        ),
+    ):
+        StateFolder(tmp_path / "cloud", kept=True).take(stack)
+
+
+def test_a_folder_with_somebodys_files_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with (
+        ExitStack() as stack,
+        pytest.raises(LocalError, match=r"STATE must be an empty folder .*thesis\.tex"),
+    ):
+        StateFolder(tmp_path, kept=True).take(stack)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def test_down_knows_whether_a_cloud_is_up(tmp_path):
+    assert owner(tmp_path / "nowhere") is None
+    assert not stop(tmp_path / "nowhere")
+    with ExitStack() as stack:
+        StateFolder(tmp_path / "cloud", kept=True).take(stack)
+        assert owner(tmp_path / "cloud")
+    assert owner(tmp_path / "cloud") is None
+
+
+@pytest.mark.parametrize("text", ["", "iort.lab", "0.0.0.0", "::", "192.0.2.1/24", "192.0.2.1,no name"])
+def test_listen_needs_an_address_to_name_in_a_bundle(text):
+    with pytest.raises(LocalError, match=r"^LISTEN must .*got "):
+        Listen.parse(text, "LISTEN")
+
+
+def test_cars_are_told_a_name_if_there_is_one():
+    assert Listen.parse("192.0.2.1", "LISTEN").host == "192.0.2.1"
+    found = Listen.parse("192.0.2.1, 10.0.0.1,IoRT.lab,other", "LISTEN")
+    assert (found.address, found.host) == ("192.0.2.1", "iort.lab")
+    assert found.hosts == ("192.0.2.1", "10.0.0.1", "iort.lab", "other")
+    with pytest.raises(LocalError, match=r"must be an address of this machine, got 192\.0\.2\.1"):
+        found.check("LISTEN")
+
+
+def test_a_kept_authority_renews_a_certificate_before_its_end_and_for_other_hosts(tmp_path):
+    authority = Authority(tmp_path)
+    day_s = 86_400.0
+
+    def certificate(*hosts: str, authority: Authority = authority, lasts_s: float = 90 * day_s):
+        return ServerCertificate(authority, tmp_path / "broker.pem", hosts, lasts_s, renewed_s=30 * day_s)
+
+    assert certificate("192.0.2.1", lasts_s=29 * day_s).renew()
+    # It ends within the thirty days.
+    assert certificate("192.0.2.1").renew()
+    assert certificate("192.0.2.1").ends_s() == pytest.approx(time.time() + 90 * day_s, abs=60)
+    assert not certificate("192.0.2.1", authority=Authority(tmp_path)).renew()
+    assert certificate("192.0.2.1", "iort.lab").renew()
+    (tmp_path / "authority.key").unlink()
+    assert certificate("192.0.2.1", "iort.lab", authority=Authority(tmp_path)).renew()
+    for secret in ("authority.key", "broker.pem"):
+        assert (tmp_path / secret).stat().st_mode & 0o777 == 0o600
+
+
+def test_up_json_is_read_as_it_was_written(tmp_path):
+    with pytest.raises(StationError, match=r"no cloud is up in .*`make up`"):
+        kept.Up.load(tmp_path)
+    up = kept.Up(
+        version=1,
+        versions={"iort": "1"},
+        started_s=1.0,
+        pids={"up": 1, "emulator": 2},
+        ports={"mqtt": 8883},
+        listen=["192.0.2.1"],
+        page=[],
+        certificates=[kept.Certificate(name="broker", file="b.pem", hosts=["192.0.2.1"], ends_s=2.0)],
+        ledger="ledger.db",
+        power_cut=True,
+    )
+    (tmp_path / kept.UP).write_text(up.text())
+    assert kept.Up.load(tmp_path) == up
+    (tmp_path / kept.UP).write_text("{}")
+    with pytest.raises(StationError, match=r"up\.json must describe a kept cloud"):
+        kept.Up.load(tmp_path)
+
+
+@pytest.mark.parametrize("of_machine", [True, False])
+def test_the_unit_starts_this_checkout_with_the_options(of_machine):
+    text = service.unit(["--state", "/srv/100% iort/$x"], of_machine=of_machine, user="lab")
+    assert f"WorkingDirectory={ROOT}\n" in text
+    assert '-m" "local.up.run" "--state" "/srv/100%% iort/$$x"\n' in text
+    assert "Type=notify\n" in text
+    assert "Restart=on-failure\n" in text
+    assert ("User=lab\n" in text) == of_machine
+    assert re.search(r"WantedBy=(multi-user|default)\.target\n", text)[1] == (
+        "multi-user" if of_machine else "default"
+    )
+    assert Path(re.search(r'ExecStart="([^"]+)"', text)[1]).exists()

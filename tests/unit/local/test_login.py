@@ -1,0 +1,78 @@
+"""The password of the page in the network, its sessions, and how often it may be tried."""
+
+from __future__ import annotations
+
+import pytest
+from argon2 import PasswordHasher
+
+from local.errors import LocalError
+from local.up import login
+from local.up.login import Password, Sessions, Tries
+
+# A real hash takes 64 MB and a tenth of a second.
+QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+class Now:
+    def __init__(self):
+        self.s = 1000.0
+
+    def __call__(self):
+        return self.s
+
+
+def test_a_password_is_made_once_and_kept_as_a_hash(tmp_path):
+    password = Password(tmp_path, QUICK)
+    made = password.make()
+    assert password.make() is None
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert made not in file.read_text()
+    assert file.read_text().startswith("$argon2id$")
+    assert Password(tmp_path, QUICK).is_right(made)
+    assert not password.is_right(made + "x")
+    assert not password.is_right("")
+
+
+@pytest.mark.parametrize("short", ["", "123456789", "x" * 1001])
+def test_a_password_of_a_wrong_length_is_refused(tmp_path, short):
+    with pytest.raises(LocalError, match=r"must have 10 to 1000 characters, got \d+"):
+        Password(tmp_path, QUICK).set(short)
+
+
+def test_an_address_waits_after_its_tries_and_others_do_not():
+    now = Now()
+    tries = Tries(now)
+    assert [tries.wait_s("192.0.2.1") for _ in range(login.TRIES)] == [0.0] * login.TRIES
+    assert tries.wait_s("192.0.2.1") == pytest.approx(login.TRY_S)
+    assert tries.wait_s("192.0.2.2") == 0.0
+    now.s += login.TRY_S
+    assert tries.wait_s("192.0.2.1") == 0.0
+    assert tries.wait_s("192.0.2.1") > 0.0
+
+
+def test_the_addresses_of_one_ipv6_network_share_their_tries():
+    tries = Tries(Now())
+    assert [tries.wait_s(f"2001:db8::{i}") for i in range(login.TRIES)] == [0.0] * login.TRIES
+    assert tries.wait_s("2001:db8::ffff") > 0.0
+
+
+def test_all_addresses_together_have_an_end_too():
+    tries = Tries(Now())
+    waits = [tries.wait_s(f"192.0.2.{i}") for i in range(login.ALL_TRIES + 1)]
+    assert waits[:-1] == [0.0] * login.ALL_TRIES
+    assert waits[-1] == pytest.approx(login.ALL_TRY_S)
+
+
+def test_a_session_ends_when_nobody_uses_it():
+    now = Now()
+    sessions = Sessions(now)
+    used, left = sessions.begin(), sessions.begin()
+    now.s += login.SESSION_S - 1
+    assert sessions.goes_on(used)
+    now.s += 2
+    assert sessions.goes_on(used)
+    assert not sessions.goes_on(left)
+    assert not sessions.goes_on("")
+    sessions.end(used)
+    assert not sessions.goes_on(used)
