@@ -22,6 +22,7 @@ NAMES = (
     "functions.log_retention",
     "storage.query_time",
     "storage.number_checks",
+    "storage.object_expiry",
     "metrics.embedded_metrics",
     "metrics.lambda_metrics",
     "metrics.iot_metrics",

@@ -38,7 +38,9 @@ def _forgetting(emit: Callable[..., None]) -> Callable[..., None]:
     def emit_logs(function: dict[str, Any], *arguments: Any, **options: Any) -> None:
         emit(function, *arguments, **options)
         config = function.get("config") or function
-        name = (config.get("LoggingConfig") or {}).get("LogGroup") or f"/aws/lambda/{config.get('FunctionName', 'unknown')}"
+        name = (config.get("LoggingConfig") or {}).get(
+            "LogGroup"
+        ) or f"/aws/lambda/{config.get('FunctionName', 'unknown')}"
         if group := cloudwatch_logs._log_groups.get(name):
             forget(group["streams"])
 
