@@ -1,24 +1,35 @@
-"""The emulator's process: ministack with its gaps closed, configured by ministack's own environment."""
+"""The emulator's process: ministack with its gaps closed, configured by ministack's own environment.
+
+The file `IORT_LEDGER` keeps its state, as safely as `IORT_LEDGER_SYNC` says (off, normal or full). Without
+them the state ends with the process.
+"""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import cast
 
 from ministack import app
 
 from local import gaps
+from local.gaps.functions.async_invocations import AsyncInvocations
 from local.gaps.metrics import alarm_timer
-from local.keeping import kept
+from local.keeping import kept, streams
 from local.keeping.ledger import Ledger, Sync
 
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT."""
+    path = os.environ.get("IORT_LEDGER")
+    sync = cast(Sync, os.environ.get("IORT_LEDGER_SYNC", "normal") if path else "off")
+    ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
+    # Before the gaps, which read streams.
+    streams.install(ledger)
     gaps.install()
-    if path := os.environ.get("IORT_LEDGER"):
-        kept.install(Ledger(Path(path), sync=cast(Sync, os.environ.get("IORT_LEDGER_SYNC", "normal"))))
+    if path:
+        kept.install(ledger, AsyncInvocations())
     alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()
 

@@ -11,12 +11,11 @@ import time
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from functools import partial, wraps
-from typing import Any
+from typing import Any, Protocol
 
 from ministack.core.responses import get_account_id, get_region
 from ministack.services import eventbridge, iot
 
-from local.gaps.functions.async_invocations import AsyncInvocations
 from local.keeping.ledger import Ledger
 
 _log = logging.getLogger(__name__)
@@ -29,12 +28,30 @@ _OWN = "$aws/"
 _acknowledged: ContextVar[bool] = ContextVar("acknowledged", default=True)
 
 
-class Invocations(AsyncInvocations):
+class Events(Protocol):
+    """A queue of events for each function, in memory."""
+
+    def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
+        """Queue one event; raises `LookupError` for an unknown function."""
+
+    def queue(
+        self,
+        account: str,
+        region: str,
+        function_arn: str,
+        event: Any,
+        *,
+        age_s: float = 0.0,
+        done: Callable[[], object] = ...,
+    ) -> None:
+        """Queue one event of this age, and call ``done`` when it needs no more attempts."""
+
+
+class Invocations:
     """A queue of events for each function, in the ledger; a function gets each event at least once."""
 
-    def __init__(self, ledger: Ledger) -> None:
-        super().__init__()
-        self._ledger = ledger
+    def __init__(self, ledger: Ledger, events: Events) -> None:
+        self._ledger, self._events = ledger, events
         ledger.define(_SCHEMA)
 
     def install(self) -> None:
@@ -50,14 +67,14 @@ class Invocations(AsyncInvocations):
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for an unknown function, or `LedgerError`."""
         if not _acknowledged.get():
-            super().dispatch(account, region, function_arn, event)
+            self._events.dispatch(account, region, function_arn, event)
             return
         with self._ledger.write() as connection:
             number = connection.execute(
                 "INSERT INTO invocations (account, region, function, event, queued_s) VALUES (?, ?, ?, ?, ?)",
                 (account, region, function_arn, json.dumps(event), time.time()),
             ).lastrowid
-            self.queue(account, region, function_arn, event, done=partial(self._remove, number))
+            self._events.queue(account, region, function_arn, event, done=partial(self._remove, number))
 
     def go_on(self) -> None:
         """Queue again what was waiting, or running, when the emulator ended."""
@@ -65,7 +82,7 @@ class Invocations(AsyncInvocations):
         for number, account, region, function, event, queued_s in rows:
             age_s, done = time.time() - queued_s, partial(self._remove, number)
             try:
-                self.queue(account, region, function, json.loads(event), age_s=age_s, done=done)
+                self._events.queue(account, region, function, json.loads(event), age_s=age_s, done=done)
             except LookupError as error:
                 _log.warning("an event is given up: %s", error)
                 done()

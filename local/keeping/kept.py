@@ -5,16 +5,16 @@ from __future__ import annotations
 from ministack import app
 
 from local.keeping import objects, queues
-from local.keeping.invocations import Invocations
+from local.keeping.invocations import Events, Invocations
 from local.keeping.ledger import Ledger
 from local.keeping.services.keeper import Services
 
 
-def install(ledger: Ledger) -> None:
-    """Keep everything but the tables; call it after the gaps are closed and before the emulator starts."""
+def install(ledger: Ledger, events: Events) -> None:
+    """Keep all but items and streams; call it after the gaps are closed and before the emulator starts."""
     objects.install(ledger)
     queues.install(ledger)
-    services, invocations = Services(ledger), Invocations(ledger)
+    services, invocations = Services(ledger), Invocations(ledger, events)
     services.install()
     invocations.install()
     ready = app._run_ready_scripts

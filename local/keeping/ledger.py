@@ -123,6 +123,12 @@ class Ledger:
             finally:
                 self._writing = False
 
+    @contextmanager
+    def reading(self) -> Iterator[sqlite3.Connection]:
+        """Read row by row, while nobody writes."""
+        with self._lock:
+            yield self._connection
+
     def read(self, sql: str, arguments: Sequence[Any] = ()) -> list[Row]:
         """Read rows, also those that nobody has committed yet."""
         with self._lock:

@@ -98,6 +98,8 @@ class Lab:
         # Whether each car is told to stop, and whether it stands.
         self.cars = {"car-1": [False, False], "car-9": [False, False]}
         self.confirms = True
+        # The cars that were stopped alone.
+        self.alone: set[str] = set()
         self.notes: list[dict[str, Any]] = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
@@ -142,6 +144,9 @@ class Lab:
                 "asked": told,
                 "stopped": stands,
                 "reason": "",
+                "alone": told and name in self.alone,
+                "by": "operator@lab" if told else "",
+                "at_ms": round(NOW_S * 1000) if told else 0,
                 "drive": LIMITS if name == "car-1" else None,
             }
             for name, (told, stands) in self.cars.items()
@@ -155,8 +160,10 @@ class Lab:
     def stop(self, asked: Mapping[str, str]) -> dict[str, Any]:
         self.asked.append(dict(asked))
         told = asked["stopped"] == "true"
+        if "robot" in asked:
+            (self.alone.add if told else self.alone.discard)(asked["robot"])
         for name, car in self.cars.items():
-            if asked.get("robot", name) == name:
+            if asked.get("robot", name) == name and (told or name not in self.alone):
                 car[:] = [told, told if self.confirms else car[1]]
         return self.motion(asked)
 

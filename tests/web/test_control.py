@@ -179,23 +179,34 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         # No car has been heard: it can be stopped all the same.
         page.goto(f"{server.url}#/car/car-1")
         page.get_by_role("button", name="Stop car-1").click()
-        until(lambda: words.inner_text() == "Not confirmed by car-1.", "the stop to be asked for")
+        until(lambda: words.inner_text().startswith("Not confirmed by car-1."), "the stop to be asked for")
         lab.cars["car-1"][1] = lab.confirms = True
-        until(lambda: words.inner_text() == "Emergency stop: car-1 stands.", "the car's confirmation")
+        stands = "Emergency stop: car-1 stands."
+        until(lambda: words.inner_text().startswith(stands), "the car's confirmation")
+        assert "Stopped by operator@lab, " in words.inner_text()
         # On every view, and in a browser that comes later and may only look.
         page.goto(f"{server.url}#/alarms")
-        assert words.inner_text() == "Emergency stop: car-1 stands."
+        assert words.inner_text() == f"{stands} Stopped alone: car-1, to be released on the car's page."
+        assert not page.get_by_role("button", name="Release all").is_visible()
         onlooker = open_page(f"{server.url}#/insights")
         onlooker.get_by_text("Emergency stop: car-1 stands.").wait_for()
         assert onlooker.locator(".stop-press, .stop-release:visible").count() == 0
         page.goto(f"{server.url}#/")
         page.get_by_role("button", name="Stop all").click()
-        until(lambda: words.inner_text() == "Emergency stop: car-1, car-9 stand.", "the fleet to stand")
+        until(
+            lambda: words.inner_text().startswith("Emergency stop: car-1, car-9 stand."), "the fleet to stand"
+        )
         page.get_by_role("button", name="Release all").click()
         assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
-        page.get_by_role("button", name="Really release all").click()
+        # Only what the fleet's stop has stopped.
+        page.get_by_role("button", name="Really release car-9: may move").click()
+        until(lambda: words.inner_text().startswith(stands), "the release of car-9")
+        assert lab.asked[-1] == {"stopped": "false"}
+        page.goto(f"{server.url}#/car/car-1")
+        page.get_by_role("button", name="Release car-1").click()
+        page.get_by_role("button", name="Really release car-1").click()
         until(lambda: not words.is_visible(), "the release")
-    assert lab.asked[-1] == {"stopped": "false"}
+    assert lab.asked[-1] == {"stopped": "false", "robot": "car-1"}
 
 
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:

@@ -50,7 +50,7 @@ REFUSALS: Mapping[str, str] = {
     REPEATED: "a later command of the session has passed",
     SETTINGS_UNKNOWN: "the robot has just connected, and does not know yet whether it must stand still",
     CLOCK_UNKNOWN: "the robot does not know the cloud's time yet",
-    LEASE_OVER: "the command's lease had ended when it came",
+    LEASE_OVER: "the command's lease had ended when it came, or the robot was stopped after it was sent",
     STALE: "the command was too old when it came",
     EARLY: "the command's time lies in the future: the sender's clock is wrong",
     NO_LEASE: "a motion needs `lease_ms`",

@@ -201,11 +201,15 @@ class DriveLimitsEntry(TypedDict):
 class MotionEntry(TypedDict):
     """Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere,
     ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it.
-    ``drive`` is null if a stick cannot drive it."""
+    ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else
+    released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it."""
 
     asked: bool
     stopped: bool | None
     reason: str
+    alone: bool
+    by: str
+    at_ms: int
     drive: DriveLimitsEntry | None
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any, Iterator, Mapping, NamedTuple
 
 from iort_contract.messages.driving import DriveLimits, decode_limits, encode_limits
-from iort_contract.messages.settings import FIELDS, SETTINGS
+from iort_contract.messages.settings import FIELDS, MOTION_STOPPED, SETTINGS
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
 from iort_contract.topics import COMMANDS
 
-REJECTED, DRIVE = "rejected", "drive"
+REJECTED, DRIVE, STOPS = "rejected", "drive", "stops"
 # Larger than any count, and than any time of a calendar.
 _MOST = 10**15
 _SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
@@ -43,12 +43,35 @@ class Outcome(NamedTuple):
     outcome: str
 
 
+class Pressed(NamedTuple):
+    """Who stopped a robot or released it, as they say, and when, by their clock."""
+
+    by: str
+    t_ms: int
+
+
+class StopNotes(NamedTuple):
+    """Who has stopped the ``robot`` alone, and who the ``fleet``; who has ``released`` the robot last."""
+
+    robot: Pressed | None = None
+    fleet: Pressed | None = None
+    released: Pressed | None = None
+
+
 @dataclass(frozen=True)
 class Desired:
-    """The desired settings by name, and the cloud's notice. The settings are not checked."""
+    """The desired settings by name, the cloud's notice, and who asked for the emergency stop. The settings
+    are not checked."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     over_share: OverShare | None = None
+    stops: StopNotes = field(default_factory=StopNotes)
+
+    @property
+    def stopped_alone(self) -> bool:
+        """Whether the release of the fleet leaves the robot stopped. A stop of an unknown source is its
+        own."""
+        return self.stops.robot is not None or self.stops.fleet is None
 
 
 @dataclass(frozen=True)
@@ -69,7 +92,30 @@ def decode_desired(document: Any) -> Desired:
     notice = _mapping(found.pop(OVER_SHARE, None))
     counts = [notice.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
     valid = [count for count in counts if type(count) is int and 0 <= count < _MOST]
-    return Desired(dict(_flat(found)), OverShare(*valid) if len(valid) == len(counts) else None)
+    notes = _mapping(found.pop(STOPS, None))
+    return Desired(
+        dict(_flat(found)),
+        OverShare(*valid) if len(valid) == len(counts) else None,
+        StopNotes(*(_pressed(notes.get(name)) for name in StopNotes._fields)),
+    )
+
+
+def encode_stop(by: Pressed, *, fleet: bool) -> dict[str, Any]:
+    """The change of the desired part that stops a robot, alone or with the fleet."""
+    note = StopNotes(fleet=by) if fleet else StopNotes(robot=by)
+    written = {name: one._asdict() for name, one in note._asdict().items() if one is not None}
+    return {**nested({MOTION_STOPPED: True}), STOPS: written}
+
+
+def encode_release(by: Pressed) -> dict[str, Any]:
+    """The change of the desired part that releases a robot."""
+    notes: dict[str, Any] = {**StopNotes()._asdict(), "released": by._asdict()}
+    return {**nested({MOTION_STOPPED: False}), STOPS: notes}
+
+
+def encode_fleet_released() -> dict[str, Any]:
+    """The change for a robot that is stopped alone, too: it stays stopped."""
+    return {STOPS: {"fleet": None}}
 
 
 def decode_reported(document: Any) -> Reported:
@@ -118,6 +164,12 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
         else:
             document[section] = value
     return document
+
+
+def _pressed(note: Any) -> Pressed | None:
+    found = _mapping(note)
+    by, t_ms = found.get("by"), found.get("t_ms")
+    return Pressed(by, t_ms) if isinstance(by, str) and type(t_ms) is int and 0 <= t_ms < _MOST else None
 
 
 def _flat(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

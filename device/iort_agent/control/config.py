@@ -153,8 +153,8 @@ _FLEET = "a mapping of name to ROS topic and type"
 
 @dataclass(frozen=True)
 class MotionState:
-    """Motion by commands. If it is ``stopped``, the robot starts in an emergency stop, which an operator
-    releases."""
+    """Motion by commands. If it is ``stopped``, the robot is in an emergency stop that no operator releases,
+    only this file."""
 
     stopped: bool = setting(allowed(SETTINGS[MOTION_STOPPED]), default=False)
 

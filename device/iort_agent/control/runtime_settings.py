@@ -30,7 +30,8 @@ def overlay(
 
     ``known_fields`` holds the fields of the streams seen so far; only these can be selected. A robot that no
     command ``moves`` must not seem to be stopped. Only an explicit value ends an emergency stop, because a
-    shadow may be deleted, or lost with its cloud.
+    shadow may be deleted, or lost with its cloud. The file's own stop is the file's alone to end: whoever
+    wrote it stands beside the robot.
     """
     values: dict[str, Any] = {"motion_stopped": in_force.motion_stopped}
     fields = dict(base.fields)
@@ -48,6 +49,10 @@ def overlay(
                 if name == MOTION_STOPPED and value and not moves:
                     raise _PLACE.child(name).problem(
                         "nothing to stop: downlink.cmd has no command with motion"
+                    )
+                if name == MOTION_STOPPED and not value and base.motion_stopped:
+                    raise _PLACE.child(name).problem(
+                        "car.yaml has motion: {stopped: true}; change it on the robot, and restart the agent"
                     )
             else:
                 hint = did_you_mean(name, CHANGEABLE)

@@ -4,8 +4,8 @@ AWS: splits a failed batch, gives it up after its retries or its age, and tells 
   (https://docs.aws.amazon.com/lambda/latest/dg/services-dynamodb-errors.html).
 ministack: invokes the function with the same batch until it succeeds, in the thread that also serves the
   queues. A stream has here a shard for each core, and a mapping a thread for each of its concurrent batches.
-  After a restart of the emulator it reads the stream from its beginning again, which AWS too does after a
-  lost acknowledgement.
+  The ledger knows the first record that a mapping has not finished (local/keeping/streams.py): there it goes
+  on after a restart.
 Test:
   tests/local/gaps/test_stream_gap.py::test_only_the_failing_record_goes_to_the_destination
 Patch: none; it replaces the whole poller by local/gaps/parts/stream_mapping.py
@@ -20,6 +20,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,8 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
 from local.gaps.parts.stream_mapping import Answer, Settings, Stream
+from local.keeping.ledger import LedgerError
+from local.keeping.streams import Streams, position_of
 
 _log = logging.getLogger(__name__)
 # AWS waits longer between attempts; tests must not.
@@ -42,7 +45,8 @@ _AHEAD = 2_000 * _SHARDS
 
 def install() -> None:
     """Close the gap in this process."""
-    lambda_svc._poll_dynamodb_streams = StreamMappings().poll
+    # The emulator keeps its streams in the ledger, which is installed before.
+    lambda_svc._poll_dynamodb_streams = StreamMappings(dynamodb._stream_records).poll
 
 
 def is_open() -> bool:
@@ -59,6 +63,7 @@ class _Running:
     mapping: dict[str, Any]
     stream: Stream
     position: int
+    marked: int | None
     busy: set[int] = field(default_factory=set)
     pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
     windows: dict[int, float] = field(default_factory=dict)
@@ -67,10 +72,11 @@ class _Running:
 class StreamMappings:
     """All stream mappings; `poll` replaces ministack's own poller."""
 
-    def __init__(self, clock: Callable[[], float] = time.time) -> None:
-        self._clock = clock
+    def __init__(self, streams: Streams, clock: Callable[[], float] = time.time) -> None:
+        self._streams, self._clock = streams, clock
         self._running: dict[str, _Running] = {}
         self._lock = threading.Lock()
+        self._telling = threading.Lock()
 
     def poll(self) -> bool:
         """Start every invocation that is due; returns whether one was started."""
@@ -117,8 +123,14 @@ class StreamMappings:
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
             # ministack stores where a new mapping begins.
             position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)
+            marked = self._streams.position(mapping["UUID"], mapping["EventSourceArn"])
             running = self._running[mapping["UUID"]] = _Running(
-                account, region, mapping, Stream(settings, partition, _SHARDS), position
+                account,
+                region,
+                mapping,
+                Stream(settings, partition, _SHARDS),
+                position if marked is None else marked,
+                marked,
             )
         elif running.stream.settings != settings and not running.stream.size and not running.busy:
             running.stream = Stream(settings, partition, _SHARDS)
@@ -131,8 +143,9 @@ class StreamMappings:
             return
         running.position = max(running.position, dynamodb.stream_start_position(table))
         records = dynamodb.stream_records_since(table, running.position, _AHEAD - ahead)
-        running.position += len(records)
         running.stream.put(lambda_svc._apply_filter_criteria(records, running.mapping))
+        # After the records: `_tell` asks in the other order.
+        running.position += len(records)
 
     def _invoke(self, running: _Running, function: dict[str, Any], number: int, batch: list[Any]) -> None:
         with request_scope(running.account, running.region):
@@ -156,15 +169,26 @@ class StreamMappings:
             lambda_svc._esm_wake.set()
 
     def _tell(self, running: _Running, function: dict[str, Any]) -> None:
-        """Send discarded records to the mapping's destination."""
-        with self._lock:
-            discarded = running.stream.discarded()
+        """Send discarded records to the mapping's destination, and note how far the mapping is."""
         mapping = running.mapping
-        for one in discarded:
-            _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
-            lambda_svc._send_ddb_stream_failure_record(
-                mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
-            )
+        # No mark may pass records that are on their way to the destination.
+        with self._telling:
+            with self._lock:
+                discarded = running.stream.discarded()
+                position = running.position
+                oldest = running.stream.oldest
+            if oldest is not None:
+                position = position_of(oldest)
+            for one in discarded:
+                _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
+                lambda_svc._send_ddb_stream_failure_record(
+                    mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
+                )
+            if position != running.marked:
+                # A full disk: the records are read again after a restart.
+                with suppress(LedgerError):
+                    self._streams.mark(mapping["UUID"], mapping["EventSourceArn"], position)
+                    running.marked = position
 
 
 def _wake_at(due_s: float | None, now_s: float, windows: dict[int, float], number: int) -> None:

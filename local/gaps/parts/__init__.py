@@ -1,1 +1,1 @@
-"""Parts of gaps: a model of stream mappings, fair threads, ordered partitions, points of metrics."""
+"""Parts of gaps: a model of stream mappings, fair threads, points of metrics."""

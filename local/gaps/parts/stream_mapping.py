@@ -115,6 +115,13 @@ class Lane:
         """The number of records that are neither done nor discarded."""
         return len(self._waiting) + sum(len(part.records) for part in self._parts)
 
+    @property
+    def oldest(self) -> Record | None:
+        """The first record that is neither done nor discarded."""
+        if self._parts:
+            return self._parts[0].records[0]
+        return self._waiting[0][0] if self._waiting else None
+
     def batch(self, now_s: float) -> list[Record]:
         """The records of the next invocation; empty if none wait or the window is still open."""
         self._expire(now_s)
@@ -267,6 +274,12 @@ class Stream:
     def size(self) -> int:
         """The number of records that are neither done nor discarded."""
         return sum(shard.size for shard in self._shards)
+
+    @property
+    def oldest(self) -> Record | None:
+        """The first record that is neither done nor discarded."""
+        found = [record for lane in self.lanes if (record := lane.oldest) is not None]
+        return min(found, key=lambda record: str(record["dynamodb"]["SequenceNumber"]), default=None)
 
     def discarded(self) -> list[Discarded]:
         """The records discarded since the last call."""

@@ -3,7 +3,8 @@
 AWS: stores a partition in the order of its sort key, so that a Query reads only what it returns
   (https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/Query.html).
 ministack: sorts the whole partition for every Query and parses the key condition again for each item. Each
-  Query took longer with every minute of a drive. The answers are the same.
+  Query took longer with every minute of a drive. The answers are the same. The items are in the ledger
+  (local/keeping/items.py), which reads a range of keys.
 Test: tests/local/gaps/test_table_gap.py::test_a_query_reads_only_the_requested_keys
 Patch: none; it needs another data structure for the items of a table
 """
@@ -19,7 +20,8 @@ from unittest.mock import Mock, patch
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb
 
-from local.gaps.parts.partition import SHOWN, Bound, Item, Partition, Shown, Wanted, place_of
+from local.keeping.items import SHOWN, Bound, Bucket, Item, Items, Wanted
+from local.keeping.places import place_of
 
 _REMEMBERED_CONDITIONS = 16_384
 _LOW, _HIGH = {"EQ", "GE", "GT"}, {"EQ", "LE", "LT"}
@@ -28,7 +30,6 @@ _LOW, _HIGH = {"EQ", "GE", "GT"}, {"EQ", "LE", "LT"}
 def install() -> None:
     """Close the gap in this process."""
     dynamodb._condition_syntax_error = lru_cache(_REMEMBERED_CONDITIONS)(dynamodb._condition_syntax_error)
-    dynamodb._set_item = ordering(dynamodb._set_item)
     dynamodb._query = narrowing(dynamodb._query)
     dynamodb._evaluate_condition = evaluating(dynamodb._evaluate_condition)
 
@@ -57,26 +58,6 @@ def is_open() -> bool:
             dynamodb._delete_table({"TableName": name})
 
 
-def ordering(set_item: Callable[..., Any]) -> Callable[..., Any]:
-    """A write of an item that makes a new partition a `Partition`."""
-
-    @wraps(set_item)
-    def keep(table: Mapping[str, Any], partition: Any, place: str, item: Item) -> Any:
-        items = table["items"]
-        if partition not in items and (kind := _sorted_by(table)):
-            items[partition] = Partition(kind)
-        return set_item(table, partition, place, item)
-
-    return keep
-
-
-def _sorted_by(table: Mapping[str, Any]) -> str:
-    """The type of the table's sort key if its order is known here, else ""."""
-    name = table.get("sk_name")
-    kind = dynamodb._get_attr_type(table, name) if name else ""
-    return kind if kind in {"N", "S"} else ""
-
-
 def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
     """A Query that looks only at items that it may return."""
 
@@ -86,7 +67,7 @@ def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
         if found is None:
             return query(data)
         partition, wanted = found
-        token = SHOWN.set(Shown(partition, partition.between(wanted), data.get("ExclusiveStartKey")))
+        token = SHOWN.set(partition.show(wanted, data.get("ExclusiveStartKey")))
         try:
             return query(data)
         finally:
@@ -112,19 +93,21 @@ def evaluating(evaluate: Callable[..., bool]) -> Callable[..., bool]:
     return condition
 
 
-def asked(data: Mapping[str, Any]) -> tuple[Partition, Wanted] | None:
+def asked(data: Mapping[str, Any]) -> tuple[Bucket, Wanted] | None:
     """The partition and range of a Query; None if ministack has to look at all items."""
     table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))
     condition = data.get("KeyConditionExpression")
     if not table or not isinstance(condition, str) or data.get("IndexName") or data.get("KeyConditions"):
         return None
+    items = table["items"]
+    if not isinstance(items, Items) or items.kind not in {"N", "S"}:
+        return None
     try:
         conditions = _conditions(condition, data)
         compared, (value,) = conditions[table["pk_name"]]
-        partition = table["items"].get(dynamodb._extract_key_val(value))
-        if compared != "EQ" or not isinstance(partition, Partition):
+        if compared != "EQ":
             return None
-        kind = partition.kind
+        partition, kind = items[dynamodb._extract_key_val(value)], items.kind
         low, high = _range(kind, *conditions.get(table["sk_name"], ("", ())))
         most, cursor = data.get("Limit"), data.get("ExclusiveStartKey")
         forward = data.get("ScanIndexForward", True) is not False

@@ -19,7 +19,7 @@ _READS = (
     "Query",
     "Scan",
 )
-# Frequent actions on what is in no document: metrics, logs, and messages, which queues.py keeps.
+# Frequent actions on what is in no document: metrics, logs, messages and items.
 _DATA = (
     "PutMetricData",
     "PutLogEvents",
@@ -27,6 +27,14 @@ _DATA = (
     "ReceiveMessage",
     "DeleteMessage",
     "ChangeMessageVis",
+    "PutItem",
+    "UpdateItem",
+    "DeleteItem",
+    "BatchWriteItem",
+    "Transact",
+    "ExecuteStatement",
+    "BatchExecute",
+    "ExecuteTransaction",
 )
 _FORM = "application/x-www-form-urlencoded"
 

@@ -4,8 +4,8 @@ A call that may change a service is answered after its documents are written; a 
 answer. A deployment is kept when it is complete, so that no stack is half made after a restart. What changes
 without a call, such as an alarm's state, is written within seconds.
 
-Elsewhere: tables and their items (items.py), messages (queues.py), objects (objects.py). Points of metrics
-and lines of logs are not kept.
+Elsewhere: items and streams of tables (items.py, streams.py), messages (queues.py), objects (objects.py).
+Points of metrics and lines of logs are not kept.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ INSERT INTO documents (service, store, key, kind, digest, text) VALUES (?, ?, ?,
 ON CONFLICT DO UPDATE SET kind = excluded.kind, digest = excluded.digest, text = excluded.text
 """
 _DELETE = "DELETE FROM documents WHERE service = ? AND store = ? AND key = ?"
-_NO_DOCUMENTS = ("dynamodb", "dynamodb_streams", "iot_data")
+_NO_DOCUMENTS = ("dynamodb_streams", "iot_data")
 
 
 class Services:

@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from ministack.core.responses import AccountRegionScopedDict
-from ministack.services import cloudwatch_logs, iot, lambda_svc, scheduler, sqs, sts
+from ministack.services import cloudwatch_logs, dynamodb, iot, lambda_svc, scheduler, sqs, sts
 
 from local.keeping.services import documents
 from local.keeping.services.documents import State
@@ -63,6 +63,12 @@ def _logs() -> State:
     return state | {"log_groups": _without(state["log_groups"], "streams")}
 
 
+def _tables() -> State:
+    # items.py has the items, and counts them.
+    left_out = "items", "ItemCount", "TableSizeBytes", dynamodb._INDEX_MEMBERS
+    return documents.read(dynamodb) | {"tables": _without(dynamodb._tables, *left_out)}
+
+
 def _queues() -> State:
     state = documents.read(sqs)
     return state | {"queues": _without(state["queues"], "messages")}
@@ -81,11 +87,11 @@ def _sessions() -> State:
     return {"sessions": sts._sessions}
 
 
-def _without(store: AccountRegionScopedDict, name: str) -> AccountRegionScopedDict:
-    """The store's entries without one of their keys."""
+def _without(store: AccountRegionScopedDict, *names: str) -> AccountRegionScopedDict:
+    """The store's entries without some of their keys."""
     shortened = AccountRegionScopedDict()
     for key, entry in store.all_items():
-        shortened._data[key] = {each: value for each, value in entry.items() if each != name}
+        shortened._data[key] = {each: value for each, value in entry.items() if each not in names}
     return shortened
 
 
@@ -114,6 +120,7 @@ def _load_sessions(state: State) -> None:
 
 _READ: dict[str, Callable[[], State]] = {
     "cloudwatch_logs": _logs,
+    "dynamodb": _tables,
     "iot": _things,
     "lambda_svc": _functions,
     "scheduler": _schedules,

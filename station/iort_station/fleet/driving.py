@@ -109,7 +109,7 @@ class Driver:
         self.driver = ""
         self.mine = False
         self.takeover = False
-        self._by = by
+        self.by = by
         self._clock = CloudClock()
         self._clockless = False
         self._held = False
@@ -259,7 +259,7 @@ class Driver:
             valid_ms=DRIVE_LEASE_MS,
             message=limits.message(stick.speed * top_mps, stick.steering * limits.max_steering_rad),
             lease_ms=DRIVE_LEASE_MS,
-            by=self._by,
+            by=self.by,
             takeover=self.takeover,
             ends=ends,
         )

@@ -11,7 +11,9 @@ from collections.abc import Callable, Mapping
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+from iort_contract.messages.settings import MOTION_STOPPED
 from iort_contract.messages.shadow import (
+    STOPS,
     Desired,
     OverShare,
     Rejection,
@@ -35,10 +37,11 @@ _Found = TypeVar("_Found")
 
 
 class State(NamedTuple):
-    """The shadow's desired and reported parts; empty if the robot has none yet."""
+    """The shadow's desired and reported parts, and its version; empty if the robot has none yet."""
 
     desired: Desired = Desired()
     reported: Reported = Reported()
+    version: int = 0
 
     def rejected(self) -> Mapping[str, Rejection]:
         """What the robot rejects of the desired settings; not its rejection of an earlier value."""
@@ -80,8 +83,10 @@ class Shadow:
         return read(self.data, self.robot)
 
     def desire(self, wanted: Mapping[str, Any]) -> None:
-        """Set desired settings by dotted name; None returns to the file's value."""
-        payload = json.dumps({"state": {"desired": nested(wanted)}})
+        """Set desired settings by dotted name; None returns to the file's value. An emergency stop that is
+        asked for so is nobody's, and the robot's own."""
+        notes = {STOPS: None} if MOTION_STOPPED in wanted else {}
+        payload = json.dumps({"state": {"desired": {**nested(wanted), **notes}}})
         self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=payload)
 
     def wait(self, found: Callable[[State], _Found | None], seconds: float) -> _Found | None:
@@ -104,8 +109,10 @@ def read(data: IoTDataPlaneClient, robot: str) -> State:
         answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
     except data.exceptions.ResourceNotFoundException:
         return State()
-    state = json.loads(answer["payload"].read()).get("state", {})
-    return State(decode_desired(state.get("desired")), decode_reported(state.get("reported")))
+    document = json.loads(answer["payload"].read())
+    state = document.get("state", {})
+    desired, reported = decode_desired(state.get("desired")), decode_reported(state.get("reported"))
+    return State(desired, reported, document.get("version", 0))
 
 
 def answered(wanted: Mapping[str, Any], state: State) -> bool | None:

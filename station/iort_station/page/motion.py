@@ -64,12 +64,18 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     fleet = _fleet(cloud)
 
     def stop(asked: Mapping[str, str]) -> MotionAnswer:
-        """Stop ``robot``, or release it; without one, the fleet."""
+        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped."""
         wanted = {"true": True, "false": False}.get(text(asked, "stopped"))
         if wanted is None:
             raise StationError("stopped must be true or false")
-        robots = [check_robot(asked["robot"])] if asked.get("robot") else list(registry.presence(cloud))
-        failed = stopping.stop(cloud, robots, stopped=wanted)
+        one = [check_robot(asked["robot"])] if asked.get("robot") else None
+        robots = one or list(registry.presence(cloud))
+        if wanted:
+            failed = stopping.stop(cloud, robots, by=user(), fleet=one is None)
+        elif one is not None:
+            failed = stopping.release(cloud, one, by=user())
+        else:
+            failed = stopping.release_fleet(cloud, robots, by=user())
         fleet.forget()
         return _told(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
 
@@ -85,5 +91,8 @@ def _entry(one: stopping.Motion) -> MotionEntry:
         "asked": one.asked,
         "stopped": one.stopped,
         "reason": one.reason,
+        "alone": one.alone,
+        "by": one.by.by if one.by is not None else "",
+        "at_ms": one.by.t_ms if one.by is not None else 0,
         "drive": None if one.drive is None else {**asdict(one.drive)},  # type: ignore[typeddict-item]  # its fields
     }

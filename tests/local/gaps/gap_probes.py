@@ -18,7 +18,7 @@ from unittest.mock import MagicMock, Mock, patch
 from ministack import app as ministack_app
 from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
-from ministack.services import cloudwatch_logs, iot, iot_data, lambda_svc, sqs
+from ministack.services import cloudwatch_logs, dynamodb, iot, iot_data, lambda_svc, sqs
 
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",
@@ -279,6 +279,11 @@ def unsigned_websocket() -> bool:
     """Ask whether an unsigned upgrade is refused where requests are checked."""
     with patch.object(ministack_app, "AUTH", True):
         return iot._ws_handshake_check(HANDSHAKE) is None
+
+
+def ttl_pass() -> bool:
+    """Ask for the function."""
+    return not hasattr(dynamodb, "_expire_items")
 
 
 def function_credentials() -> bool:

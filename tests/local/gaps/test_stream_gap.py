@@ -14,13 +14,19 @@ from ministack.services import dynamodb, lambda_svc, sqs
 
 from local.gaps.functions.stream_retries import StreamMappings
 from tests.local.gaps import series_table
+from tests.local.keeping.in_process import ACCOUNT, REGION, kept
 
-ACCOUNT, REGION = "000000000000", "eu-west-1"
 QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
 
 
 @pytest.fixture
-def cloud(monkeypatch):
+def streams(tmp_path):
+    with kept(tmp_path / "ledger.db") as streams:
+        yield streams
+
+
+@pytest.fixture
+def cloud(monkeypatch, streams):
     """Make a table with a stream, a queue, and a function whose answer the test sets."""
     with request_scope(ACCOUNT, REGION):
         series_table.create("gap", StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"})
@@ -41,15 +47,15 @@ def cloud(monkeypatch):
         monkeypatch.setattr(
             lambda_svc, "_get_func_record_for_qualifier", lambda *_: (function, function["config"])
         )
-        yield Cloud(monkeypatch)
+        yield Cloud(monkeypatch, streams)
         del lambda_svc._esms["gap-mapping"]
         dynamodb._delete_table({"TableName": "gap"})
         sqs._queues.clear()
 
 
 class Cloud:
-    def __init__(self, monkeypatch):
-        self.mappings, self.seen = StreamMappings(), []
+    def __init__(self, monkeypatch, streams):
+        self.streams, self.mappings, self.seen = streams, StreamMappings(streams), []
         self.answer = lambda _numbers: {"body": None}
         self.running = self.most = 0
         self._lock = threading.Lock()
@@ -132,7 +138,7 @@ def test_a_throttled_batch_is_retried_without_loss(cloud):
 def test_a_batching_window_collects_its_records(cloud):
     lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 2
     now = 1_000.0
-    cloud.mappings = StreamMappings(lambda: now)
+    cloud.mappings = StreamMappings(cloud.streams, lambda: now)
     cloud.put(0)
     assert not cloud.mappings.poll()
     now += 1.5
@@ -152,3 +158,26 @@ def test_the_poller_wakes_at_the_end_of_the_window(cloud):
     assert lambda_svc._esm_wake.wait(60)
     cloud.poll_until(lambda: cloud.seen)
     assert cloud.seen == [[0]]
+
+
+def test_a_mapping_goes_on_after_a_restart_with_what_it_had_not_finished(cloud):
+    cloud.answer = lambda numbers: {"error": 6 in numbers, "body": None}
+    lambda_svc._esms["gap-mapping"]["MaximumRetryAttempts"] = -1
+    cloud.put(*range(8))
+    cloud.poll_until(lambda: cloud.seen.count([6]) > 1)
+    cloud.seen.clear()
+    # A new poller knows what the ledger has.
+    cloud.answer = lambda _numbers: {"body": None}
+    cloud.mappings = StreamMappings(cloud.streams)
+    cloud.poll_until(lambda: cloud.seen and cloud.seen[-1][-1] == 7)
+    assert cloud.seen == [[6, 7]]
+
+
+def test_a_new_mapping_of_the_latest_records_misses_none_in_a_restart(cloud):
+    lambda_svc._esms["gap-mapping"]["StartingPosition"] = "LATEST"
+    cloud.put(0)
+    assert not cloud.mappings.poll()
+    cloud.put(1)
+    cloud.mappings = StreamMappings(cloud.streams)
+    cloud.poll_until(lambda: cloud.seen)
+    assert cloud.seen == [[1]]

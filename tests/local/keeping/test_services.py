@@ -65,6 +65,17 @@ def test_all_that_calls_have_made_is_there_after_a_kill(emulator):
     states = emulator.client("stepfunctions")
     machine = states.create_state_machine(name="wait", definition=json.dumps(_WAIT), roleArn=_ROLE)
     execution = states.start_execution(stateMachineArn=machine["stateMachineArn"])["executionArn"]
+    tables = emulator.client("dynamodb")
+    tables.create_table(
+        TableName="table",
+        KeySchema=[{"AttributeName": "key", "KeyType": "HASH"}],
+        AttributeDefinitions=[{"AttributeName": "key", "AttributeType": "S"}],
+        BillingMode="PAY_PER_REQUEST",
+        StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
+    )
+    for key in ("kept", "deleted"):
+        tables.put_item(TableName="table", Item={"key": {"S": key}})
+    tables.delete_item(TableName="table", Key={"key": {"S": "deleted"}})
     session = emulator.client("sts").assume_role(RoleArn=_ROLE, RoleSessionName="viewer")["Credentials"]
 
     emulator.restart()
@@ -82,6 +93,9 @@ def test_all_that_calls_have_made_is_there_after_a_kill(emulator):
     assert (got["Body"].read(), got["Metadata"]) == (b"bytes", {"robot": "car1"})
     assert [one["Key"] for one in s3.list_objects_v2(Bucket="bucket")["Contents"]] == ["a/object"]
     assert states.describe_execution(executionArn=execution)["status"] == "RUNNING"
+    described = tables.describe_table(TableName="table")["Table"]
+    assert (described["ItemCount"], described["StreamSpecification"]["StreamEnabled"]) == (1, True)
+    assert tables.scan(TableName="table")["Items"] == [{"key": {"S": "kept"}}]
     viewer = emulator.client("sts", session).get_caller_identity()["Arn"]
     assert viewer.endswith("assumed-role/anybody/viewer")
 

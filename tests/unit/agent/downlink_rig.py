@@ -14,6 +14,7 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.control.motion.commands import Operator
+from iort_agent.control.motion.stops import STOP_AHEAD_MS
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.trigger import OnTrigger
@@ -48,6 +49,8 @@ TYPES = {
     "geometry_msgs/PoseStamped": POSE,
 }
 T0 = 1_700_000_000_000_000
+# For the agent, 0.3 s.
+LEASE_MS = 300 + STOP_AHEAD_MS
 
 
 def doubles(*values: float) -> bytes:
@@ -129,7 +132,7 @@ CONFIG: dict[str, Any] = {
 class Rig:
     def __init__(
         self, robot: str = "car1", *, share: Any = None, uplink: Loopback | None = None, clock: Any = None,
-        graph: Any = None, **config: Any,
+        graph: Any = None, guard: Any = None, **config: Any,
     ) -> None:  # fmt: skip
         self.clock = clock or ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
@@ -146,6 +149,7 @@ class Rig:
             link=link_of(self.uplink, self.clock, robot=robot),
             boot="0badcafe",
             graph=graph or self.graph,
+            guard=guard,
             offset=lambda: self.offset,
             operator=Operator(
                 lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
@@ -159,7 +163,7 @@ class Rig:
 
     def send(self, message: Any, *, name: str = "speed", raw: bytes | None = None, **changes: Any) -> None:
         now_us = self.clock.now_us()
-        command = Command("feedbeef", now_us - 10, self.seq, now_us, 500, message, 300)
+        command = Command("feedbeef", now_us - 10, self.seq, now_us, 500, message, LEASE_MS)
         self.seq += 1
         payload = raw if raw is not None else encode_command(replace(command, **changes))
         self.uplink.deliver(f"cmd/iort/car1/{name}", payload)

@@ -9,7 +9,9 @@ import pytest
 
 from iort_agent.clock import SystemClock
 from iort_agent.common.state import ClockOffset
-from tests.unit.agent.downlink_rig import CONFIG, T0, Rig, doubles
+from iort_agent.control.motion.stops import STOP_AHEAD_MS
+from tests.agent_fakes import ManualClock
+from tests.unit.agent.downlink_rig import CONFIG, LEASE_MS, T0, Rig, doubles
 
 
 def test_a_command_becomes_a_ros_message() -> None:
@@ -170,6 +172,51 @@ def test_a_lease_that_ends_stops_the_car(caplog: pytest.LogCaptureFixture) -> No
     assert caplog.text.count("nobody renews it, stopping") == 1
     rig.send({"data": 1.0})
     assert rig.graph.published[-1][1] == doubles(1.0)
+
+
+class FakeGuard:
+    """What the guard was told, and when."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        self.clock = clock
+        self.told: list[tuple[float, float | None, bool]] = []
+
+    def ready(self) -> bool:
+        return True
+
+    def tell(self, _topic: str, until: float | None, *, held: bool) -> bool:
+        self.told.append((self.clock.monotonic(), until, held))
+        return True
+
+    def tick(self) -> None:
+        pass
+
+
+def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
+    clock = ManualClock(now_us=T0)
+    guard = FakeGuard(clock)
+    rig = Rig(clock=clock, guard=guard)
+    ahead_s = STOP_AHEAD_MS / 1000
+    rig.send({"data": 2.5})
+    rig.send({"data": 2.5}, lease_ms=STOP_AHEAD_MS + 1)
+    clock.advance(0.001)
+    rig.downlink.tick()
+    # A driver lets go: the guard's stop must not overtake the motion before it.
+    rig.send({"data": 1.0})
+    rig.send({"data": 0.0}, ends=True)
+    rig.downlink.tick()
+    rig.downlink.set_stopped(True)
+    at = clock.monotonic()
+    began = at - 0.001
+    assert guard.told == [
+        (began, pytest.approx(began + LEASE_MS / 1000), False),
+        (began, pytest.approx(began + 0.001 + ahead_s), False),
+        (at, None, False),
+        (at, pytest.approx(at + LEASE_MS / 1000), False),
+        (at, pytest.approx(at + ahead_s), False),
+        (at, None, False),
+        (at, None, True),
+    ]
 
 
 def test_two_names_of_one_topic_share_its_lease() -> None:

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iort_agent.control.motion.leases import Leases, Limits
-from iort_agent.control.motion.stops import STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS
+from iort_agent.control.motion.stops import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS
 from iort_contract.messages.commands import Command
 from iort_contract.messages.driving import (
     BEGIN_AGAIN,
@@ -25,7 +25,8 @@ from iort_contract.messages.driving import (
 )
 
 T0 = 1_700_000_000_000_000
-LIMITS = Limits(max_age_s=1.0, max_ahead_s=0.5, lease_s=0.5)
+# A lease ends early for the agent: here after 0.5 s, that of a command after 0.3 s.
+LIMITS = Limits(max_age_s=1.0, max_ahead_s=0.5, lease_s=0.5 + STOP_AHEAD_MS / 1000)
 
 
 def command(seq: int = 0, **changes: Any) -> Command:
@@ -35,7 +36,7 @@ def command(seq: int = 0, **changes: Any) -> Command:
         "sent_us": T0,
         "valid_ms": 800,
     }
-    return Command(**{**settings, "seq": seq, "message": {}, "lease_ms": 300, **changes})
+    return Command(**{**settings, "seq": seq, "message": {}, "lease_ms": 300 + STOP_AHEAD_MS, **changes})
 
 
 @pytest.mark.parametrize(
@@ -170,7 +171,7 @@ def test_the_end_of_a_lease_repeats_the_stop_a_few_times() -> None:
 def test_the_robots_own_limit_is_the_shorter_one() -> None:
     leases = Leases()
     leases.offer(command(lease_ms=10_000), LIMITS, now_us=T0, uncertainty_us=0, now=0)
-    assert leases.next_due() == 0.5
+    assert leases.next_due() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(("age_us", "uncertainty_us"), [(200_000, 0), (50_000, 150_000), (0, 200_000)])
@@ -202,6 +203,19 @@ def test_a_newer_command_ends_the_stops() -> None:
     assert leases.stop_due(0.3)
     assert leases.offer(command(1), LIMITS, now_us=T0, uncertainty_us=0, now=0.4) is None
     assert not leases.stop_due(0.6)
+
+
+def test_what_a_session_sent_before_the_stop_moves_nothing_after_it() -> None:
+    leases = Leases()
+    assert offered(leases, A, seq=0) is None
+    assert leases.stop_due(0.3)
+    # It was long on its way: for 0.2 s, and for 0.05 s.
+    late, soon = (
+        command(seq, session=A, started_us=T0, sent_us=T0 + at) for seq, at in ((1, 150_000), (2, 300_000))
+    )
+    times = {"now_us": T0 + 350_000, "uncertainty_us": 0, "now": 0.35}
+    assert leases.offer(late, LIMITS, **times) == LEASE_OVER
+    assert leases.offer(soon, LIMITS, **times) is None
 
 
 def test_cut_and_closed() -> None:
@@ -245,7 +259,7 @@ TICK = 0.05
 def left_s(motion: Command, latest_us: int) -> float:
     """The rest of a lease, at the latest time that it may be."""
     assert motion.lease_ms is not None
-    left = min(motion.lease_ms / 1000, 0.5) - max(0, latest_us - motion.sent_us) / 1e6
+    left = min((motion.lease_ms - STOP_AHEAD_MS) / 1000, 0.5) - max(0, latest_us - motion.sent_us) / 1e6
     assert left > 0, "what has no time left does not move"
     return left
 
@@ -261,6 +275,7 @@ class Model:
         self.passed: list[Command] = []
         self.refused: set[str] = set()  # sessions that an emergency stop ended
         self.moving_until: float | None = None  # the last motion's end
+        self.stopped = -1e9  # when the last motion ended
 
     def tick(self) -> None:
         due = self.leases.next_due()
@@ -269,7 +284,7 @@ class Model:
         assert due is not None or not self.held, "an emergency stop goes on"
         if self.moving_until is not None and self.now >= self.moving_until:
             assert said, "a stop follows the last motion by the first tick after its lease"
-            self.moving_until = None
+            self.moving_until, self.stopped = None, self.now
         elif said:
             assert self.moving_until is None, "nothing stops a motion whose lease holds"
 
@@ -315,6 +330,8 @@ class Model:
         assert event.session not in self.refused
         if self.moving_until is not None and self.now < self.moving_until:
             assert event.takeover or event.session == self.passed[-1].session
+        if self.passed and event.session == self.passed[-1].session:
+            assert self.now - (now_us + uncertainty_us - event.sent_us) / 1e6 >= self.stopped
         self.passed.append(event)
         self.moving_until = self.now + left_s(event, now_us + uncertainty_us)
 

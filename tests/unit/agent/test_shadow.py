@@ -278,6 +278,14 @@ def test_an_emergency_stop_outlives_the_shadow_that_asked_for_it() -> None:
     assert not rig.applied[-1].motion_stopped
 
 
+def test_a_stop_of_the_robots_own_file_is_not_the_operators_to_release() -> None:
+    base = replace(BASE, motion_stopped=True)
+    settings, rejected = overlay(base, base, {"motion.stopped": False}, {})
+    assert settings.motion_stopped
+    assert "car.yaml has motion: {stopped: true}" in rejected["motion.stopped"].reason
+    assert overlay(base, base, {"motion.stopped": True}, {})[1] == {}
+
+
 def test_a_robot_without_motion_does_not_seem_to_be_stopped() -> None:
     desired = {"motion.stopped": True}
     settings, rejected = overlay(BASE, BASE, desired, {}, moves=False)

@@ -29,8 +29,8 @@ def test_the_emergency_stop_ends_the_hold_at_once_and_is_not_taken_for_done_if_i
     seat.broker.publish = lambda topic, message: sent.append((topic, message))
     driver.phase, driver._held, driver._session = Phase.STARTING, True, "0badcafe"
 
-    def stop(_cloud: Any, robots: list[str], *, stopped: bool) -> dict[str, str]:
-        assert stopped
+    def stop(_cloud: Any, robots: list[str], *, by: str) -> dict[str, str]:
+        assert by == "anna"
         assert decode_command(sent[-1][1]).ends
         return {robots[0]: "Throttling"}
 

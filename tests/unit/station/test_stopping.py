@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from typing import Any
 
 import pytest
 from botocore.exceptions import ClientError
 
+from iort_agent.control.shadow import _merged
 from iort_contract.messages.driving import DriveLimits, encode_limits
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
+from iort_station.operations.alarms import user
 from iort_station.page import motion
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
@@ -27,6 +30,9 @@ class Shadows:
     def __init__(self) -> None:
         self.states: dict[str, Any] = {"car7": {"reported": {"drive": encode_limits(LIMITS)}}}
         self.broken = ""
+        self.version = 1
+        # Called when a shadow has been read.
+        self.read = lambda: None
 
     def client(self, _service: str) -> Shadows:
         return self
@@ -34,12 +40,17 @@ class Shadows:
     def get_thing_shadow(self, *, thingName: str, shadowName: str) -> dict[str, Any]:
         if thingName not in self.states:
             raise self.exceptions.ResourceNotFoundException
-        return {"payload": io.BytesIO(json.dumps({"state": self.states[thingName]}).encode())}
+        state = {"state": self.states[thingName], "version": self.version}
+        self.read()
+        return {"payload": io.BytesIO(json.dumps(state).encode())}
 
     def update_thing_shadow(self, *, thingName: str, shadowName: str, payload: str) -> None:
         if thingName == self.broken:
             raise ClientError({"Error": {"Code": "ThrottlingException"}}, "UpdateThingShadow")
-        self.states.setdefault(thingName, {}).update(json.loads(payload)["state"])
+        document = json.loads(payload)
+        if document.get("version", self.version) != self.version:
+            raise ClientError({"Error": {"Code": "ConflictException"}}, "UpdateThingShadow")
+        self.states[thingName] = _merged(self.states.get(thingName, {}), document["state"])
 
     def confirm(self, robot: str, *, stopped: bool) -> None:
         self.states[robot].setdefault("reported", {})["motion"] = {"stopped": stopped}
@@ -81,6 +92,34 @@ def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release
     cloud.confirm("car7", stopped=True)
     told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (True, True)
+
+
+def test_the_release_of_the_fleet_leaves_a_robot_that_was_stopped_alone(cloud):
+    act = motion.actions(cloud)["stop"]
+    act({"robot": "car7", "stopped": "true"})
+    told = act({"stopped": "true"})["robots"]
+    assert {robot: one["alone"] for robot, one in told.items()} == {"car7": True, "car8": False}
+    assert told["car8"]["by"] == user()
+    assert abs(told["car8"]["at_ms"] / 1000 - time.time()) < 60
+    told = act({"stopped": "false"})["robots"]
+    assert {robot: one["asked"] for robot, one in told.items()} == {"car7": True, "car8": False}
+    assert told["car8"]["by"] == user(), "who released it"
+    assert not act({"robot": "car7", "stopped": "false"})["robots"]["car7"]["asked"]
+    # Stopped by an older station, or by `iort config`: nobody knows with what.
+    cloud.states["car8"] = {"desired": {"motion": {"stopped": True}}}
+    assert act({"stopped": "false"})["robots"]["car8"]["asked"]
+
+
+def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
+    act = motion.actions(cloud)["stop"]
+    act({"stopped": "true"})
+
+    def somebody_stops() -> None:
+        cloud.version += 1
+
+    cloud.read = somebody_stops
+    assert set(act({"stopped": "false"})["failed"]) >= {"car7"}
+    assert cloud.states["car7"]["desired"]["motion"]["stopped"]
 
 
 def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):

@@ -12,6 +12,7 @@ from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.motion.driving import limited
 from iort_agent.control.motion.guard import Guard
 from iort_agent.control.motion.named import Motion, Named
+from iort_agent.control.motion.stops import STOP_AHEAD_MS
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.commands import Command, decode_command
@@ -146,7 +147,9 @@ class Commands:
         if self._guard is None or known == motion.guarded:
             return True
         motion.guarded = known
-        return self._guard.tell(motion.topic, motion.leases.ends, held=motion.leases.held)
+        ends = motion.leases.ends
+        until = None if ends is None else ends + STOP_AHEAD_MS / 1000
+        return self._guard.tell(motion.topic, until, held=motion.leases.held)
 
     def _begin_stop(self, motion: Motion, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""

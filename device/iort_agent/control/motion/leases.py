@@ -1,12 +1,15 @@
 """Decides which commands may pass and when the robot must be stopped. Knows neither clock nor ROS.
 
 A motion command is valid for a lease, counted from when it was sent. A command that was long on its way, or
-that waited in a frozen robot, has less of its lease left, or nothing. When the lease ends without a newer
-command, a stop is due (`iort_agent.control.motion.stops`).
+that waited in a frozen robot, has less of its lease left, or nothing. `STOP_AHEAD_MS` before the lease ends
+without a newer command, a stop is due (`iort_agent.control.motion.stops`).
 
 One session drives at a time: while its lease holds, another one is refused unless it takes over. A session
 that was refused so, or that an emergency stop ended, stays refused: a stick that is still held must not move
 the robot at the moment when the other driver lets go, or when the stop is released.
+
+What a session has sent before its lease ended moves nothing after the stop, even if it came late and its own
+lease still holds.
 
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
 within the uncertainty of its measured offset (`iort_agent.lanes.clock_offset`), and counts a command as old
@@ -18,7 +21,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from iort_agent.control.motion.stops import Stops
+from iort_agent.control.motion.stops import STOP_AHEAD_MS, Stops
 from iort_contract.messages.commands import Command
 from iort_contract.messages.driving import (
     BEGIN_AGAIN,
@@ -69,7 +72,7 @@ class Leases(Stops):
         lease_s = _lease_s(command, limits, age_us)
         reason = self._rejection(command, limits, age_us, uncertainty_us, lease_s)
         if reason is None and lease_s is not None:
-            reason = self._other_driver(command, now)
+            reason = self._other_driver(command, now) or self._stopped_since(command, age_us, now)
         if reason is not None:
             return reason
         self.last = command
@@ -125,6 +128,11 @@ class Leases(Stops):
             self._refuse(command.session)
         return reason
 
+    def _stopped_since(self, command: Command, age_us: int, now: float) -> str | None:
+        """Why a motion may not pass that its session sent before the robot was stopped: it would jerk."""
+        same = self.last is not None and self.last.session == command.session
+        return LEASE_OVER if same and not command.ends and now - age_us / 1e6 < self.ended else None
+
     def _rejection(
         self,
         command: Command,
@@ -152,8 +160,9 @@ class Leases(Stops):
 
 
 def _lease_s(command: Command, limits: Limits, age_us: int) -> float | None:
-    """The rest of the lease; None for a command that moves nothing."""
+    """The rest of the lease for the agent; None for a command that moves nothing."""
     if limits.lease_s is None or command.lease_ms is None:
         return None
     # A sender whose clock is ahead gets no more than the whole lease.
-    return min(command.lease_ms / 1000, limits.lease_s) - max(0, age_us) / 1e6
+    lease_ms = min(command.lease_ms, limits.lease_s * 1000) - STOP_AHEAD_MS
+    return lease_ms / 1000 - max(0, age_us) / 1e6

@@ -15,6 +15,9 @@ STOP_REPEATS = 4
 STOP_REPEAT_S = 0.25
 # Between the stops of an emergency stop. A multiplexer that ranks drivers forgets one after some 200 ms.
 STOP_HOLD_S = 0.1
+# The agent ends a lease this much early. At its very end the guard publishes the stop, if the agent has not:
+# two processes that publish at one moment are heard in any order, and a stop could seem to precede a motion.
+STOP_AHEAD_MS = 30
 
 
 class Stops:
@@ -23,6 +26,8 @@ class Stops:
     def __init__(self) -> None:
         # The end of the current lease.
         self.ends: float | None = None
+        # When the newest lease was over and the first stop was due.
+        self.ended = -math.inf
         # Whether an emergency stop holds.
         self.held = False
         # The stops still to publish: infinitely many in an emergency stop.
@@ -36,7 +41,7 @@ class Stops:
     def stop_due(self, now: float) -> bool:
         """Whether the caller must publish a stop now."""
         if self.ends is not None and now >= self.ends:
-            self.ends = None
+            self.ends, self.ended = None, now
             self._stops, self._next_stop = STOP_REPEATS + 1, now
         if not self._stops or now < self._next_stop:
             return False

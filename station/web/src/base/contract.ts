@@ -38,7 +38,7 @@ export const REFUSALS = {
   "repeated_or_out_of_order": "a later command of the session has passed",
   "settings_unknown": "the robot has just connected, and does not know yet whether it must stand still",
   "clock_offset_unknown": "the robot does not know the cloud's time yet",
-  "lease_over": "the command's lease had ended when it came",
+  "lease_over": "the command's lease had ended when it came, or the robot was stopped after it was sent",
   "stale": "the command was too old when it came",
   "from_the_future": "the command's time lies in the future: the sender's clock is wrong",
   "without_lease": "a motion needs `lease_ms`",
@@ -657,11 +657,14 @@ export interface DriveLimitsEntry {
   readonly lease_ms: number;
 }
 
-/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it. ``drive`` is null if a stick cannot drive it. */
+/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it. */
 export interface MotionEntry {
   readonly asked: boolean;
   readonly stopped: boolean | null;
   readonly reason: string;
+  readonly alone: boolean;
+  readonly by: string;
+  readonly at_ms: number;
   readonly drive: DriveLimitsEntry | null;
 }
 

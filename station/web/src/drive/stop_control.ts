@@ -3,6 +3,7 @@
 
 import type { Config } from "../base/contract";
 import { el, onPress, setAttribute, Text } from "../base/dom";
+import { dayTime } from "../base/format";
 import { Stops } from "./stops";
 
 // A longer list of names says nothing more.
@@ -47,25 +48,27 @@ export class StopControl {
 
   private ask(sure: boolean): void {
     this.sure = sure;
-    const whom = this.robot ?? "all";
-    this.release.textContent = sure ? `Really release ${whom}: it may move` : `Release ${whom}`;
+    const whom = this.robot ?? listed(this.stops.held.fleet);
+    this.release.textContent = sure ? `Really release ${whom}: may move` : `Release ${this.robot ?? "all"}`;
     setAttribute(this.release, "data-sure", String(sure));
   }
 
   private show(): void {
     const { stand, pending } = this.stops.stopped;
-    const refused = this.robot === undefined ? "" : (this.stops.of(this.robot)?.reason ?? "");
+    const { fleet, alone } = this.stops.held;
+    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
     const texts = [
       ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
       ...(pending.length > 0 ? [`Not confirmed by ${listed(pending)}.`] : []),
-      ...(refused && this.stops.of(this.robot!)!.asked ? [`${this.robot} rejects the stop: ${refused}.`] : []),
+      ...(one?.asked && one.by ? [`Stopped by ${one.by}, ${dayTime(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`] : []),
+      ...(this.robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
+      ...(one?.reason ? [`${this.robot} rejects the ${one.asked ? "stop" : "release"}: ${one.reason}.`] : []),
       ...(this.stops.error ? [`${this.stops.error}.`] : []),
     ];
     this.words.set(texts.join(" "));
     this.strip.hidden = texts.length === 0;
     setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== ""));
-    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
-    const any = this.robot === undefined ? stand.length + pending.length > 0 : one !== undefined && (one.asked || one.stopped === true);
+    const any = this.robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
     this.release.hidden = !this.stops.able || !any;
   }
 }

@@ -41,6 +41,12 @@ export class Stops {
     return { stand: names.filter((name) => this.robots[name]!.stopped === true && !pending.includes(name)), pending };
   }
 
+  /** The cars that a stop of the fleet holds, which the fleet's release ends; and those that were stopped alone. */
+  get held(): { readonly fleet: string[]; readonly alone: string[] } {
+    const asked = Object.keys(this.robots).filter((name) => this.robots[name]!.asked);
+    return { fleet: asked.filter((name) => !this.robots[name]!.alone), alone: asked.filter((name) => this.robots[name]!.alone) };
+  }
+
   /** Stop a car, or every one; or release it. */
   async set(robot: string | undefined, stopped: boolean): Promise<void> {
     this.error = "";

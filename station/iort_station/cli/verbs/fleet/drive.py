@@ -159,7 +159,7 @@ class _Seat:
         self._keys.let_go()
         # The broker is faster than the shadow.
         self._tick(now_us)
-        failed = stopping.stop(self._cloud, [self._robot], stopped=True)
+        failed = stopping.stop(self._cloud, [self._robot], by=self._driver.by)
         if failed:
             raise StationError(f"the emergency stop of {self._robot} has failed: {failed[self._robot]}")
         self._stop_asked = True

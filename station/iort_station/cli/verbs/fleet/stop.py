@@ -15,6 +15,8 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry, stopping
 from iort_station.fleet.stopping import Motion
+from iort_station.operations import alarms
+from iort_station.times import iso_s
 
 commands = typer.Typer()
 _POLL_S, _AGAIN_S = 0.3, 2.0
@@ -34,22 +36,33 @@ def stop(
     """Stop robots in an emergency, until --release.
 
     A robot ends every motion by command at once and refuses new ones, also after it or the cloud restarts.
-    One that is not connected does so before it takes a command again. Exit status 1 unless every robot that
-    is connected has confirmed it.
+    One that is not connected does so before it takes a command again. --all --release releases what a stop of
+    all has stopped: a robot that was also stopped by its name stays. Exit status 1 unless every robot that is
+    connected has confirmed it.
     """
     if bool(robots) == everyone:
         raise UsageError("give the robots' names, or --all")
     cloud = context.obj.cloud()
     presence = registry.presence(cloud)
     names = sorted(presence) if everyone else list(dict.fromkeys(robots or []))
-    failed = stopping.stop(cloud, names, stopped=not release)
-    online = [name for name in names if name not in failed and presence[name]["online"]]
+    failed = _ask(cloud, names, everyone=everyone, release=release)
+    stays = stopping.motion(cloud, names) if everyone and release else {}
+    stays = {name: one for name, one in stays.items() if one.alone}
+    online = [name for name in names if name not in {**failed, **stays} and presence[name]["online"]]
     with errors.status("waiting for the robots"):
         found = _wait(cloud, online, seconds, stopped=not release)
     found |= stopping.motion(cloud, [name for name in names if name not in found])
-    told = {name: failed.get(name) or _told(found[name], stopped=not release) for name in names}
+    told = {
+        name: failed.get(name) or _told(found[name], stopped=not release, stays=name in stays)
+        for name in names
+    }
     if as_json:
-        print_json({name: {"stopped": found[name].stopped, "text": text} for name, text in told.items()})
+        print_json(
+            {
+                name: {"stopped": found[name].stopped, "text": text, "by": _by(found[name])}
+                for name, text in told.items()
+            }
+        )
     else:
         for name, text in told.items():
             out.print(f"{name}: {text}", soft_wrap=True)
@@ -57,6 +70,13 @@ def stop(
         say("no robot is registered")
     if failed or any(not _done(found[name], stopped=not release) for name in online):
         raise StationError("not every robot has confirmed it")
+
+
+def _ask(cloud: Cloud, names: list[str], *, everyone: bool, release: bool) -> dict[str, str]:
+    by = alarms.user()
+    if not release:
+        return stopping.stop(cloud, names, by=by, fleet=everyone)
+    return (stopping.release_fleet if everyone else stopping.release)(cloud, names, by=by)
 
 
 def _wait(cloud: Cloud, names: list[str], seconds: float, *, stopped: bool) -> dict[str, Motion]:
@@ -69,7 +89,7 @@ def _wait(cloud: Cloud, names: list[str], seconds: float, *, stopped: bool) -> d
             return found
         if time.monotonic() > again:
             # A robot that has missed the change learns from the next one that it has.
-            stopping.stop(cloud, waits, stopped=stopped)
+            stopping.repeat(cloud, waits)
             again += _AGAIN_S
         # A shadow sends no events to this API.
         time.sleep(_POLL_S)
@@ -79,9 +99,15 @@ def _done(one: Motion, *, stopped: bool) -> bool:
     return bool(one.stopped) is stopped
 
 
-def _told(one: Motion, *, stopped: bool) -> str:
+def _by(one: Motion) -> str:
+    return f"{one.by.by} at {iso_s(one.by.t_ms * 1000)}" if one.by is not None else ""
+
+
+def _told(one: Motion, *, stopped: bool, stays: bool) -> str:
+    if stays:
+        return f"stays stopped, by {_by(one) or 'somebody'}: release it by its name"
     if one.reason:
-        return f"not stopped: {one.reason}"
+        return f"not {'stopped' if stopped else 'released'}: {one.reason}"
     if _done(one, stopped=stopped):
         return "stopped" if stopped else "released"
     return f"not confirmed: it {'stops' if stopped else 'is released'} when it is connected"
