@@ -36,6 +36,8 @@ def count(cloud: Cloud, robot: str) -> Counted:
         )
         for name in inventory.known(cloud, robot)
     ]
+    # A known stream of which the agent took nothing has no audit.
+    audits = [one for one in audits if one.runs or one.refused or one.taken is not None]
     runs = [run for one in audits for run in one.runs]
     short = sum(abs(each.samples or 1) for one in audits for each in one.shortfalls)
     return Counted(

@@ -38,7 +38,8 @@ class Kills:
     @property
     def good(self) -> bool:
         """Whether nothing is lost and everything is summarised."""
-        return all(not one.lost and one.summarized == one.expected for one in self.cars.values())
+        cars = self.cars.values()
+        return all(not one.incomplete and one.summarized == one.expected for one in cars)
 
     def as_json(self) -> dict[str, Any]:
         """All figures."""
@@ -67,6 +68,7 @@ def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Ki
     chance = random.Random(seed)  # noqa: S311 - moments, no secrets
     killed, restarts = Counter[str](), []
     say("starting the cloud")
+    folder.mkdir(parents=True)
     with Up(folder / "state") as up, ExitStack() as driving:
         settings: dict[str, Any] = {
             "sources": [{"type": "sim", "rate_hz": RATE_HZ, "pose": {"rate_hz": 0}}],
