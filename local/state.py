@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from iort_station.kept import lock_of
 from local.certificates import write_private
 from local.errors import LocalError
 
@@ -112,11 +113,6 @@ class StateFolder:
         if not path.exists():
             write_private(path, secrets.token_hex(size).encode())
         return path.read_text()
-
-
-def lock_of(folder: Path) -> Path:
-    """The file that an embedded cloud locks while it runs; it has its process id."""
-    return folder.parent / f"{folder.name}.lock"
 
 
 def _free(host: str, port: int) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fcntl
 import os
 import signal
 import sys
@@ -11,8 +10,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from iort_station.kept import owner
 from local.errors import LocalError
-from local.state import lock_of
 from local.up.run import add_state
 
 _ENDS_S = 60.0
@@ -50,19 +49,6 @@ def stop(folder: Path) -> bool:
         # It is no child of ours, so nothing tells its end.
         time.sleep(_POLL_S)
     return True
-
-
-def owner(folder: Path) -> int | None:
-    """The process that holds a folder's lock, if there is one."""
-    try:
-        with lock_of(folder).open() as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except OSError:
-                return int(lock.read())
-    except (FileNotFoundError, ValueError):
-        pass
-    return None
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Mapping
@@ -21,6 +22,24 @@ def folder(environment: Mapping[str, str] = os.environ) -> Path:
         environment.get("XDG_DATA_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".local/share"
     )
     return Path(home) / "iort" / "cloud"
+
+
+def lock_of(folder: Path) -> Path:
+    """The file that an embedded cloud locks while it runs; it has its process id."""
+    return folder.parent / f"{folder.name}.lock"
+
+
+def owner(folder: Path) -> int | None:
+    """The process that holds a folder's lock, if there is one."""
+    try:
+        with lock_of(folder).open() as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError:
+                return int(lock.read())
+    except (FileNotFoundError, ValueError):
+        pass
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)

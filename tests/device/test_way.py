@@ -196,9 +196,16 @@ def namespaces() -> bool:
             "no machine answers for 10.9.9.1",
             "in the same network",
         ),
+        # Like a firewall that drops what comes.
+        (
+            "ip route add 10.9.9.1 dev car; ip neigh add 10.9.9.1 lladdr 02:00:00:00:00:01 dev car",
+            "port",
+            "no answer from 10.9.9.1:8883 in 5 s",
+            "open port 8883 on the cloud's machine",
+        ),
         ("ip addr add 10.9.9.1/24 dev car", "port", "10.9.9.1 answers, but nothing listens", "`make up`"),
     ],
-    ids=["no-network", "blackhole", "nobody", "no-broker"],
+    ids=["no-network", "blackhole", "nobody", "firewall", "no-broker"],
 )
 def test_a_network_without_a_way_to_the_cloud(
     tmp_path: Path, network: str, what: str, text: str, todo: str

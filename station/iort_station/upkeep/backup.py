@@ -92,9 +92,11 @@ def back_up(
     """
     if not (folder / VERSION).is_file():
         raise StationError(f"{folder} has no kept cloud: `make up` makes one, --state names another folder")
+    if out.exists() and not force:
+        raise StationError(f"{out} exists: name another file, or overwrite it with --force")
     made_s = time.time()
     with (
-        whole(out, force=force) as part,
+        whole(out, force=True) as part,
         _copied(folder, out, progress) as files,
         os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT, 0o600), "wb") as archive,
     ):

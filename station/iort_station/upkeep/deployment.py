@@ -41,8 +41,10 @@ def findings(cloud: Cloud) -> Iterator[Finding]:
         yield Finding("stacks", FAIL, str(error), "deploy them: `make deploy`, or `make up` on this machine")
         return
     yield Finding("stacks", OK, f"of {cloud.namespace} are deployed")
-    yield from _robots(cloud)
-    yield lag(load(cloud, function))
+    rows = list(registry.listed(cloud))
+    connected = sum(bool(row.get(ONLINE)) for row in rows)
+    yield Finding("robots", OK, f"{connected} of {len(rows)} are connected")
+    yield _lag(load(cloud, function), connected)
     yield from _alarms(cloud)
 
 
@@ -58,13 +60,17 @@ def load(cloud: Cloud, function: str) -> Load:
         MetricDataQueries=queries,
         StartTime=datetime.fromtimestamp(now_s // 60 * 60 - 60 * _MINUTES, timezone.utc),
         EndTime=datetime.fromtimestamp(now_s, timezone.utc),
-        ScanBy="TimestampDescending",
     )
-    found: dict[str, list[float]] = {one["Id"]: one["Values"] for one in answer["MetricDataResults"]}
-    # The newest point is of a minute that has not ended.
-    rates = {key: sum(values[1:]) / len(values[1:]) / 60 for key, values in found.items() if values[1:]}
-    # Of the newest two minutes: what was late before has been caught up.
-    newest = found["behind"][:2]
+    found = {
+        one["Id"]: {at.timestamp(): value for at, value in zip(one["Timestamps"], one["Values"], strict=True)}
+        for one in answer["MetricDataResults"]
+    }
+    behind = found["behind"]
+    # Of its newest two minutes: what was late before has been caught up.
+    newest = [value for at, value in behind.items() if at >= max(behind) - 60]
+    # The present minute is not over.
+    over = {key: [value for at, value in of.items() if at <= now_s - 60] for key, of in found.items()}
+    rates = {key: sum(values) / len(values) / 60 for key, values in over.items() if values}
     return Load(max(newest) / 1000 if newest else None, rates.get("batches"), rates.get("samples"))
 
 
@@ -74,10 +80,15 @@ def _query(key: str, namespace: str, name: str, statistic: str, of: Mapping[str,
     return {"Id": key, "MetricStat": {"Metric": metric, "Period": 60, "Stat": statistic}}
 
 
-def lag(found: Load) -> Finding:
+def _lag(found: Load, connected: int) -> Finding:
     """How far the summaries are behind the recordings."""
     if found.behind_s is None:
-        return Finding("summaries", OK, f"Lambda 2 had nothing to do in the last {_MINUTES} minutes")
+        return graded(
+            "summaries",
+            f"Lambda 2 had nothing to do in the last {_MINUTES} minutes",
+            "robots are connected: do they record? `iort robots show NAME`, `iort errors`",
+            warn=connected > 0,
+        )
     rates = ""
     if found.batches_s is not None and found.samples_s is not None:
         rates = f", {found.batches_s:,.1f} batches and {found.samples_s:,.0f} samples a second"
@@ -105,12 +116,6 @@ def clock(cloud: Cloud) -> Finding:
         "set the clock: `timedatectl set-ntp true`. `--last` and the page's ages are wrong",
         warn=abs(off_s) > _CLOCK_OFF_S,
     )
-
-
-def _robots(cloud: Cloud) -> Iterator[Finding]:
-    rows = list(registry.listed(cloud))
-    connected = sum(bool(row.get(ONLINE)) for row in rows)
-    yield Finding("robots", OK, f"{connected} of {len(rows)} are connected")
 
 
 def _alarms(cloud: Cloud) -> Iterator[Finding]:

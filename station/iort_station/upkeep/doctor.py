@@ -40,14 +40,17 @@ def of_kept(folder: Path) -> Iterator[Finding]:
         yield Finding("processes", FAIL, str(error), "`make up`")
         yield _backup(folder)
         return
-    yield from _processes(folder, up)
-    yield from _addresses(up)
+    runs = kept.owner(folder) is not None and all(map(machine.runs, up.pids.values()))
+    yield _processes(folder, up, runs=runs)
+    if runs:
+        yield _version(up)
+        yield from _addresses(up)
+        yield _memory(up)
     yield _disk(folder, up)
-    yield _memory(up)
     yield from _certificates(up)
     yield _clock()
     yield _backup(folder)
-    if not all(map(machine.runs, up.pids.values())):
+    if not runs:
         return
     try:
         yield from deployment.findings(Cloud.load(folder / kept.CLOUD))
@@ -67,18 +70,20 @@ def of_cloud(cloud: Cloud) -> Iterator[Finding]:
     yield from deployment.findings(cloud)
 
 
-def _processes(folder: Path, up: Up) -> Iterator[Finding]:
-    ended = [f"{name} (process {pid})" for name, pid in up.pids.items() if not machine.runs(pid)]
-    if ended:
+def _processes(folder: Path, up: Up, *, runs: bool) -> Finding:
+    if not runs:
         # A cloud that is stopped removes this file.
-        killed = ": killed, or the machine was switched off" if (folder / kept.CLOUD).exists() else ""
+        killed = (folder / kept.CLOUD).exists()
+        text = "were killed, or the machine was switched off" if killed else "were stopped: no cloud is up"
         todo = f"`make up` starts it again; what it acknowledged is in {folder}"
-        yield Finding("processes", FAIL, f"{', '.join(ended)} ended{killed}", todo)
-    else:
-        names = ", ".join(f"{name} {pid}" for name, pid in up.pids.items())
-        yield Finding("processes", OK, f"{names}, for {_span(time.time() - up.started_s)}")
+        return Finding("processes", FAIL, text, todo)
+    names = ", ".join(f"{name} {pid}" for name, pid in up.pids.items())
+    return Finding("processes", OK, f"{names}, for {_span(time.time() - up.started_s)}")
+
+
+def _version(up: Up) -> Finding:
     installed, running = version("iort-station"), up.versions.get("iort")
-    yield graded(
+    return graded(
         "version",
         f"{running} runs" + ("" if running == installed else f", and {installed} is installed"),
         "`make down`, then `make up`, to run the installed one",
@@ -142,7 +147,7 @@ def _disk(folder: Path, up: Up) -> Finding:
 def _memory(up: Up) -> Finding:
     ours, whole = machine.resident_bytes(up.pids.get("emulator", 0)), machine.memory()
     if ours is None or whole is None:
-        return Finding("memory", OK, "cannot be told on this system, or of a process that has ended")
+        return Finding("memory", OK, "this system does not tell it")
     return graded(
         "memory",
         f"the emulator has {ours / 1e6:,.0f} MB; {whole.available / 1e9:,.1f} of {whole.total / 1e9:,.1f} GB "

@@ -20,8 +20,7 @@ MADE_ANEW = (kept.UP, kept.CLOUD, LAST_BACKUP, "tmp", "*.tmp", "*.log", "*.sock"
 def held(folder: Path) -> Iterator[None]:
     """Hold the state folder, as a running cloud does. Raises `StationError` if another process holds it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the folder, which a restore replaces.
-    with (folder.parent / f"{folder.name}.lock").open("a+") as lock:
+    with kept.lock_of(folder).open("a+") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -12,13 +12,14 @@ import pytest
 
 from iort_station import kept
 from iort_station.errors import StationError
+from iort_station.kept import owner
 from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.network.listen import Listen
 from local.state import StateFolder
 from local.up import service
-from local.up.down import owner, stop
+from local.up.down import stop
 
 
 @pytest.fixture
