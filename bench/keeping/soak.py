@@ -32,7 +32,8 @@ CARS = 5
 _HOUR_S = 3_600
 # Batches of a car that wait for their acknowledgement.
 _WINDOW = 20
-_CONNECT_S, _SUMMARY_S = 60.0, 180.0
+_CONNECT_S, _SUMMARY_S, _IDLE_S = 60.0, 180.0, 600.0
+_QUIET_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ def soak(folder: Path, hours: int, minutes: int) -> None:
         for hour in range(hours):
             _hour(cars, minutes * 60)
             _summarized(embedded.cloud, cars)
+            _wait_until_idle(embedded)
             _say(look=asdict(_look(embedded, hour + 1, sum(len(car.sent_ms) for car in cars), began)))
             clock.forward(_HOUR_S - int(time.time()) % _HOUR_S)
         for car in cars:
@@ -125,6 +127,21 @@ def _summarized(cloud: Cloud, cars: list[Car]) -> None:
             if time.monotonic() > deadline:
                 raise BenchError(f"{car.name}: no summary in {_SUMMARY_S:.0f} s")
             threading.Event().wait(0.1)
+
+
+def _wait_until_idle(embedded: EmbeddedCloud) -> None:
+    """Wait until no task of the archive is left and no function works: the clock must not jump meanwhile."""
+    sqs, emulator = embedded.cloud.client("sqs"), embedded.emulator.pid
+    [tasks] = [url for url in sqs.list_queues()["QueueUrls"] if "ArchiveTasks" in url]
+    names = ("ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible")
+    deadline = time.monotonic() + _IDLE_S
+    while time.monotonic() < deadline:
+        before = usage.below(emulator).cpu_s
+        found = sqs.get_queue_attributes(QueueUrl=tasks, AttributeNames=list(names))["Attributes"]
+        threading.Event().wait(_QUIET_S)
+        if usage.below(emulator).cpu_s == before and not any(int(found[name]) for name in names):
+            return
+    raise BenchError(f"the functions still work after {_IDLE_S:.0f} s")
 
 
 def _look(embedded: EmbeddedCloud, hour: int, batches: int, began: float) -> Look:
