@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
+from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.messages.viewing import LEASE, lease_topic
 from iort_contract.topics import (
@@ -288,6 +289,8 @@ _NOT_SENT = (
     "anything/else",
 )
 _HEARD = (f"{LIVE}/iort/+/+", f"{LIVE}/iort/{A}/+", f"{LIVE}/iort/{B}/vesc", f"{LIVE}/iort/#")
+# Live messages that are not for everybody: the agent's log, and who drives.
+_OPERATORS = (build_topic(LIVE, A, LOG_STREAM), build_topic(LIVE, B, DRIVE_STREAM))
 _NOT_HEARD = (
     *("#", "+/#", "+/iort/#", f"{LIVE}/#", f"{LIVE}/+/+/+", f"{LIVE}/lab2/+/+", "$aws/#"),
     *(f"{lane}/iort/{A}/+" for lane in (CMD, VIEW, RECORD, FLEET, PING, PONG, ASK, ANSWER)),
@@ -313,6 +316,7 @@ for _who, _client, _sends in (
             may=(build_topic(LIVE, A, "vesc"), build_topic(LIVE, B, "pose")),
             may_not=(build_topic(CMD, A, "drive"), lease_topic(A, "iort"), build_topic(FLEET, A, "pose")),
         ),
+        *(Row(_who, does, what, _who != EVERYBODY) for does in (SUBSCRIBE, RECEIVE) for what in _OPERATORS),
     ]
 
 # Requests that every role of the stacks makes to every resource of a kind. Only the role that declares a

@@ -119,7 +119,7 @@ def report(section: Section, found: dict[str, Way]) -> None:
     title = f"{POINTS:,} points: median (range of {REPEATS} repeats, in turns)"
     section.table(title, _COLUMNS, [way.row(name) for name, way in found.items()])
     for name, of, way, target, tolerance in (
-        ("query, client's processor", "client_cpu_s", OURS_QUERY, 20.0, 1.5),
+        ("query, client's processor", "client_cpu_s", OURS_QUERY, 30.0, 1.5),
         ("query, wall", "wall_s", OURS_QUERY, None, 2.0),
         ("query in Lambda, client's processor", "client_cpu_s", LAMBDA_QUERY, None, 1.5),
     ):

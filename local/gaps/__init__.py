@@ -15,6 +15,7 @@ from typing import Protocol, cast
 NAMES = (
     "broker.client_certificate",
     "broker.https_port",
+    "broker.rule_time",
     "broker.server_certificate",
     "functions.async_invocations",
     "functions.stream_retries",
@@ -23,6 +24,7 @@ NAMES = (
     "storage.query_time",
     "storage.number_checks",
     "storage.object_expiry",
+    "storage.request_time",
     "metrics.embedded_metrics",
     "metrics.lambda_metrics",
     "metrics.iot_metrics",

@@ -160,8 +160,14 @@ class Tables:
     def _undone(self) -> None:
         """What ministack counts and indexes itself is made anew."""
         self._written = None
-        for items in self._items.values():
-            dynamodb._items_replaced(items.table)
+        known = {name for (name,) in self.ledger.read("SELECT name FROM tables")}
+        for name, items in list(self._items.items()):
+            if name not in known:
+                # Its first item was undone. The next one makes it known again.
+                items.table["items"] = {}
+                del self._items[name]
+            items.table.pop(dynamodb._INDEX_MEMBERS, None)
+            dynamodb._update_counts(items.table)
 
 
 def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -44,6 +44,7 @@ class Ledger:
         # How often changes were undone: whoever wrote before must not acknowledge.
         self.undone = 0
         # Called, with the lock held, when changes were undone: what is remembered of them must be forgotten.
+        # They may read, and not write.
         self.on_undo: list[Callable[[], object]] = []
         self._lock = threading.RLock()
         self._writing = False
@@ -95,6 +96,7 @@ class Ledger:
         with self.write() as connection:
             for statement in filter(str.strip, schema.split(";")):
                 connection.execute(statement)
+        self.commit()
 
     @contextmanager
     def write(self) -> Iterator[sqlite3.Connection]:

@@ -83,8 +83,9 @@ class NetworkPage(PageServer):
             return web.json_response({"error": "log in again: load this page anew"}, status=401)
         if path == LOGIN:
             return _to("/")
-        if request.method == "POST" and path == LOGOUT:
-            return self._log_out(request, name)
+        if path == LOGOUT:
+            # A link elsewhere cannot do so: the cookie is not sent then.
+            return self._log_out(name)
         if path == SOCKET:
             return await self._socket(request, name)
         return await super().handle(request)
@@ -121,9 +122,7 @@ class NetworkPage(PageServer):
         answer.headers["Set-Cookie"] = f"{cookie}; Max-Age={SESSION_S:.0f}"
         return answer
 
-    def _log_out(self, request: web.BaseRequest, name: str) -> web.Response:
-        if not self._own(request):
-            return web.Response(status=403)
+    def _log_out(self, name: str) -> web.Response:
         self._sessions.end(name)
         self._cut(name)
         answer = _to("/")
@@ -150,6 +149,8 @@ class NetworkPage(PageServer):
             content_type="text/html",
             headers={
                 **HEADERS,
+                # Without a referrer the form's origin would be "null".
+                "Referrer-Policy": "same-origin",
                 "Cache-Control": "no-store",
                 "Content-Security-Policy": _POLICY,
                 **(headers or {}),

@@ -38,7 +38,7 @@ class Pages:
         embedded, listen = self._embedded, self._listen
         with ExitStack() as stack:
             port = embedded.state.port("page", embedded.host)
-            self.here = stack.enter_context(PageServer(port=port, **_shown(embedded.cloud)))
+            self.here = stack.enter_context(PageServer(port=port, **shown(embedded.cloud)))
             if listen is not None:
                 port = embedded.state.port("network page", listen.address)
                 password = Password(embedded.folder)
@@ -53,7 +53,7 @@ class Pages:
                         gateway=embedded.cloud.endpoint_url or "",
                         trusts=ssl.create_default_context(cafile=embedded.cloud.ca_bundle),
                         context=embedded.certificate("page", listen.hosts).context(),
-                        **_shown(replace(embedded.cloud, websocket=socket)),
+                        **shown(replace(embedded.cloud, websocket=socket)),
                     )
                 )
             self._exit = stack.pop_all()
@@ -65,7 +65,7 @@ class Pages:
         self._exit.close()
 
 
-def _shown(cloud: Cloud) -> dict[str, Any]:
+def shown(cloud: Cloud) -> dict[str, Any]:
     """What a page shows and does, as `iort dashboard` on this machine."""
     return {
         "namespace": cloud.namespace,

@@ -16,6 +16,9 @@ from pathlib import Path
 
 import pytest
 import trustme
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, Finding
@@ -54,12 +57,27 @@ def serving(answer: Callable[[socket.socket], object], host: str = "127.0.0.1") 
             thread.join(10)
 
 
-def with_tls(
-    authority: trustme.CA, *hosts: str, reply: bytes = b"", **dates: datetime
-) -> Callable[..., None]:
+def dated(authority: trustme.CA, host: str, first: datetime, last: datetime) -> trustme.LeafCert:
+    """A server's certificate with these dates, which Python 3.8's trustme cannot make."""
+    signer = x509.load_pem_x509_certificate(authority.cert_pem.bytes())
+    signing = serialization.load_pem_private_key(authority.private_key_pem.bytes(), None)
+    key = ec.generate_private_key(ec.SECP256R1())
+    identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
+    certificate = (
+        x509.CertificateBuilder(signer.subject, x509.Name([]), key.public_key(), 1, first, last)
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName(host)]), critical=False)
+        .add_extension(identifier, critical=False)
+        .sign(signing, hashes.SHA256())
+    )
+    pem, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+    private = key.private_bytes(pem, form, serialization.NoEncryption())
+    return trustme.LeafCert(private, certificate.public_bytes(pem), [])
+
+
+def with_tls(leaf: trustme.LeafCert, reply: bytes = b"") -> Callable[..., None]:
     """Answer with TLS, then with the bytes."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    authority.issue_cert(*hosts, **dates).configure_cert(context)
+    leaf.configure_cert(context)
     context.verify_mode = ssl.CERT_REQUIRED
     ROBOTS.configure_trust(context)
 
@@ -90,6 +108,7 @@ def go(file: Path) -> list[Finding]:
 
 
 CLOUD, OTHER = trustme.CA(organization_name="lab"), trustme.CA(organization_name="another")
+GOOD = CLOUD.issue_cert("localhost")
 REFUSES = b"\x20\x03\x00\x87\x00"
 
 
@@ -104,27 +123,32 @@ REFUSES = b"\x20\x03\x00\x87\x00"
         ),
         (lambda one: one.recv(1) and one.recv(9999) and one.recv(1), "TLS", "says nothing for", "hangs"),
         (lambda _: None, "TLS", "ends before TLS", "broker is down"),
-        (with_tls(OTHER, "localhost"), "server certificate", "O=another, which is not in", "another cloud's"),
         (
-            with_tls(CLOUD, "lab"),
+            with_tls(OTHER.issue_cert("localhost")),
+            "server certificate",
+            "O=another, which is not in",
+            "another cloud's",
+        ),
+        (
+            with_tls(CLOUD.issue_cert("lab")),
             "server certificate",
             "is for lab, and not for localhost",
             "LISTEN=ADDRESS,localhost",
         ),
         (
-            with_tls(CLOUD, "localhost", not_before=NOW - 9 * DAY, not_after=NOW - DAY),
+            with_tls(dated(CLOUD, "localhost", NOW - 9 * DAY, NOW - DAY)),
             "server certificate",
             f"ended on {NOW - DAY:%Y-%m-%d}",
             "set the clock",
         ),
         (
-            with_tls(CLOUD, "localhost", not_before=NOW + DAY, not_after=NOW + 9 * DAY),
+            with_tls(dated(CLOUD, "localhost", NOW + DAY, NOW + 9 * DAY)),
             "server certificate",
             f"is valid from {NOW + DAY:%Y-%m-%d}",
             "set the clock",
         ),
-        (with_tls(CLOUD, "localhost"), "broker", "hangs up on car7", "`iort robots list`"),
-        (with_tls(CLOUD, "localhost", reply=REFUSES), "broker", "refuses car7: not authorized", "thing car7"),
+        (with_tls(GOOD), "broker", "hangs up on car7", "`iort robots list`"),
+        (with_tls(GOOD, REFUSES), "broker", "refuses car7: not authorized", "thing car7"),
     ],
     ids=["http", "silent", "hung-up", "authority", "name", "ended", "early", "certificate", "refused"],
 )
@@ -144,7 +168,7 @@ def test_what_the_server_does_wrong_is_named_with_a_remedy(
 
 
 def test_a_bundle_of_another_cloud_is_named(tmp_path: Path) -> None:
-    with serving(with_tls(CLOUD, "localhost")) as port:
+    with serving(with_tls(GOOD)) as port:
         findings = go(car(tmp_path, CLOUD, port, "localhost", signer=OTHER))
     assert "the cloud does not know who signed" in findings[-2].text
     assert "`iort robots add`" in findings[-2].todo

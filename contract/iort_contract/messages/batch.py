@@ -213,6 +213,20 @@ def _packed_messages(
     return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
 
 
+class Envelope(NamedTuple):
+    """What a batch says beside its samples, checked; and the samples' JSON with what follows it."""
+
+    boot: str
+    seq: int
+    first_us: int
+    n: int
+    nonfinite: int
+    previous: tuple[RunEnd, ...] | None
+    codec: str
+    text: bytes
+    behind: bytes
+
+
 class Opened(NamedTuple):
     """A batch whose envelope, times and field names are checked, and whose values are still encoded.
 
@@ -230,11 +244,8 @@ class Opened(NamedTuple):
     previous: tuple[RunEnd, ...] | None
 
 
-def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
-    """Check everything in an envelope except the values, which take the most time.
-
-    Raises `ContractError`, with the reason.
-    """
+def read_envelope(message: bytes | str | Mapping[str, Any]) -> Envelope:
+    """Check everything around the samples; raises `ContractError`, with the reason."""
     # The check for a dict is the fast one.
     envelope = message if isinstance(message, (dict, Mapping)) else json_object(message, "envelope")
     check_version(envelope, BATCH_VERSION)
@@ -248,6 +259,20 @@ def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope must say 1 to {MAX_SAMPLES} samples, got {n}")
     text, _, behind = inflate(envelope.get("samples"), codec).partition(b"\n")
+    return Envelope(boot, seq, first_us, n, nonfinite, previous, codec, text, behind)
+
+
+def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
+    """Check everything in a batch except the values, which take the most time.
+
+    Raises `ContractError`, with the reason.
+    """
+    return open_envelope(read_envelope(message))
+
+
+def open_envelope(envelope: Envelope) -> Opened:
+    """Check everything in an envelope's samples except the values; raises `ContractError`."""
+    boot, seq, first_us, n, nonfinite, previous, codec, text, behind = envelope
     check_effort(text)
     body = json_object(text, "samples")
     dt, fields = body.get("dt"), body.get("fields")

@@ -49,7 +49,12 @@ class Session:
     def connect(self, client_id: str) -> None:
         """Start a session that ends with the connection."""
         head = _text("MQTT") + bytes([5, _CLEAN_START]) + struct.pack(">HB", _KEEP_ALIVE_S, 0)
-        self._send(CONNECT << 4, head + _text(client_id))
+        try:
+            self._send(CONNECT << 4, head + _text(client_id))
+        except OSError:
+            # The server's reason, such as a TLS alert, may have come before.
+            self._read(1)
+            raise
         self._accepted(self._receive(CONNACK)[1])
 
     def round_trip(self, topic: str, payload: bytes, answer_topic: str, timeout_s: float) -> bytes | None:

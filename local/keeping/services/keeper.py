@@ -1,8 +1,8 @@
 """Keeps the state of ministack's services in the ledger: stacks, roles, functions, things, parameters, ...
 
-A call that may change a service is answered after its documents are written; a failed write is the call's
-answer. A deployment is kept when it is complete, so that no stack is half made after a restart. What changes
-without a call, such as an alarm's state, is written within seconds.
+A call that may change a service writes its documents before it is answered (gate.py); a failed write is the
+call's answer. A deployment is kept when it is complete, so that no stack is half made after a restart. What
+changes without a call, such as an alarm's state, is written within seconds.
 
 Elsewhere: items and streams of tables (items.py, streams.py), messages (queues.py), objects (objects.py).
 Points of metrics and lines of logs are not kept.
@@ -157,7 +157,6 @@ class Services:
                 and calls.may_change(method, path, headers, body, query)
             ):
                 self.save(service)
-            self._ledger.commit()
             return answer
 
         return handle

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from decimal import Decimal
 
 import pytest
@@ -96,6 +97,19 @@ def test_an_item_and_its_record_are_one_change(streams, monkeypatch):
         put(2)
     assert numbers() == [1]
     assert call("_describe_table")["Table"]["ItemCount"] == 1
+
+
+def test_a_table_whose_first_item_was_undone_gets_a_place_of_its_own(streams):
+    with suppress(LedgerError), streams.ledger.write() as connection:
+        put(1)
+        connection.execute("INSERT INTO items VALUES (1)")
+    assert numbers() == []
+    series_table.create("kept-other")
+    assert dynamodb._put_item({"TableName": "kept-other", "Item": item(7)})[0] == 200
+    put(1)
+    assert numbers() == [1]
+    assert numbers(call("_scan", TableName="kept-other")) == [7]
+    del dynamodb._tables["kept-other"]
 
 
 def test_a_full_file_undoes_items_and_records(streams):

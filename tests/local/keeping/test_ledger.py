@@ -197,6 +197,7 @@ def test_a_failing_disk_is_not_asked_again(tmp_path, monkeypatch):
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
+    put(ledger, 1)
     for _ in range(2):
         with pytest.raises(LedgerError, match="Input/output error"):
             ledger.commit()

@@ -134,11 +134,11 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
     # No file may grow beyond a page of the ledger.
     unlimited = resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
     try:
-        with pytest.raises(ClientError, match="500"):
+        with pytest.raises(ClientError, match=r"50[03]"):
             s3.put_object(Bucket="full", Key="key", Body=b"x" * 10_000)
-        with pytest.raises(ClientError, match="InternalError"):
+        with pytest.raises(ClientError, match=r"ServiceUnavailable|InternalError"):
             ssm.put_parameter(Name="/parameter", Value="x" * 4096, Type="String", Overwrite=True)
-        with pytest.raises(ClientError, match="InternalError"):
+        with pytest.raises(ClientError, match=r"ServiceUnavailable|InternalError"):
             sqs.send_message(QueueUrl=queue, MessageBody="x" * 10_000)
     finally:
         resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)

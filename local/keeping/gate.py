@@ -1,0 +1,146 @@
+"""Nothing is acknowledged before it is committed.
+
+Every answer of the gateway, every PUBACK and every message of the cloud itself waits until all that was
+written before is in the ledger. Whoever waits at the same time shares a commit. If it fails, an API call is
+answered by 503, and the connection of a robot is closed without a PUBACK: it keeps the batch.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
+from functools import wraps
+from typing import Any
+
+from ministack import app
+from ministack.services import iot
+
+from local.keeping.ledger import Ledger, LedgerError
+
+_log = logging.getLogger(__name__)
+Message = dict[str, Any]
+Send = Callable[[Message], Awaitable[None]]
+# The record lane's action.
+_PUT = "dynamoDBv2"
+# Why the message that this task publishes was refused.
+_refusal: ContextVar[list[LedgerError] | None] = ContextVar("refusal", default=None)
+
+
+class Gate:
+    """Lets answers out."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._committing: asyncio.Task[None] | None = None
+
+    def install(self) -> None:
+        """Stand before everything that leaves the emulator; the last to be installed."""
+        app.app = self._answering(app.app)
+        iot.broker_publish = self._acknowledging(iot.broker_publish)
+        iot._dispatch_rule_action = self._refusing(iot._dispatch_rule_action)
+        iot._fleet_provisioning_reply = self._replying(iot._fleet_provisioning_reply)
+
+    async def passed(self, since: int) -> None:
+        """Wait until all that was written is committed. Raises `LedgerError` if something written after
+        `Ledger.undone` was ``since`` is undone."""
+        if self._ledger.pending:
+            if self._committing is None:
+                self._committing = asyncio.create_task(self._commit())
+            await asyncio.shield(self._committing)
+        if since != self._ledger.undone:
+            raise LedgerError("what was written is undone: try again")
+
+    async def _commit(self) -> None:
+        # It runs when all who are ready have written; whoever comes later needs the next one.
+        self._committing = None
+        if self._ledger.sync == "full":
+            await asyncio.to_thread(self._ledger.commit)
+        else:
+            self._ledger.commit()
+
+    def _answering(self, serve: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
+        @wraps(serve)
+        async def answer(scope: Message, receive: Any, send: Send) -> None:
+            if scope["type"] != "http":
+                await serve(scope, receive, send)
+                return
+            since, refused = self._ledger.undone, False
+
+            async def send_committed(message: Message) -> None:
+                nonlocal refused
+                if message["type"] == "http.response.start":
+                    try:
+                        await self.passed(since)
+                    except LedgerError as error:
+                        refused = True
+                        await _refuse(send, error)
+                if not refused:
+                    await send(message)
+
+            await serve(scope, receive, send_committed)
+
+        return answer
+
+    def _acknowledging(self, publish: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
+        @wraps(publish)
+        async def acknowledge(account: str, region: str, topic: str, payload: bytes, **rest: Any) -> None:
+            since, refusals, outer = self._ledger.undone, list[LedgerError](), _refusal.get()
+            token = _refusal.set(refusals)
+            try:
+                if rest.get("client_id") is None:
+                    # The cloud says what it has done.
+                    await self.passed(since)
+                await publish(account, region, topic, payload, **rest)
+                if not rest.get("qos"):
+                    return
+                await self.passed(since)
+            except LedgerError as error:
+                refusals.append(error)
+            finally:
+                _refusal.reset(token)
+            if outer is not None:
+                outer += refusals
+            if refusals and rest.get("qos"):
+                # It ends the session, as AWS does when it cannot take a message.
+                raise ConnectionError(f"{topic}: {refusals[0]}")
+
+        return acknowledge
+
+    def _refusing(self, dispatch: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
+        @wraps(dispatch)
+        async def refuse(account: str, region: str, rule: str, action: Message, event: Any) -> None:
+            refusals = _refusal.get()
+            if refusals:
+                # The message will come again, so that its error action has nothing to tell.
+                return
+            try:
+                if _PUT in action:
+                    self._ledger.check_room()
+                await dispatch(account, region, rule, action, event)
+            except LedgerError as error:
+                if refusals is not None:
+                    refusals.append(error)
+                raise
+
+        return refuse
+
+    def _replying(self, reply: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
+        @wraps(reply)
+        async def committed(*arguments: Any) -> Any:
+            since = self._ledger.undone
+            answer = await reply(*arguments)
+            await self.passed(since)
+            return answer
+
+        return committed
+
+
+async def _refuse(send: Send, error: LedgerError) -> None:
+    _log.warning("a call is refused: %s", error)
+    body = json.dumps({"__type": "ServiceUnavailable", "message": str(error)}).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": 503, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

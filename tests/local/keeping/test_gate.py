@@ -1,0 +1,178 @@
+"""Nothing is acknowledged before it is committed: MQTT sessions and calls of this process' ministack."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+from contextlib import closing
+
+import pytest
+from ministack import app
+from ministack.core.responses import request_scope
+from ministack.services import dynamodb, iot, sqs
+
+from local.keeping.gate import Gate
+from tests.local.keeping.in_process import ACCOUNT, REGION, kept
+
+NAME = "gate-items"
+CONNECT = bytes([0x10, 13, 0, 4, *b"MQTT", 4, 2, 0, 60, 0, 1, *b"c"])
+PUBACK = 0x40
+
+
+class Cloud:
+    """A record rule with an error action, and clients whose packets the test writes by hand."""
+
+    def __init__(self, ledger):
+        self.ledger = ledger
+        # What was committed when each acknowledgement left.
+        self.acknowledged = {}
+
+    def committed(self):
+        with closing(sqlite3.connect(self.ledger.path)) as other:
+            return {key for (key,) in other.execute("SELECT pk FROM items")}
+
+    async def publish(self, key, *, qos=1):
+        """Publish a record; returns whether the connection stays."""
+        number = len(self.acknowledged) + 1
+
+        async def send(message):
+            data = message.get("bytes") or b"\0"
+            if data[0] == PUBACK:
+                self.acknowledged[key] = self.committed()
+
+        session = iot._WSSession(send, ACCOUNT, REGION, ACCOUNT)
+        assert await iot._feed_session(session, CONNECT.replace(b"\0\1c", b"\0\1" + key.encode()), 10_000)
+        topic, payload = b"record", json.dumps({"key": key, "text": "x" * 60}).encode()
+        body = bytes([0, len(topic)]) + topic + bytes([0, number] if qos else []) + payload
+        packet = bytes([0x30 | qos << 1, len(body)]) + body
+        try:
+            return await iot._feed_session(session, packet, 10_000)
+        except ConnectionError:
+            return False
+
+    @property
+    def dead_letters(self):
+        return sqs._queue_by_arn(f"arn:aws:sqs:{REGION}:{ACCOUNT}:gate")["messages"]
+
+
+@pytest.fixture
+def cloud(tmp_path, monkeypatch):
+    for name in ("broker_publish", "_dispatch_rule_action", "_fleet_provisioning_reply"):
+        monkeypatch.setattr(iot, name, getattr(iot, name))
+    monkeypatch.setattr(app, "app", app.app)
+    with request_scope(ACCOUNT, REGION), kept(tmp_path / "ledger.db") as streams:
+        Gate(streams.ledger).install()
+        dynamodb._create_table(
+            {
+                "TableName": NAME,
+                "KeySchema": [{"AttributeName": "key", "KeyType": "HASH"}],
+                "AttributeDefinitions": [{"AttributeName": "key", "AttributeType": "S"}],
+                "BillingMode": "PAY_PER_REQUEST",
+            }
+        )
+        sqs._act_create_queue({"QueueName": "gate"}, "")
+        queue = f"http://localhost:4566/{ACCOUNT}/gate"
+        iot._topic_rules["gate"] = {
+            "ruleName": "gate",
+            "sql": "SELECT * FROM 'record'",
+            "actions": [{"dynamoDBv2": {"putItem": {"tableName": NAME}, "roleArn": ""}}],
+            "errorAction": {"sqs": {"queueUrl": queue, "roleArn": ""}},
+        }
+        yield Cloud(streams.ledger)
+        del iot._topic_rules["gate"]
+        sqs._queues.clear()
+        dynamodb._tables.clear()
+
+
+def test_a_record_is_committed_when_it_is_acknowledged(cloud):
+    assert asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {"a": {"a"}}
+
+
+def test_records_of_the_same_moment_share_a_commit(cloud, monkeypatch):
+    commits = []
+    commit = cloud.ledger.commit
+    monkeypatch.setattr(cloud.ledger, "commit", lambda: commits.append(commit()))
+
+    async def publish():
+        return await asyncio.gather(*map(cloud.publish, "abcdefghij"))
+
+    assert all(asyncio.run(publish()))
+    assert set(cloud.acknowledged) == cloud.committed() == set("abcdefghij")
+    assert all(key in committed for key, committed in cloud.acknowledged.items())
+    assert len(commits) < 5
+
+
+def test_a_record_that_cannot_be_committed_is_not_acknowledged(cloud, monkeypatch):
+    with monkeypatch.context() as context:
+        context.setattr(cloud.ledger, "_connection", Failing(cloud.ledger._connection))
+        assert not asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {}
+    assert cloud.committed() == set()
+    assert cloud.dead_letters == []
+    assert asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {"a": {"a"}}
+
+
+class Failing:
+    """A connection whose disk is full at the commit."""
+
+    def __init__(self, connection):
+        self._connection = connection
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def execute(self, sql, *arguments):
+        if sql == "COMMIT":
+            raise sqlite3.OperationalError("database or disk is full")
+        return self._connection.execute(sql, *arguments)
+
+
+def test_records_are_refused_before_the_disk_is_full(cloud):
+    cloud.ledger.floor_bytes = 1 << 60
+    assert not asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {}
+    assert cloud.dead_letters == []
+    # Who wants no acknowledgement stays connected.
+    assert asyncio.run(cloud.publish("b", qos=0))
+    cloud.ledger.floor_bytes = 0
+    assert asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {"a": {"a"}}
+
+
+async def call(action, **data):
+    """A call of the gateway; returns its status."""
+    sent = []
+
+    async def receive():
+        return {"type": "http.request", "body": json.dumps(data).encode(), "more_body": False}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [
+        (b"host", b"localhost"),
+        (b"x-amz-target", f"DynamoDB_20120810.{action}".encode()),
+        (b"content-type", b"application/x-amz-json-1.0"),
+        (
+            b"authorization",
+            f"AWS4-HMAC-SHA256 Credential=test/20260101/{REGION}/dynamodb/aws4_request".encode(),
+        ),
+    ]
+    scope = {"type": "http", "method": "POST", "path": "/", "headers": headers, "client": ("127.0.0.1", 1)}
+    await app.app(scope, receive, send)
+    assert [message["type"] for message in sent] == ["http.response.start", "http.response.body"]
+    return sent[0]["status"]
+
+
+def test_a_call_is_answered_when_its_change_is_committed(cloud, monkeypatch):
+    put = {"TableName": NAME, "Item": {"key": {"S": "a"}}}
+    assert asyncio.run(call("PutItem", **put)) == 200
+    assert cloud.committed() == {"a"}
+    with monkeypatch.context() as context:
+        context.setattr(cloud.ledger, "_connection", Failing(cloud.ledger._connection))
+        assert asyncio.run(call("PutItem", TableName=NAME, Item={"key": {"S": "b"}})) == 503
+    assert asyncio.run(call("GetItem", TableName=NAME, Key={"key": {"S": "a"}})) == 200
+    assert cloud.committed() == {"a"}

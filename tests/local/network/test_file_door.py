@@ -1,0 +1,136 @@
+"""What passes the door to the files, in front of a real gateway."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import ssl
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import boto3
+import pytest
+from botocore.config import Config
+
+from local.certificates import Authority, ServerCertificate
+from local.network.file_door import FileDoor
+
+HOST = "127.0.0.2"
+BODY = b"content"
+SIGNED_BY_PATH = Config(signature_version="s3v4", s3={"addressing_style": "path"})
+
+
+@pytest.fixture(scope="module")
+def door(embedded, tmp_path_factory) -> Iterator[FileDoor]:
+    certificate = ServerCertificate(
+        embedded.authority, tmp_path_factory.mktemp("door") / "files.pem", (HOST,)
+    )
+    certificate.renew()
+    with FileDoor(
+        HOST,
+        0,
+        gateway=embedded.cloud.endpoint_url,
+        authority=Path(embedded.cloud.ca_bundle),
+        bucket=embedded.cloud.output("storage", "FilesBucket"),
+        certificate=certificate,
+    ) as door:
+        yield door
+
+
+@pytest.fixture
+def send(embedded, door) -> Callable[..., tuple[int, str]]:
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+
+    def request(method: str, path: str, **headers: str) -> tuple[int, str]:
+        connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=30)
+        connection.request(method, path, body=BODY if method == "PUT" else None, headers=headers)
+        answer = connection.getresponse()
+        told = answer.status, answer.read().decode()
+        connection.close()
+        return told
+
+    return request
+
+
+@pytest.fixture(scope="module")
+def credentials(embedded) -> dict[str, str]:
+    """Those of a role that may store robots' files, as the function's that signs."""
+    iam, bucket = embedded.cloud.client("iam"), embedded.cloud.output("storage", "FilesBucket")
+    anybody = {"Effect": "Allow", "Principal": {"AWS": "*"}, "Action": "sts:AssumeRole"}
+    role = iam.create_role(RoleName="door", AssumeRolePolicyDocument=json.dumps({"Statement": [anybody]}))
+    may = {"Effect": "Allow", "Action": "s3:PutObject", "Resource": f"arn:aws:s3:::{bucket}/robots/*"}
+    iam.put_role_policy(RoleName="door", PolicyName="door", PolicyDocument=json.dumps({"Statement": [may]}))
+    got = embedded.cloud.client("sts").assume_role(RoleArn=role["Role"]["Arn"], RoleSessionName="door")
+    return got["Credentials"]
+
+
+@pytest.fixture
+def presigned(embedded, door, credentials) -> Callable[..., str]:
+    """The path of a signed address for an object."""
+    cloud, got = embedded.cloud, credentials
+
+    def sign(bucket: str | None = None, key: str = "robots/x", **keys: str) -> str:
+        given = {
+            "aws_access_key_id": got["AccessKeyId"],
+            "aws_secret_access_key": got["SecretAccessKey"],
+            "aws_session_token": got["SessionToken"],
+            **keys,
+        }
+        s3 = boto3.client(
+            "s3",
+            region_name=cloud.region,
+            endpoint_url=f"https://{HOST}:{door.port}",
+            config=SIGNED_BY_PATH,
+            **given,
+        )
+        place = {"Bucket": bucket or cloud.output("storage", "FilesBucket"), "Key": key}
+        return s3.generate_presigned_url("put_object", Params=place).split(str(door.port), 1)[1]
+
+    return sign
+
+
+def test_a_signed_request_reaches_the_gateway_which_judges_it(send, presigned):
+    path = presigned()
+    assert send("PUT", path)[0] == 200
+    for refused, why in (
+        (f"{path[:-1]}{'1' if path[-1] == '0' else '0'}", "SignatureDoesNotMatch"),
+        (path.replace("robots/x", "robots/y"), "SignatureDoesNotMatch"),
+        (presigned(key="analysis/x"), "AccessDenied"),
+        (presigned(aws_access_key_id="ASIA0123456789ABCDEF"), "InvalidAccessKeyId"),
+    ):
+        status, text = send("PUT", refused)
+        assert (status, why in text) == (403, True), text
+
+
+@pytest.mark.parametrize(
+    "case", ["plain", "owner", "bucket", "twice", "method", "header", "parent", "inside"]
+)
+def test_nothing_else_passes(send, presigned, embedded, case):
+    path = presigned()
+    method, target, headers = {
+        "plain": ("GET", path.partition("?")[0], {}),
+        # The gateway takes these for its owner's, whatever their signature.
+        "owner": ("PUT", presigned(aws_access_key_id="test", aws_secret_access_key="x"), {}),
+        "bucket": ("PUT", presigned(bucket="another-bucket"), {}),
+        "twice": ("PUT", f"{path}&x-amz-credential=test/20260101/eu-west-1/s3/aws4_request", {}),
+        "method": ("DELETE", path, {}),
+        "header": ("PUT", path, {"Authorization": "AWS4-HMAC-SHA256 Credential=test/x"}),
+        "parent": ("PUT", path.replace("robots/x", "../_ministack/reset"), {}),
+        "inside": ("GET", f"/_ministack/health?{path.partition('?')[2]}", {}),
+    }[case]
+    assert send(method, target, **headers) == (403, "only presigned requests for files pass here\n")
+
+
+def test_the_door_takes_over_a_renewed_certificate(tmp_path):
+    authority = Authority()
+    certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
+    certificate.renew()
+    given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
+    authority.write_own(tmp_path / "ca.pem")
+    with FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door:
+        shown = [ssl.get_server_certificate((HOST, door.port)).strip()]
+        certificate.path.unlink()
+        assert certificate.renew()
+        # The first connection after the change tells the door.
+        shown += [ssl.get_server_certificate((HOST, door.port)).strip() for _ in range(2)]
+    assert [one in certificate.path.read_text() for one in shown] == [False, False, True]
