@@ -19,7 +19,7 @@ from typing import Any
 from bench.errors import BenchError
 from bench.keeping.clock import Clock, inherited
 from bench.keeping.counted import count
-from bench.load.fleet_load import SAMPLES, Columns, Load, Robot, laps
+from bench.load.fleet_load import Columns, Load, Robot, laps
 from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
@@ -28,7 +28,7 @@ from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 
-CARS = 5
+CARS, RATE_HZ = 5, 50
 _HOUR_S = 3_600
 # Batches of a car that wait for their acknowledgement.
 _WINDOW = 20
@@ -84,13 +84,16 @@ def soak(folder: Path, hours: int, minutes: int) -> None:
         for car in cars:
             car.client.stop()
         found = {car.name: asdict(count(embedded.cloud, car.name)) for car in cars}
-        _say(found=found, sent={car.name: len(car.sent_ms) * SAMPLES for car in cars})
+        _say(found=found, sent={car.name: len(car.sent_ms) * RATE_HZ for car in cars})
 
 
 def _cars(cloud: Cloud, folder: Path) -> list[Car]:
     names = [f"car{i + 1}" for i in range(CARS)]
     bundles = {name: str(robots.add(cloud, name, out=folder / "cars").folder) for name in names}
-    load, seconds = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, 0), laps()
+    load, seconds = (
+        Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, 0, RATE_HZ),
+        laps(RATE_HZ),
+    )
     cars = [
         Car(name, Path(path), load, _columns(seconds, i)) for i, (name, path) in enumerate(bundles.items())
     ]
@@ -133,13 +136,14 @@ def _wait_until_idle(embedded: EmbeddedCloud) -> None:
     """Wait until no task of the archive is left and no function works: the clock must not jump meanwhile."""
     sqs, emulator = embedded.cloud.client("sqs"), embedded.emulator.pid
     [tasks] = [url for url in sqs.list_queues()["QueueUrls"] if "ArchiveTasks" in url]
-    names = ("ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible")
     deadline = time.monotonic() + _IDLE_S
     while time.monotonic() < deadline:
         before = usage.below(emulator).cpu_s
-        found = sqs.get_queue_attributes(QueueUrl=tasks, AttributeNames=list(names))["Attributes"]
+        counts = sqs.get_queue_attributes(QueueUrl=tasks, AttributeNames=["All"])["Attributes"]
+        waiting = int(counts["ApproximateNumberOfMessages"])
+        working = int(counts["ApproximateNumberOfMessagesNotVisible"])
         threading.Event().wait(_QUIET_S)
-        if usage.below(emulator).cpu_s == before and not any(int(found[name]) for name in names):
+        if not waiting and not working and usage.below(emulator).cpu_s == before:
             return
     raise BenchError(f"the functions still work after {_IDLE_S:.0f} s")
 
