@@ -70,9 +70,9 @@ bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=
 	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \
 		$(if $(REPORT),--json "$(REPORT)")
 
-bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 REPORT=figures.json
+bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 RATE=50 LIMIT=1 REPORT=figures.json
 	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
-		$(if $(REPORT),--json "$(REPORT)")
+		$(if $(RATE),--rate $(RATE)) $(if $(LIMIT),--limit) $(if $(REPORT),--json "$(REPORT)")
 
 bench-drive: setup ## measure driving by hand from the page, with ROS 1: TRIES=50 ONLY="tab hidden" REPORT=figures.json
 	@$(BIN)/python -m bench.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")

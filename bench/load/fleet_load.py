@@ -27,8 +27,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
 
 Columns = dict[str, list[Value]]
-SAMPLES = 50
-_STEP_US = 20_000
+_SECOND_US = 1_000_000
 # Laps are one second long; robots start at different ones.
 _LAPS = 60
 _CONNECT_S = 120.0
@@ -38,13 +37,14 @@ _SAY_S = 5.0
 
 @dataclass(frozen=True)
 class Load:
-    """The robots, each with the folder of its keys, the duration, and the address of the broker."""
+    """The robots, each with the folder of its keys, the duration, the rate and the address of the broker."""
 
     robots: dict[str, str]
     namespace: str
     host: str
     port: int
     seconds: int
+    rate_hz: int
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Sent:
 
 
 class Robot:
-    """One robot with its own session; it sends batches of 50 samples, numbered from 0."""
+    """One robot with its own session; it sends batches of a second, numbered from 0."""
 
     def __init__(
         self, name: str, folder: Path, load: Load, columns: Sequence[dict[str, list[Value]]]
@@ -71,7 +71,7 @@ class Robot:
         self.name = name
         self._columns = columns
         self._topic = record_topic(name, VESC_STREAM, load.namespace)
-        self._boot, self._first_us = os.urandom(4).hex(), 0
+        self._boot, self._first_us, self._rate_hz = os.urandom(4).hex(), 0, load.rate_hz
         self.connected = threading.Event()
         self.lost = self.resent = 0
         self.sent_ms: list[int] = []
@@ -99,9 +99,9 @@ class Robot:
         """Send the batch of the last second."""
         seq = len(self.sent_ms)
         # Like the agent's batches, a batch lies within one second of wall time.
-        self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * SAMPLES * _STEP_US
-        first_us = self._first_us + seq * SAMPLES * _STEP_US
-        times = range(first_us, first_us + SAMPLES * _STEP_US, _STEP_US)
+        self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
+        first_us = self._first_us + seq * _SECOND_US
+        times = [first_us + i * _SECOND_US // self._rate_hz for i in range(self._rate_hz)]
         batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])
         payload = encode_batch(batch)
         self.sent_ms.append(time.time_ns() // 1_000_000)
@@ -122,16 +122,16 @@ class Robot:
         self.client.publish(packet).add_done_callback(done)
 
 
-def laps() -> list[Columns]:
+def laps(rate_hz: int) -> list[Columns]:
     """Return a minute of a simulated car, split into seconds."""
-    samples = simulated_drive(_LAPS * SAMPLES)
-    seconds = [samples[i : i + SAMPLES] for i in range(0, len(samples), SAMPLES)]
+    samples = simulated_drive(_LAPS * rate_hz, rate_hz=rate_hz)
+    seconds = [samples[i : i + rate_hz] for i in range(0, len(samples), rate_hz)]
     return [{name: [sample[name] for sample in second] for name in second[0]} for second in seconds]
 
 
 def drive(load: Load) -> Sent:
     """Connect every robot; each sends one batch a second at its own moment; wait for the end."""
-    seconds = laps()
+    seconds = laps(load.rate_hz)
     robots = [
         Robot(name, Path(folder), load, seconds[i % _LAPS :] + seconds[: i % _LAPS])
         for i, (name, folder) in enumerate(load.robots.items())

@@ -19,7 +19,6 @@ from botocore.exceptions import BotoCoreError, ClientError
 from bench import ROOT
 from bench.errors import BenchError
 from bench.load.fleet_figures import Fleet
-from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.load.fleet_load import Load
 from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -37,16 +36,26 @@ from local.figures import Spread
 Tell = Callable[[str], None]
 # After so long without a change no more summaries come.
 _CATCH_UP_S = 120.0
+# The processes that a deployment consists of here.
+OURS = ("emulator", "Lambda workers")
 
 
-def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, prefix: str = "bench") -> Fleet:
+def measure(
+    embedded: EmbeddedCloud,
+    count: int,
+    seconds: int,
+    tell: Tell,
+    *,
+    rate_hz: int = 50,
+    prefix: str = "bench",
+) -> Fleet:
     """Register ``count`` robots, drive them, and count what arrived."""
     cloud, names = embedded.cloud, [f"{prefix}-{count}-{i:04}" for i in range(count)]
     with tempfile.TemporaryDirectory() as folder:
         tell(f"{count} robots: registering")
         bundles = {name: str(robots.add(cloud, name, out=Path(folder)).folder) for name in names}
         tell(f"{count} robots: connecting")
-        load = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, seconds)
+        load = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, seconds, rate_hz)
         emulator = embedded.emulator.pid
         file = Path(folder) / "load.json"
         file.write_text(json.dumps(asdict(load)))
@@ -64,17 +73,19 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
     batches = sent["batches"]
     began = time.monotonic()
     tell(f"{count} robots: waiting for the summaries")
-    in_summary = _summarized(cloud, {name: batches[name] * BATCH_SAMPLES for name in names})
+    in_summary = _summarized(cloud, batches, rate_hz)
+    done = _usage(pid, emulator)
     catch_up_s = time.monotonic() - began
     tell(f"{count} robots: counting the batches")
     arrived = [_stored(cloud, name, sent["sent_ms"][name]) for name in names]
     return Fleet(
         robots=count,
+        rate_hz=rate_hz,
         seconds=seconds,
         batches_sent=sum(batches.values()),
         batches_stored=sum(each.batches for each in arrived),
         batches_lost=sum(each.missing for each in arrived),
-        samples_sent=sum(batches.values()) * BATCH_SAMPLES,
+        samples_sent=sum(batches.values()) * rate_hz,
         samples_summarized=in_summary,
         topics_out_of_order=sum(not each.ordered for each in arrived),
         resent=sent["resent"],
@@ -84,6 +95,7 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
         ack_ms=Spread.of(sent["ack_ms"]),
         summary_behind_s=Spread.of(behind),
         catch_up_s=round(catch_up_s, 1),
+        cpu_s=round(sum(done[name].cpu_s - before[name].cpu_s for name in OURS), 2),
         cpu_percent={
             name: round((after[name].cpu_s - before[name].cpu_s) / took_s * 100, 1) for name in before
         },
@@ -110,8 +122,7 @@ def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
 def _usage(generator: int, emulator: int) -> dict[str, usage.Usage]:
     return {
         "load generator": usage.of(generator),
-        "emulator": usage.of(emulator),
-        "Lambda workers": usage.below(emulator),
+        **dict(zip(OURS, (usage.of(emulator), usage.below(emulator)), strict=True)),
     }
 
 
@@ -158,21 +169,21 @@ def _stored(cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> _Stored:
     return _Stored(list(headers(cloud, robot, VESC_STREAM)), sent_ms)
 
 
-def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
+def _summarized(cloud: Cloud, batches: dict[str, int], rate_hz: int) -> int:
     """Count the samples in the summaries of all robots, after all have arrived or no more come.
 
     It waits for one robot after the other, since all lag equally.
     """
     total, since = 0, time.monotonic()
-    for name, samples in expected.items():
+    for name, seconds in batches.items():
         counted, looked_at = 0, None
         while True:
             # Counting is expensive: count only when the summaries reach the last second that was sent.
             ends = _ends(cloud, name)
             over = time.monotonic() - since > _CATCH_UP_S
-            if over or (ends and (ends[1] - ends[0] + 1) * BATCH_SAMPLES >= samples):
+            if over or (ends and ends[1] - ends[0] + 1 >= seconds):
                 counted = delivery.samples_summarized(cloud, name, VESC_STREAM)
-            if counted >= samples or over:
+            if counted >= seconds * rate_hz or over:
                 break
             if looked_at != (counted, ends):
                 since = since if looked_at is None else time.monotonic()

@@ -1,12 +1,11 @@
-"""The items of DynamoDB's tables, in the ledger instead of in memory."""
+"""A table's items, in the ledger instead of in memory."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import wraps
 from typing import Any, NamedTuple
 
 from ministack.services import dynamodb
@@ -17,28 +16,8 @@ from local.keeping.places import place_of
 Item = dict[str, Any]
 Table = dict[str, Any]
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS tables (id INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL, ttl TEXT);
-CREATE TABLE IF NOT EXISTS items (
-    id INTEGER PRIMARY KEY, tab INTEGER NOT NULL, pk TEXT NOT NULL, sk TEXT NOT NULL,
-    text TEXT, expires_s REAL, size INTEGER NOT NULL, item TEXT NOT NULL);
-CREATE UNIQUE INDEX IF NOT EXISTS items_key ON items (tab, pk, sk);
-CREATE INDEX IF NOT EXISTS items_expires ON items (tab, expires_s) WHERE expires_s IS NOT NULL
-"""
-# What changes items. Each of its calls is one change of the ledger, with its records of the stream.
-_WRITES = (
-    "_put_item",
-    "_update_item",
-    "_delete_item",
-    "_batch_write_item",
-    "_transact_write_items",
-    "_execute_statement",
-    "_batch_execute_statement",
-    "_execute_transaction",
-)
 # DynamoDB reads at most this for a page.
-_PAGE_BYTES = 1024 * 1024
-_encode = json.JSONEncoder(separators=(",", ":")).encode
+PAGE_BYTES = 1024 * 1024
 
 
 class Bound(NamedTuple):
@@ -57,137 +36,15 @@ class Wanted(NamedTuple):
     most: int | None
 
 
-class Tables:
-    """All tables whose items are in the ledger."""
-
-    def __init__(self, ledger: Ledger) -> None:
-        self.ledger = ledger
-        self._items: dict[str, Items] = {}
-        self._written: tuple[Item, str] | None = None
-        ledger.define(_SCHEMA)
-        ledger.on_undo.append(self._undone)
-
-    def install(self) -> None:
-        """Let ministack keep its items here."""
-        dynamodb._set_item = self._adopting(dynamodb._set_item)
-        dynamodb._items_replaced = self._replacing(dynamodb._items_replaced)
-        dynamodb.load_persisted_state = self._loading(dynamodb.load_persisted_state)
-        dynamodb.drop_stream_records = self._dropping(dynamodb.drop_stream_records)
-        dynamodb._expire_items = self.expire
-        for name in _WRITES:
-            setattr(dynamodb, name, together(self.ledger, getattr(dynamodb, name)))
-
-    def adopt(self, table: Table) -> Items:
-        """The table's items; those that it still has in memory are moved into the ledger."""
-        held = table.get("items") or {}
-        if isinstance(held, Items):
-            return held
-        name = f"{table['TableArn']} {table.get('TableId', '')}"
-        with self.ledger.write() as connection:
-            connection.execute("INSERT OR IGNORE INTO tables (name) VALUES (?)", (name,))
-            ((number, ttl),) = connection.execute("SELECT id, ttl FROM tables WHERE name = ?", (name,))
-            items = table["items"] = self._items[name] = Items(self, table, number, ttl)
-            self._learn_ttl(items)
-            for partition, bucket in held.items():
-                for key, item in bucket.items():
-                    items[partition][key] = item
-        return items
-
-    def encode(self, item: Item) -> str:
-        """The item's JSON text; the last one is remembered, because its record of the stream follows."""
-        if self._written is None or self._written[0] is not item:
-            self._written = (item, _encode(item))
-        return self._written[1]
-
-    def expire(self, now_s: float) -> None:
-        """Delete the items whose time to live has passed."""
-        for items in list(self._items.values()):
-            with self.ledger.write():
-                self._learn_ttl(items)
-                items.expire(now_s)
-        self.ledger.commit()
-
-    def _learn_ttl(self, items: Items) -> None:
-        _, _, _, region, account, _ = items.table["TableArn"].split(":", 5)
-        setting = dynamodb._ttl_settings.get_scoped(account, region, items.table["TableName"]) or {}
-        enabled = setting.get("TimeToLiveStatus") == "ENABLED"
-        items.expire_by(setting.get("AttributeName") if enabled else None)
-
-    def _adopting(self, set_item: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(set_item)
-        def keep(table: Table, *arguments: Any) -> Any:
-            self.adopt(table)
-            return set_item(table, *arguments)
-
-        return keep
-
-    def _replacing(self, replaced: Callable[..., Any]) -> Callable[..., Any]:
-        """A transaction is undone, and a table restored, with a dictionary of all items."""
-
-        @wraps(replaced)
-        def adopt(table: Table) -> None:
-            held = table["items"]
-            if not isinstance(held, Items):
-                with self.ledger.write():
-                    table["items"] = {}
-                    self.adopt(table).clear()
-                    table["items"].update(held)
-            replaced(table)
-
-        return adopt
-
-    def _loading(self, load: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(load)
-        def loaded(data: Any) -> None:
-            load(data)
-            for table in dynamodb._tables.all_values():
-                self.adopt(table)
-                dynamodb._update_counts(table)
-
-        return loaded
-
-    def _dropping(self, drop: Callable[..., Any]) -> Callable[..., Any]:
-        """The stream of a deleted table is dropped when the table is already forgotten."""
-
-        @wraps(drop)
-        def dropped(name: str, table: Table | None = None) -> None:
-            drop(name, table)
-            if table and dynamodb._tables.get(name) is not table and isinstance(table["items"], Items):
-                del self._items[table["items"].delete()]
-
-        return dropped
-
-    def _undone(self) -> None:
-        """What ministack counts and indexes itself is made anew."""
-        self._written = None
-        known = {name for (name,) in self.ledger.read("SELECT name FROM tables")}
-        for name, items in list(self._items.items()):
-            if name not in known:
-                # Its first item was undone. The next one makes it known again.
-                items.table["items"] = {}
-                del self._items[name]
-            items.table.pop(dynamodb._INDEX_MEMBERS, None)
-            dynamodb._update_counts(items.table)
-
-
-def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as one change of the ledger."""
-
-    @wraps(function)
-    def change(*arguments: Any, **named: Any) -> Any:
-        with ledger.write():
-            return function(*arguments, **named)
-
-    return change
-
-
 class Items(MutableMapping[str, "Bucket"]):
     """A table's items by partition. As in ministack's own dictionary, a new partition is made when it is
     asked for."""
 
-    def __init__(self, tables: Tables, table: Table, number: int, ttl: str | None) -> None:
-        self.tables, self.table, self.number, self.ttl = tables, table, number, ttl
-        self.ledger = tables.ledger
+    def __init__(
+        self, ledger: Ledger, encode: Callable[[Item], str], table: Table, number: int, ttl: str | None
+    ) -> None:
+        self.ledger, self.encode = ledger, encode
+        self.table, self.number, self.ttl = table, number, ttl
         sort = table.get("sk_name")
         self.kind: str = dynamodb._get_attr_type(table, sort) if sort else ""
 
@@ -244,7 +101,7 @@ class Items(MutableMapping[str, "Bucket"]):
             return
         with self.ledger.write() as connection:
             connection.execute("UPDATE tables SET ttl = ? WHERE id = ?", (attribute, self.number))
-            path = None if attribute is None else f"$.{_encode(attribute)}.N"
+            path = None if attribute is None else f"$.{json.dumps(attribute)}.N"
             connection.execute(
                 "UPDATE items SET expires_s = CAST(json_extract(item, ?) AS REAL) WHERE tab = ?",
                 (path, self.number),
@@ -302,7 +159,7 @@ class Bucket(MutableMapping[str, Item]):
             None if place[2] == key else key,
             self.items_of.expires_s(item),
             dynamodb._item_size_bytes(item),
-            self.items_of.tables.encode(item),
+            self.items_of.encode(item),
         )
         with self._ledger.write() as connection:
             connection.execute(
@@ -359,8 +216,9 @@ class Bucket(MutableMapping[str, Item]):
             return [item for _, item in self.items()]
         return shown.items
 
-    def show(self, wanted: Wanted, cursor: Mapping[str, Any] | None) -> Shown:
-        """The items in the range in the order asked for: as many as a page may have, and one more."""
+    def texts(self, wanted: Wanted) -> list[tuple[int, str]]:
+        """Sizes and JSON texts of the items in the range, in the order asked for: as many as a page may have,
+        and one more."""
         sql, arguments = "", [self.items_of.number, self.partition]
         for bound, operator in ((wanted.low, ">"), (wanted.high, "<")):
             if bound is not None:
@@ -368,15 +226,19 @@ class Bucket(MutableMapping[str, Item]):
                 arguments.append(bound.at)
         order = "" if wanted.forward else " DESC"
         sql = f"SELECT size, item FROM items WHERE tab = ? AND pk = ?{sql} ORDER BY sk{order} LIMIT ?"  # noqa: S608 - only operators are filled in
-        texts, left = [], _PAGE_BYTES
+        found, left = [], PAGE_BYTES
         with self._ledger.reading() as connection:
             for size, text in connection.execute(
                 sql, [*arguments, -1 if wanted.most is None else wanted.most]
             ):
-                texts.append(text)
+                found.append((size, text))
                 left -= size
                 if left < 0:
                     break
+        return found
+
+    def show(self, texts: Iterable[str], cursor: Mapping[str, Any] | None) -> Shown:
+        """Items that the running Query may see."""
         return Shown(self._at(""), [json.loads(text) for text in texts], cursor)
 
 

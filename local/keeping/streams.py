@@ -11,8 +11,8 @@ from typing import Any, overload
 
 from ministack.services import dynamodb, lambda_svc
 
-from local.keeping.items import Tables
 from local.keeping.ledger import Ledger
+from local.keeping.tables import Tables
 
 Record = dict[str, Any]
 

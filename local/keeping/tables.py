@@ -1,0 +1,158 @@
+"""Puts the items of every table of DynamoDB into the ledger."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+from ministack.services import dynamodb
+
+from local.keeping.items import Item, Items, Table
+from local.keeping.ledger import Ledger
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS tables (id INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL, ttl TEXT);
+CREATE TABLE IF NOT EXISTS items (
+    id INTEGER PRIMARY KEY, tab INTEGER NOT NULL, pk TEXT NOT NULL, sk TEXT NOT NULL,
+    text TEXT, expires_s REAL, size INTEGER NOT NULL, item TEXT NOT NULL);
+CREATE UNIQUE INDEX IF NOT EXISTS items_key ON items (tab, pk, sk);
+CREATE INDEX IF NOT EXISTS items_expires ON items (tab, expires_s) WHERE expires_s IS NOT NULL
+"""
+# What changes items. Each of its calls is one change of the ledger, with its records of the stream.
+_WRITES = (
+    "_put_item",
+    "_update_item",
+    "_delete_item",
+    "_batch_write_item",
+    "_transact_write_items",
+    "_execute_statement",
+    "_batch_execute_statement",
+    "_execute_transaction",
+)
+_encode = json.JSONEncoder(separators=(",", ":")).encode
+
+
+class Tables:
+    """All tables whose items are in the ledger."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self._items: dict[str, Items] = {}
+        self._written: tuple[Item, str] | None = None
+        ledger.define(_SCHEMA)
+        ledger.on_undo.append(self._undone)
+
+    def install(self) -> None:
+        """Let ministack keep its items here."""
+        dynamodb._set_item = self._adopting(dynamodb._set_item)
+        dynamodb._items_replaced = self._replacing(dynamodb._items_replaced)
+        dynamodb.load_persisted_state = self._loading(dynamodb.load_persisted_state)
+        dynamodb.drop_stream_records = self._dropping(dynamodb.drop_stream_records)
+        dynamodb._expire_items = self.expire
+        for name in _WRITES:
+            setattr(dynamodb, name, together(self.ledger, getattr(dynamodb, name)))
+
+    def adopt(self, table: Table) -> Items:
+        """The table's items; those that it still has in memory are moved into the ledger."""
+        held = table.get("items")
+        if isinstance(held, Items):
+            return held
+        name = f"{table['TableArn']} {table.get('TableId', '')}"
+        with self.ledger.write() as connection:
+            connection.execute("INSERT OR IGNORE INTO tables (name) VALUES (?)", (name,))
+            ((number, ttl),) = connection.execute("SELECT id, ttl FROM tables WHERE name = ?", (name,))
+            items = table["items"] = self._items[name] = Items(self.ledger, self.encode, table, number, ttl)
+            self._learn_ttl(items)
+            for partition, bucket in (held or {}).items():
+                for key, item in bucket.items():
+                    items[partition][key] = item
+        return items
+
+    def encode(self, item: Item) -> str:
+        """The item's JSON text; the last one is remembered, because its record of the stream follows."""
+        if self._written is None or self._written[0] is not item:
+            self._written = (item, _encode(item))
+        return self._written[1]
+
+    def expire(self, now_s: float) -> None:
+        """Delete the items whose time to live has passed."""
+        for items in list(self._items.values()):
+            with self.ledger.write():
+                self._learn_ttl(items)
+                items.expire(now_s)
+        self.ledger.commit()
+
+    def _learn_ttl(self, items: Items) -> None:
+        _, _, _, region, account, _ = items.table["TableArn"].split(":", 5)
+        setting = dynamodb._ttl_settings.get_scoped(account, region, items.table["TableName"]) or {}
+        enabled = setting.get("TimeToLiveStatus") == "ENABLED"
+        items.expire_by(setting.get("AttributeName") if enabled else None)
+
+    def _adopting(self, set_item: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(set_item)
+        def keep(table: Table, *arguments: Any) -> Any:
+            self.adopt(table)
+            return set_item(table, *arguments)
+
+        return keep
+
+    def _replacing(self, replaced: Callable[..., Any]) -> Callable[..., Any]:
+        """A transaction is undone, and a table restored, with a dictionary of all items."""
+
+        @wraps(replaced)
+        def adopt(table: Table) -> None:
+            held = table["items"]
+            if not isinstance(held, Items):
+                with self.ledger.write():
+                    table["items"] = {}
+                    self.adopt(table).clear()
+                    table["items"].update(held)
+            replaced(table)
+
+        return adopt
+
+    def _loading(self, load: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(load)
+        def loaded(data: Any) -> None:
+            load(data)
+            for table in dynamodb._tables.all_values():
+                self.adopt(table)
+                dynamodb._update_counts(table)
+
+        return loaded
+
+    def _dropping(self, drop: Callable[..., Any]) -> Callable[..., Any]:
+        """The stream of a deleted table is dropped when the table is already forgotten."""
+
+        @wraps(drop)
+        def dropped(name: str, table: Table | None = None) -> None:
+            drop(name, table)
+            if table and dynamodb._tables.get(name) is not table and isinstance(table["items"], Items):
+                del self._items[table["items"].delete()]
+
+        return dropped
+
+    def _undone(self) -> None:
+        """What ministack counts and indexes itself is made anew."""
+        self._written = None
+        known = {name for (name,) in self.ledger.read("SELECT name FROM tables")}
+        for name, items in list(self._items.items()):
+            if name not in known:
+                # Its first item was undone. The next one makes it known again.
+                items.table["items"] = {}
+                del self._items[name]
+            items.table.pop(dynamodb._INDEX_MEMBERS, None)
+            dynamodb._update_counts(items.table)
+
+
+def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as one change of the ledger."""
+
+    @wraps(function)
+    def change(*arguments: Any, **named: Any) -> Any:
+        with ledger.write():
+            return function(*arguments, **named)
+
+    return change
