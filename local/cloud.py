@@ -17,7 +17,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,8 @@ class EmbeddedCloud:
 
     A ``kept`` cloud goes on from what its folder has, and what it acknowledges survives the end of its
     processes; with ``power_cut`` that of the machine, too. ``listen`` opens the broker and the files to a
-    network. With ``journal`` the emulator writes its log to our own output.
+    network. With ``journal`` the emulator writes its log to our own output. ``environment`` is added to the
+    emulator's and its functions'.
 
     ``ports`` may set ``gateway``, ``mqtt``, ``pubnub``, ``relay`` and ``files``; the others are free ports.
     ``progress`` is called with the name of each step when it begins. `__enter__` raises `LocalError` if it
@@ -79,6 +80,7 @@ class EmbeddedCloud:
         power_cut: bool = False,
         listen: Listen | None = None,
         journal: bool = False,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.folder, self.namespace, self.host = folder, namespace, host
         self.live, self.kept, self.listen = live, kept, listen
@@ -88,6 +90,7 @@ class EmbeddedCloud:
         self.certificates: list[ServerCertificate] = []
         self.ledger = folder / LEDGER
         self.power_cut, self._journal = power_cut, journal
+        self._environment = environment or {}
         self._progress = progress
         self._exit = ExitStack()
         self.cloud: Cloud
@@ -204,6 +207,7 @@ class EmbeddedCloud:
     def start_emulator(self, certificate: Path, key: Path, broker: ServerCertificate) -> None:
         """Start the emulator and wait until it is ready."""
         environment = {
+            **self._environment,
             # Not our own environment: the functions would inherit the operator's credentials.
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.folder),

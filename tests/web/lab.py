@@ -98,6 +98,7 @@ class Lab:
         # Whether each car is told to stop, and whether it stands.
         self.cars = {"car-1": [False, False], "car-9": [False, False]}
         self.confirms = True
+        self.streams = [VESC_STREAM]
         # The cars that were stopped alone.
         self.alone: set[str] = set()
         self.notes: list[dict[str, Any]] = []
@@ -193,7 +194,7 @@ class Lab:
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
             "tags": lambda _: {"tags": {"car-1": {"lab": "north"}}},
             "vehicles": lambda _: {"vehicles": {}},
-            "streams": lambda _: {"streams": [VESC_STREAM]},
+            "streams": lambda _: {"streams": self.streams},
             "runs": lambda _: runs(),
             "history": history,
             "insights": insights,

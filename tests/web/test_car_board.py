@@ -65,6 +65,7 @@ def served(pubnub: PubNubStandIn, recorded: Recorded) -> Iterator[str]:
         "history": recorded.history,
         "vehicles": lambda _: {"vehicles": {}},
         "robots": lambda _: {"robots": {}},
+        "streams": lambda _: {"streams": [LOG_STREAM]},
     }
     told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
     with PageServer(namespace="iort", answers=answers, track=HALL, **told) as server:

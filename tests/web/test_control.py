@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from iort_contract.catalog.streams import LOG_STREAM
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.browser import drawn, show, until
@@ -207,6 +208,23 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         page.get_by_role("button", name="Really release car-1").click()
         until(lambda: not words.is_visible(), "the release")
     assert lab.asked[-1] == {"stopped": "false", "robot": "car-1"}
+
+
+def test_the_log_of_a_car_that_never_warned_is_not_asked_for(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    with lab.server(pubnub) as server:
+        page = open_page(f"{server.url}#/")
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        with page.expect_response(lambda answer: "/streams.json?" in answer.url):
+            page.goto(f"{server.url}#/car/car-1")
+        lab.streams = [*lab.streams, LOG_STREAM]
+        log = f"stream={LOG_STREAM}"
+        with page.expect_request(lambda request: log in request.url):
+            page.goto(f"{server.url}#/car/car-9")
+        assert [url for url in asked if log in url and "robot=car-9" not in url] == []
 
 
 def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:

@@ -1,6 +1,6 @@
 // The warnings and errors of a car's agent: those that come live, and those of the last hour from the page's server.
 
-import { LOG_STREAM, type Config, type HistoryAnswer } from "../base/contract";
+import { LOG_STREAM, type Config, type HistoryAnswer, type StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { dayTime } from "../base/format";
 import { lineOf, type Line } from "../live/lines";
@@ -46,11 +46,14 @@ export class AgentLog {
     const to_us = Date.now() * 1000;
     const asked = { robot, stream: LOG_STREAM, from_us: String(to_us - BACK_S * 1e6), to_us: String(to_us), rows: String(ROWS) };
     try {
+      // A car that never warned has no such stream.
+      const { streams } = await ask<StreamsAnswer>("streams", { robot });
+      if (!streams.includes(LOG_STREAM)) return;
       const { times_s, fields } = await ask<HistoryAnswer>("history", asked);
       if (robot !== this.robot) return;
       this.past = times_s.flatMap((at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? []);
     } catch (error) {
-      // A car that never warned has no such stream.
+      // What comes live is shown all the same.
       if (!(error instanceof AnswerError)) throw error;
     }
   }
