@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 import ssl
@@ -28,6 +29,8 @@ _CONNECT_S = 3.0
 _LOW_BYTES, _FULL_BYTES = 5_000_000_000, 500_000_000
 # Shares of the machine's memory.
 _LEAST_AVAILABLE, _MOST_OURS = 0.1, 0.5
+# Of the time, so that a burst has room.
+_MOST_BUSY, _MEASURED_S = 0.8, 2.0
 # A server's certificate gets a successor 30 days before its end.
 _NOT_RENEWED_S, _BACKUP_S = 25 * 86_400, 7 * 86_400
 
@@ -45,7 +48,7 @@ def of_kept(folder: Path) -> Iterator[Finding]:
     if runs:
         yield _version(up)
         yield from _addresses(up)
-        yield _memory(up)
+        yield from _emulator(up.pids["emulator"])
     yield _disk(folder, up)
     yield from _certificates(up)
     yield _clock()
@@ -144,16 +147,31 @@ def _disk(folder: Path, up: Up) -> Finding:
     )
 
 
-def _memory(up: Up) -> Finding:
-    ours, whole = machine.resident_bytes(up.pids.get("emulator", 0)), machine.memory()
-    if ours is None or whole is None:
-        return Finding("memory", OK, "this system does not tell it")
-    return graded(
+def _emulator(pid: int) -> Iterator[Finding]:
+    processes, whole, cores = machine.family(pid), machine.memory(), os.cpu_count() or 1
+    if not processes or whole is None:
+        yield Finding("memory", OK, "this system does not tell it")
+        return
+    ours = sum(map(machine.resident_bytes, processes))
+    yield graded(
         "memory",
         f"the emulator has {ours / 1e6:,.0f} MB; {whole.available / 1e9:,.1f} of {whole.total / 1e9:,.1f} GB "
         "are available",
         "`make down`, then `make up`, gives it back and loses nothing; look at this machine's other programs",
         warn=ours > _MOST_OURS * whole.total or whole.available < _LEAST_AVAILABLE * whole.total,
+    )
+    began, before = time.monotonic(), {one: machine.processor_s(one) for one in processes}
+    time.sleep(_MEASURED_S)
+    passed_s = time.monotonic() - began
+    busy = {one: max(0.0, machine.processor_s(one) - was) / passed_s for one, was in before.items()}
+    # The emulator computes on one core; its functions are processes of their own.
+    share = max(busy[pid], sum(busy.values()) / cores)
+    yield graded(
+        "load",
+        f"the emulator is busy {busy[pid]:.0%} of the time, and its functions "
+        f"{(sum(busy.values()) - busy[pid]) / cores:.0%} of {cores} cores",
+        "fewer cars, slower streams or a faster machine: at 100 % summaries fall behind, and nothing is lost",
+        warn=share > _MOST_BUSY,
     )
 
 

@@ -38,20 +38,31 @@ def runs(pid: int) -> bool:
     return True
 
 
-def resident_bytes(pid: int) -> int | None:
-    """The memory of a process and of those that it started; None where it cannot be told."""
+def family(pid: int) -> list[int]:
+    """A process and those that it started, as far as they run; empty where that cannot be told."""
     children: dict[int, list[int]] = {}
     for status in _PROC.glob("[0-9]*/status"):
         with suppress(OSError):
             parent = next(line for line in status.read_text().splitlines() if line.startswith("PPid:"))
             children.setdefault(int(parent.split()[1]), []).append(int(status.parent.name))
-    found, waiting = None, [pid]
-    while waiting:
-        one = waiting.pop()
-        size = dict(_lines(_PROC / str(one) / "status")).get("VmRSS")
-        found = found if size is None else (found or 0) + size
-        waiting += children.get(one, [])
+    found = [pid] if (_PROC / str(pid)).exists() else []
+    for one in found:
+        found += children.get(one, [])
     return found
+
+
+def resident_bytes(pid: int) -> int:
+    """The memory of a process; 0 if it has ended."""
+    return dict(_lines(_PROC / str(pid) / "status")).get("VmRSS", 0)
+
+
+def processor_s(pid: int) -> float:
+    """The processor time of a process so far; 0 if it has ended."""
+    with suppress(OSError):
+        # Behind the name, which may have spaces: "proc_pid_stat(5)".
+        fields = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def clock_is_set() -> bool | None:

@@ -78,7 +78,7 @@ def test_a_backup_of_a_cloud_that_a_car_writes_to_has_everything_so_far(tmp_path
         assert found["robots"]["text"] == "1 of 1 are connected"
         assert found["backup"]["text"].endswith(str(archive))
         assert "recordings at most" in found["summaries"]["text"]
-        assert {"servers", "memory", "disk", "certificate of broker", "clock"} <= found.keys()
+        assert {"servers", "memory", "load", "disk", "certificate of broker", "clock"} <= found.keys()
         refused = iort(folder)("restore", archive, "--force")
         assert "stop it first" in str(refused.exception)
     assert findings(folder, status=1)["processes"]["level"] == "fail"

@@ -408,7 +408,7 @@ def test_any_error_of_the_sdk_becomes_a_publish_error_without_keys(monkeypatch):
 
 
 def test_the_loggers_that_could_show_the_keys_are_silenced():
-    for name in ("httpx", "httpcore", "pubnub"):
+    for name in ("httpx", "httpcore", "urllib3", "pubnub"):
         assert not logging.getLogger(name).isEnabledFor(logging.INFO)
 
 

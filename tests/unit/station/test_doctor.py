@@ -130,14 +130,20 @@ def test_a_disk_that_fills_up_is_told_before_it_is_full(folder, monkeypatch, fre
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux' /proc")
-def test_the_memory_of_a_process_has_that_of_its_children():
-    alone = machine.resident_bytes(os.getpid())
-    command = [sys.executable, "-c", "x = bytearray(50_000_000); print(1, flush=True); input()"]
+def test_the_facts_of_a_process_and_of_its_children():
+    # It is busy until its processor time shows.
+    code = (
+        "import time; x = bytearray(50_000_000)\nwhile time.process_time() < 0.1: pass\nprint(1, flush=True)"
+    )
+    command = [sys.executable, "-c", f"{code}; input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
-        assert machine.resident_bytes(os.getpid()) > alone + 50_000_000
+        assert {os.getpid(), child.pid} <= set(machine.family(os.getpid()))
+        assert machine.resident_bytes(child.pid) > 50_000_000
+        assert machine.processor_s(child.pid) >= 0.08
         child.communicate(b"\n")
-    assert machine.resident_bytes(child.pid) is None
+    assert machine.family(child.pid) == []
+    assert machine.resident_bytes(child.pid) == machine.processor_s(child.pid) == 0
     assert not machine.runs(child.pid)
     assert machine.memory().total > machine.memory().available > 0
     assert machine.clock_is_set() in (True, False)
