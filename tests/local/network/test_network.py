@@ -142,5 +142,12 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         sent = car(bundle, "upload", str(upload))
         assert sent.wait(60.0) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car1")
+        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
+        way = laboratory.car.run(*check)
+        assert f"route: from {laboratory.car.address} to {address}" in way
+        assert "rules: answer a ping" in way
+        assert f"cars connect to {address}:{ports['mqtt']}" in laboratory.iort("doctor")
         assert stop(laboratory.state)
     assert laboratory.listeners() == set()
+    ended = laboratory.car.run("sh", "-c", '"$@" || true', "sh", *check)
+    assert f"port: {address} answers, but nothing listens on {ports['mqtt']}" in ended
