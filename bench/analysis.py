@@ -86,7 +86,8 @@ def _measure(plan: Plan, console: Console) -> list[Section]:
 
 def _timed(plan: Plan) -> Section:
     hour = speed.hour_cpu_s(car=0)
-    return report.speed(hour, _ROBOT_HOURS, speed.bill(_ROBOT_HOURS, hour.cpu_s, plan.seconds))
+    ours, floor = (speed.bill(_ROBOT_HOURS, cpu_s, plan.seconds) for cpu_s in (hour.cpu_s, hour.floor_s))
+    return report.speed(hour, _ROBOT_HOURS, ours, floor)
 
 
 def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:
