@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -88,6 +88,10 @@ bench-analysis-cloud: setup ## analyse 50 robot-hours on an embedded cloud, with
 
 bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
 	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
+
+bench-kept: setup ## kill the cloud of make up at random, and soak it for a week of its clock: KILLS=50 SOAK=168 MINUTES=4 OUT=docs/bench
+	@$(BIN)/python -m bench.kept $(if $(KILLS),--kills $(KILLS)) $(if $(SOAK),--soak $(SOAK)) $(if $(MINUTES),--minutes $(MINUTES)) \
+		$(if $(OUT),--out $(OUT)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-look: setup ## look at cars in Chromium, and count at the broker what it costs: CARS=20 PICTURES=folder REPORT=figures.json
 	@$(BIN)/python -m bench.looking $(if $(CARS),--cars $(CARS)) $(if $(PICTURES),--pictures "$(PICTURES)") $(if $(REPORT),--json "$(REPORT)")

@@ -9,34 +9,30 @@ but for the two that robots need with ``listen``.
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import signal
 import ssl
 import sys
+import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 from urllib.parse import urlsplit
 
 from typing_extensions import Self
 
 from iort_contract.cloud import PUBNUB
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.messages.event import rule_event
-from iort_contract.messages.live import LiveSample, encode_live, encode_ping
-from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.kept import LEDGER
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
-from local import patched
+from local import first_calls, patched
 from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
@@ -63,7 +59,8 @@ class EmbeddedCloud:
 
     A ``kept`` cloud goes on from what its folder has, and what it acknowledges survives the end of its
     processes; with ``power_cut`` that of the machine, too. ``listen`` opens the broker and the files to a
-    network. With ``journal`` the emulator writes its log to our own output.
+    network. With ``journal`` the emulator writes its log to our own output. ``environment`` is added to the
+    emulator's and its functions'.
 
     ``ports`` may set ``gateway``, ``mqtt``, ``pubnub``, ``relay`` and ``files``; the others are free ports.
     ``progress`` is called with the name of each step when it begins. `__enter__` raises `LocalError` if it
@@ -83,6 +80,7 @@ class EmbeddedCloud:
         power_cut: bool = False,
         listen: Listen | None = None,
         journal: bool = False,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.folder, self.namespace, self.host = folder, namespace, host
         self.live, self.kept, self.listen = live, kept, listen
@@ -92,6 +90,7 @@ class EmbeddedCloud:
         self.certificates: list[ServerCertificate] = []
         self.ledger = folder / LEDGER
         self.power_cut, self._journal = power_cut, journal
+        self._environment = environment or {}
         self._progress = progress
         self._exit = ExitStack()
         self.cloud: Cloud
@@ -113,6 +112,7 @@ class EmbeddedCloud:
         self._exit.close()
 
     def _start(self) -> None:
+        began_ms = time.time_ns() // 1_000_000
         self.state.take(self._exit)
         without_proxy(self.host)
         self.ports = self._find_ports()
@@ -143,7 +143,10 @@ class EmbeddedCloud:
         deploy(self.cloud, self.folder, self._progress, live=self.live, kept=self.kept)
         if self.live == PUBNUB:
             keys.store(self.cloud, self.keys)
-        self._warm_up()
+        self._progress("functions")
+        first_calls.warm_up(self.cloud, self.live)
+        if self.kept:
+            first_calls.end_sessions(self.cloud, began_ms)
         if self.listen:
             door = FileDoor(
                 self.listen.address,
@@ -204,6 +207,7 @@ class EmbeddedCloud:
     def start_emulator(self, certificate: Path, key: Path, broker: ServerCertificate) -> None:
         """Start the emulator and wait until it is ready."""
         environment = {
+            **self._environment,
             # Not our own environment: the functions would inherit the operator's credentials.
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.folder),
@@ -263,36 +267,3 @@ class EmbeddedCloud:
             f"{self.cloud.endpoint_url}{path}", timeout=5, context=context
         ) as response:
             return bytes(response.read())
-
-    def _warm_up(self) -> None:
-        """Invoke every function once, with an event that has no effect.
-
-        A first invocation takes seconds on a small machine, and a live message that waits for it is stale.
-        """
-        self._progress("functions")
-        # A sample of 1970 is stale and is dropped.
-        stale = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
-        warm_up: dict[tuple[str, str], dict[str, Any]] = {
-            ("processing", "Live"): self._rule_event(encode_live(stale), LIVE, "warm-up"),
-            ("processing", "Summarize"): {"Records": []},
-            ("processing", "Echo"): self._rule_event(encode_ping(0, 0), PING, LAMBDA),
-            # An event without a fault and without a low voltage.
-            ("processing", "Alert"): self._rule_event(b"", LIVE, "warm-up"),
-            # Refused without a listener. Without an id it would go to quarantine.
-            ("processing", "Upload"): self._rule_event(b'{"id": "00000000"}', PING, FILE),
-            ("fleet", "Admit"): {},
-            ("fleet", "Presence"): {},
-            ("processing", "Query"): {},
-        }
-        if self.live != PUBNUB:
-            del warm_up["processing", "Live"]
-        client = self.cloud.client("lambda")
-        for (stack, name), event in warm_up.items():
-            function = self.cloud.output(stack, f"{name}Function")
-            answer = client.invoke(FunctionName=function, Payload=json.dumps(event).encode())
-            if "FunctionError" in answer:
-                reason = answer["Payload"].read().decode(errors="replace")
-                raise LocalError(f"function {name} does not start: {reason[:500]}")
-
-    def _rule_event(self, message: bytes, lane: str, name: str) -> dict[str, Any]:
-        return rule_event(message, build_topic(lane, "warm-up", name, self.namespace), 0)

@@ -16,7 +16,7 @@ from ministack import app
 from local import gaps
 from local.gaps.functions.async_invocations import AsyncInvocations
 from local.gaps.metrics import alarm_timer
-from local.keeping import kept, streams
+from local.keeping import kept, presence, streams
 from local.keeping.gate import Gate
 from local.keeping.ledger import Ledger, Sync
 
@@ -31,6 +31,7 @@ def main() -> None:
     gaps.install()
     if path:
         kept.install(ledger, AsyncInvocations())
+        presence.install()
     Gate(ledger).install()
     alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()

@@ -34,7 +34,7 @@ class StateFolder:
     def take(self, stack: ExitStack) -> None:
         """Lock the folder until the stack closes, and clean it. Raises `LocalError` if that is not
         possible."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
         if shutil.disk_usage(self.path).free < _LEAST_FREE_BYTES:
             raise LocalError(f"{self.path} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
         # The file stays open and locked while this cloud runs.
@@ -53,21 +53,24 @@ class StateFolder:
         lock.write(str(os.getpid()))
         lock.flush()
         if self.kept:
-            self._check_version()
-            self.path.chmod(0o700)
+            self.prepare()
             # Files of an earlier run remain after a kill -9.
             shutil.rmtree(self.path / "tmp", ignore_errors=True)
         else:
             shutil.rmtree(self.path)
         (self.path / "tmp").mkdir(parents=True, mode=0o700)
 
-    def _check_version(self) -> None:
+    def prepare(self) -> None:
+        """Make the folder of a kept cloud, for its owner alone. Raises `LocalError` if it is another folder,
+        or of a newer version."""
+        self.path.mkdir(parents=True, exist_ok=True)
         version = self.path / "VERSION"
         if not version.exists():
             if unknown := [one.name for one in self.path.iterdir()]:
                 raise LocalError(
                     f"STATE must be an empty folder or one of `make up`, got {self.path} with {unknown[0]}"
                 )
+            self.path.chmod(0o700)
             version.write_text(f"{VERSION}\n")
         found = version.read_text().strip()
         if not found.isdecimal() or int(found) > VERSION:

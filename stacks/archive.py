@@ -21,6 +21,8 @@ from stacks.storage import Storage
 _MEMORY_MB, _TIMEOUT_S, _SCRATCH_MB = 1769, 600, 4096
 # An hour of a thousand streams takes some minutes, and the account keeps environments for other functions.
 _AT_ONCE = 10
+# The least that a queue's mapping may have: there all functions share a machine's cores and memory.
+_EMBEDDED = 2
 
 
 class Archive(PlatformStack):
@@ -46,8 +48,6 @@ class Archive(PlatformStack):
             scratch_mb=_SCRATCH_MB,
             layers=layers.arrays(self),
             arrays=True,
-            # On the embedded cloud all functions share this machine's cores.
-            reserved_concurrency=1 if settings.embedded else 0,
         )
         storage.telemetry.grant(archive, "dynamodb:Query")
         storage.may_change(storage.telemetry, archive, TOPIC, BATCH, EXPIRES_S, PUT_OFF_TO_S)
@@ -69,7 +69,7 @@ class Archive(PlatformStack):
             target=archive,
             event_source_arn=tasks.queue_arn,
             batch_size=1,
-            max_concurrency=_AT_ONCE,
+            max_concurrency=_EMBEDDED if settings.embedded else _AT_ONCE,
         )
         # Every hour at a quarter past, and at night.
         when = {

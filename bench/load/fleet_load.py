@@ -95,12 +95,13 @@ class Robot:
     def _on_lost(self, _: Any) -> None:
         self.lost += 1
 
-    def send(self) -> None:
-        """Send the batch of the last second."""
+    def send(self, first_us: int | None = None) -> None:
+        """Send the batch of the last second, or of the one that begins then."""
         seq = len(self.sent_ms)
-        # Like the agent's batches, a batch lies within one second of wall time.
-        self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
-        first_us = self._first_us + seq * _SECOND_US
+        if first_us is None:
+            # Like the agent's batches, a batch lies within one second of wall time.
+            self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
+            first_us = self._first_us + seq * _SECOND_US
         times = [first_us + i * _SECOND_US // self._rate_hz for i in range(self._rate_hz)]
         batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])
         payload = encode_batch(batch)

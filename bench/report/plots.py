@@ -114,6 +114,19 @@ def lines(x: Sequence[float], series: Mapping[str, Sequence[float]], *, x_label:
     return _picture(fill, x_label, y_label)
 
 
+def over(x: Sequence[float], series: Mapping[str, Sequence[float]], *, x_label: str, y_label: str) -> Draw:
+    """One line for each name, over the same x values, from 0 on."""
+
+    def fill(axes: mpl.axes.Axes) -> None:
+        for i, (name, values) in enumerate(series.items()):
+            axes.plot(x, values, _LINES[i % 4], color=COLOURS[i % 7], label=name, linewidth=1.6)
+        axes.set_ylim(bottom=0)
+        axes.grid(visible=True, linewidth=0.3)
+        axes.legend(fontsize=8)
+
+    return _picture(fill, x_label, y_label)
+
+
 def points(
     name: str, x: Sequence[float], y: Sequence[float], *, y_label: str, shaded: tuple[float, float]
 ) -> Draw:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from local.errors import LocalError
+from local.state import StateFolder
 from local.up.login import LEAST_CHARACTERS, Password
 from local.up.run import add_state
 
@@ -28,8 +29,7 @@ def main() -> None:
 
 
 def _change(folder: Path) -> None:
-    if not folder.is_dir():
-        raise LocalError(f"{folder} must be a folder of `make up`")
+    StateFolder(folder, kept=True).prepare()
     new = getpass.getpass(f"New password, at least {LEAST_CHARACTERS} characters: ")
     if getpass.getpass("Again: ") != new:
         raise LocalError("the two passwords must be the same")

@@ -13,7 +13,9 @@ from string import Template
 
 from local.deployment import ROOT
 from local.errors import LocalError
-from local.up.run import add_network, add_state
+from local.state import StateFolder
+from local.up.login import Password
+from local.up.run import NO, add_network, add_state
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -68,6 +70,7 @@ def main() -> None:
         elif options.remove:
             _remove(of_machine=of_machine)
         else:
+            _make_password(options.state, options.page)
             _install(text, of_machine=of_machine)
     except LocalError as error:
         sys.exit(f"up-service: {error}")
@@ -83,6 +86,14 @@ def unit(options: list[str], *, of_machine: bool, user: str = "") -> str:
         user=f"User={user}\n" if of_machine and user else "",
         wanted="multi-user.target" if of_machine else "default.target",
     )
+
+
+def _make_password(folder: Path, page: str | None) -> None:
+    """Make the page's first password here: the service would write it into the journal."""
+    state = StateFolder(folder, kept=True)
+    state.prepare()
+    if (page or state.settings().get("page", NO)) != NO and (made := Password(folder).make()):
+        _say(f"the page's password is {made} (shown once; `make up-password` sets another)")
 
 
 def _install(text: str, *, of_machine: bool) -> None:

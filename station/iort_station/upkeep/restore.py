@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+import lzma
 import os
 import shutil
 import sqlite3
 import tarfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
@@ -42,7 +45,7 @@ def restore(
         )
     with held(folder), _beside(folder) as made:
         manifest = _read(archive, made, progress)
-        for path in made.rglob("*"):
+        for path in made.iterdir():
             if path.is_file() and is_database(path):
                 _check_database(path)
         os.sync()
@@ -84,9 +87,7 @@ def _read(archive: Path, target: Path | None, progress: Progress) -> Manifest:
                         text = file.read()
                         continue
                     found[member.name] = _take(file, member, target, progress)
-    except (tarfile.TarError, EOFError, OSError) as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            raise
+    except (tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, gzip.BadGzipFile) as error:
         raise StationError(f"{archive} is damaged, or no backup of `iort backup`: {error}") from error
     manifest = _manifest(archive, text)
     wrong = [name for name in {**found, **manifest.files} if found.get(name) != manifest.files.get(name)]

@@ -12,7 +12,7 @@ import pytest
 from ministack.core import lambda_runtime
 from ministack.services import lambda_svc
 
-from local.gaps.functions import log_end
+from local.gaps.functions import log_end, log_retention
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +76,10 @@ def test_a_traceback_is_one_event():
     failed = f"[ERROR]\t10:00Z\tit failed\n{trace}"
     records = ["[INFO]\tbefore", trace, "  indented", failed, "after"]
     assert lambda_svc._log_records("\n".join(records)) == records
+
+
+def test_a_group_keeps_its_newest_logs_and_its_errors():
+    kept, quiet, bad = log_retention.KEPT, {"message": "START"}, {"message": "[ERROR]\twrong"}
+    streams = {f"{i}": {"events": [quiet, bad] if i in {3, 4} else [quiet]} for i in range(3 * kept)}
+    log_retention.forget(streams)
+    assert list(streams) == ["3", "4", *(f"{i}" for i in range(2 * kept, 3 * kept))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 import os
 import signal
 import socket
@@ -119,8 +118,8 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         assert laboratory.listeners() == reached
         laboratory.iort("robots", "add", "car1", "--out", str(laboratory.folder))
         agent = car(bundle, "run")
-        until(lambda: "car1" in laboratory.iort("robots", "list"))
-        until(lambda: json.loads(laboratory.iort("audit", "car1", "--json")))
+        until(lambda: "connected" in agent.tail())
+        until(lambda: "vesc" in laboratory.iort("streams", "car1"))
         up = kept.Up.load(laboratory.state)
         # Both processes at once, as at a power cut of a machine that has written everything.
         for pid in (up.pids["up"], up.pids["emulator"]):
@@ -131,15 +130,24 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
     with laboratory.running():
         assert time.monotonic() - began < SECOND_START_S
         assert laboratory.listeners() == reached
-        agent_report = bundle / "report.json"
-        until(lambda: "complete" in laboratory.iort("audit", "car1"))
+        # Its second connection; the batches in between have waited in its queue.
+        until(lambda: agent.tail().count(f"connected to {address}") == 2)
+        until(lambda: "online since" in laboratory.iort("robots", "list"))
         agent.interrupt()
         assert agent.wait(30.0) == 0, agent.tail()
-        assert not agent_report.exists()
+        until(lambda: "offline since" in laboratory.iort("robots", "list"))
+        until(lambda: "vesc: complete" in laboratory.iort("audit", "car1"))
         upload = laboratory.folder / "drive.bag"
         upload.write_bytes(os.urandom(100_000))
         sent = car(bundle, "upload", str(upload))
         assert sent.wait(60.0) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car1")
+        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
+        way = laboratory.car.run(*check)
+        assert f"route: from {laboratory.car.address} to {address}" in way
+        assert "rules: answer a ping" in way
+        assert f"cars connect to {address}:{ports['mqtt']}" in laboratory.iort("doctor")
         assert stop(laboratory.state)
     assert laboratory.listeners() == set()
+    ended = laboratory.car.run("sh", "-c", '"$@" || true', "sh", *check)
+    assert f"port: {address} answers, but nothing listens on {ports['mqtt']}" in ended

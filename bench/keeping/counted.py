@@ -1,0 +1,51 @@
+"""What is stored and summarised of a robot, by the code of `iort audit`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.cloud import Cloud
+from iort_station.data import inventory
+from iort_station.operations import accounts, audit, delivery
+
+
+@dataclass(frozen=True)
+class Counted:
+    """The counts of a robot's streams together; ``lost`` are samples and batches that are not stored.
+
+    ``summarized`` and ``expected`` are samples of the motor controller's stream alone.
+    """
+
+    samples: int
+    batches: int
+    duplicated: int
+    lost: int
+    incomplete: tuple[str, ...]
+    summarized: int
+    expected: int
+
+
+def count(cloud: Cloud, robot: str) -> Counted:
+    """Audit every stream of a robot, from its first batch on."""
+    told, now_us = accounts.accounts(cloud, robot), time.time_ns() // 1000
+    audits = [
+        accounts.held_against(
+            audit.audit(name, audit.headers(cloud, robot, name), from_start=True), told, now_us
+        )
+        for name in inventory.known(cloud, robot)
+    ]
+    # A known stream of which the agent took nothing has no audit.
+    audits = [one for one in audits if one.runs or one.refused or one.taken is not None]
+    runs = [run for one in audits for run in one.runs]
+    short = sum(abs(each.samples or 1) for one in audits for each in one.shortfalls)
+    return Counted(
+        samples=sum(run.samples for run in runs),
+        batches=sum(run.batches for run in runs),
+        duplicated=sum(run.duplicated for run in runs),
+        lost=sum(one.missing for one in audits) + short,
+        incomplete=tuple(one.stream for one in audits if not one.complete),
+        summarized=delivery.samples_summarized(cloud, robot, VESC_STREAM),
+        expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
+    )

@@ -1,0 +1,192 @@
+"""A week of five cars on a kept cloud, on a clock that is set forward while nothing is under way.
+
+In each hour of the clock every car drives so many minutes at 50 Hz, a batch a second, as fast as the broker
+acknowledges. When everything is summarised the clock is set to the next hour: records of streams, sessions,
+metrics and items expire and the archive takes its hours by that clock. Writes a JSON object a line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.errors import BenchError
+from bench.keeping.clock import Clock, inherited
+from bench.keeping.counted import count
+from bench.load.fleet_load import Columns, Load, Robot, laps
+from bench.meters import usage
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.tables import SECOND
+from iort_station.cloud import Cloud
+from iort_station.data.batches import summary_table, topic_of
+from iort_station.fleet import robots
+from local.cloud import EmbeddedCloud
+
+CARS, RATE_HZ = 5, 50
+_HOUR_S = 3_600
+# Batches of a car that wait for their acknowledgement.
+_WINDOW = 20
+_CONNECT_S, _SUMMARY_S, _IDLE_S = 60.0, 180.0, 600.0
+_QUIET_S = 0.3
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the cloud takes after so many hours of the clock; memory without what processes share."""
+
+    hour: int
+    batches: int
+    seconds: float
+    emulator_mb: float
+    functions_mb: float
+    ledger_mb: float
+    files_mb: float
+
+
+class Car(Robot):
+    """A car that waits for acknowledgements when too many are missing."""
+
+    last_s = 0
+
+    def drive(self, first_s: int, seconds: int) -> None:
+        """Send the batches of these seconds, and wait until all are acknowledged."""
+        for self.last_s in range(first_s, first_s + seconds):
+            self.send(self.last_s * 1_000_000)
+            self._wait(_WINDOW)
+        self._wait(0)
+
+    def _wait(self, most: int) -> None:
+        pause, deadline = threading.Event(), time.monotonic() + _CONNECT_S
+        while len(self.sent_ms) - len(self.acknowledged) > most:
+            if time.monotonic() > deadline:
+                raise BenchError(f"{self.name}: no acknowledgement in {_CONNECT_S:.0f} s")
+            pause.wait(0.005)
+
+
+def soak(folder: Path, hours: int, minutes: int) -> None:
+    """Drive through the hours; say how it goes, and at the end what is stored."""
+    clock = Clock()
+    with EmbeddedCloud(folder / "cloud", kept=True, live="iot", environment=inherited()) as embedded:
+        cars = _cars(embedded.cloud, folder)
+        began = time.monotonic()
+        for hour in range(hours):
+            _hour(cars, minutes * 60)
+            _summarized(embedded.cloud, cars)
+            _wait_until_idle(embedded)
+            _say(look=asdict(_look(embedded, hour + 1, sum(len(car.sent_ms) for car in cars), began)))
+            clock.forward(_HOUR_S - int(time.time()) % _HOUR_S)
+        for car in cars:
+            car.client.stop()
+        found = {car.name: asdict(count(embedded.cloud, car.name)) for car in cars}
+        _say(found=found, sent={car.name: len(car.sent_ms) * RATE_HZ for car in cars})
+
+
+def _cars(cloud: Cloud, folder: Path) -> list[Car]:
+    names = [f"car{i + 1}" for i in range(CARS)]
+    bundles = {name: str(robots.add(cloud, name, out=folder / "cars").folder) for name in names}
+    load, seconds = (
+        Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, 0, RATE_HZ),
+        laps(RATE_HZ),
+    )
+    cars = [
+        Car(name, Path(path), load, _columns(seconds, i)) for i, (name, path) in enumerate(bundles.items())
+    ]
+    for car in cars:
+        car.client.start()
+    for car in cars:
+        if not car.connected.wait(_CONNECT_S):
+            raise BenchError(f"{car.name} was not connected within {_CONNECT_S:.0f} s")
+    return cars
+
+
+def _columns(seconds: list[Columns], first: int) -> list[Columns]:
+    return seconds[first:] + seconds[:first]
+
+
+def _hour(cars: list[Car], seconds: int) -> None:
+    first_s = int(time.time()) + 1
+    driving = [threading.Thread(target=car.drive, args=(first_s, seconds)) for car in cars]
+    for thread in driving:
+        thread.start()
+    for thread in driving:
+        thread.join()
+
+
+def _summarized(cloud: Cloud, cars: list[Car]) -> None:
+    """Wait until the newest second of each car is in its summary."""
+    table, deadline = summary_table(cloud), time.monotonic() + _SUMMARY_S
+    for car in cars:
+        topic = topic_of(cloud, car.name, VESC_STREAM)
+        while True:
+            item = table.first(topic, newest=True, attributes=(SECOND,))
+            if item is not None and int(item[SECOND]["N"]) >= car.last_s:
+                break
+            if time.monotonic() > deadline:
+                raise BenchError(f"{car.name}: no summary in {_SUMMARY_S:.0f} s")
+            threading.Event().wait(0.1)
+
+
+def _wait_until_idle(embedded: EmbeddedCloud) -> None:
+    """Wait until no task of the archive is left and no function works: the clock must not jump meanwhile."""
+    sqs, emulator = embedded.cloud.client("sqs"), embedded.emulator.pid
+    [tasks] = [url for url in sqs.list_queues()["QueueUrls"] if "ArchiveTasks" in url]
+    deadline = time.monotonic() + _IDLE_S
+    while time.monotonic() < deadline:
+        before = usage.below(emulator).cpu_s
+        counts = sqs.get_queue_attributes(QueueUrl=tasks, AttributeNames=["All"])["Attributes"]
+        waiting = int(counts["ApproximateNumberOfMessages"])
+        working = int(counts["ApproximateNumberOfMessagesNotVisible"])
+        threading.Event().wait(_QUIET_S)
+        if not waiting and not working and usage.below(emulator).cpu_s == before:
+            return
+    raise BenchError(f"the functions still work after {_IDLE_S:.0f} s")
+
+
+def _look(embedded: EmbeddedCloud, hour: int, batches: int, began: float) -> Look:
+    emulator = embedded.emulator.pid
+    return Look(
+        hour=hour,
+        batches=batches,
+        seconds=round(time.monotonic() - began, 1),
+        emulator_mb=_private_mb(emulator),
+        functions_mb=round(sum(map(_private_mb, usage.descendants(emulator))), 1),
+        ledger_mb=_disk_mb(embedded.folder.glob("ledger.db*")),
+        files_mb=_disk_mb((embedded.folder / "s3").rglob("*")),
+    )
+
+
+def _private_mb(pid: int) -> float:
+    """The memory of a process: its own, and its part of what it shares."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return round(sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024, 1)
+
+
+def _disk_mb(paths: Iterable[Path]) -> float:
+    return round(sum(path.stat().st_size for path in paths if path.is_file()) / 2**20, 1)
+
+
+def _say(**what: Any) -> None:
+    print(json.dumps(what), flush=True)
+
+
+def main() -> None:
+    """Soak in a folder."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--hours", type=int, required=True)
+    parser.add_argument("--minutes", type=int, required=True)
+    given = parser.parse_args()
+    soak(given.folder, given.hours, given.minutes)
+
+
+if __name__ == "__main__":
+    main()
