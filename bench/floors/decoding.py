@@ -1,6 +1,6 @@
 """The floor of the analysis: the values of stored batches as numpy's columns, by the barest code.
 
-It checks nothing: neither the batches nor their order, overlap, gaps or clock. It cleans and analyses nothing.
+It checks nothing: neither the batches nor their order, overlap, gaps or clock. It cleans and mines nothing.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def speed(hour: Hour, robot_hours: float, ours: Bill, floor: Bill) -> Section:
     section = Section("speed", "Time and cost of the analysis")
     dollars, least = sum(ours.dollars.values()), sum(floor.dollars.values())
     section.table(
-        f"{robot_hours:,.0f} robot-hours on AWS in dollars, by the cost model from the measured processor time",
+        f"{robot_hours:,.0f} robot-hours on AWS in dollars, by the cost model from the processor time",
         ["", "analysis", "floor"],
         [
             *([what, f"{usd:.3f}", f"{floor.dollars[what]:.3f}"] for what, usd in ours.dollars.items()),
@@ -161,8 +161,8 @@ def speed(hour: Hour, robot_hours: float, ours: Bill, floor: Bill) -> Section:
     section.notes.append(
         f"Of the hour's processor time {hour.decode_s:.2f} s decode the stored batches, "
         f"{hour.analyse_s:.2f} s clean and mine. The floor decodes the same values in {hour.floor_s:.2f} s: "
-        "base64, zlib, JSON and numpy's sums, a batch at a time, without any check. Ours decodes many batches "
-        "at once. Dollars and minutes are those of a processor like this one."
+        "base64, zlib, JSON and numpy's sums, a batch at a time, without any check. "
+        "Dollars and minutes are those of a processor like this one."
     )
     section.raw = {
         **hour._asdict(),
