@@ -75,10 +75,10 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 		$(if $(RATE),--rate $(RATE)) $(if $(LIMIT),--limit) $(if $(REPORT),--json "$(REPORT)")
 
 bench-drive: setup ## measure driving by hand from the page, with ROS 1: TRIES=50 ONLY="tab hidden" REPORT=figures.json
-	@$(BIN)/python -m bench.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")
+	@$(BIN)/python -m bench.browser.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")
 
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
-	@$(BIN)/python -m bench.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
+	@$(BIN)/python -m bench.browser.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 ONLY=speed OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysis $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY)) $(if $(OUT),--out $(OUT))
@@ -94,10 +94,10 @@ bench-kept: setup ## kill the cloud of make up at random, and soak it for a week
 		$(if $(OUT),--out $(OUT)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-look: setup ## look at cars in Chromium, and count at the broker what it costs: CARS=20 PICTURES=folder REPORT=figures.json
-	@$(BIN)/python -m bench.looking $(if $(CARS),--cars $(CARS)) $(if $(PICTURES),--pictures "$(PICTURES)") $(if $(REPORT),--json "$(REPORT)")
+	@$(BIN)/python -m bench.browser.looking $(if $(CARS),--cars $(CARS)) $(if $(PICTURES),--pictures "$(PICTURES)") $(if $(REPORT),--json "$(REPORT)")
 
 screenshots: setup ## take the pictures of docs/images anew
-	@$(BIN)/python -m bench.screenshots
+	@$(BIN)/python -m bench.browser.screenshots
 
 verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,files YES=1 KEEP=1 BY=name
 	@$(BIN)/python -m verify.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

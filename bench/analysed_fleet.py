@@ -21,16 +21,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from bench.command import made, parser, write
+from bench.command import made, parser, progress, write
 from bench.errors import BenchError
 from bench.proof.cars import drive_of
 from bench.proof.speed import HOUR_S
@@ -101,26 +93,25 @@ def measure(embedded: EmbeddedCloud, hours: int, console: Console) -> Figures:
     """Write the hours, and analyse them; raises `BenchError` if a drive is not analysed."""
     cloud = embedded.cloud
     _without_lambda_2(cloud)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-        simulating = progress.add_task("hours simulated", total=1)
+    with progress(console) as bars:
+        simulating = bars.add_task("hours simulated", total=1)
         spec = drive_of(0, 0, seconds=HOUR_S)
         batches, start_us = stored(spec), spec.key.start_us
-        progress.advance(simulating)
+        bars.advance(simulating)
         robots = [f"car{number}" for number in range(hours)]
-        writing = progress.add_task("robot-hours written", total=hours)
+        writing = bars.add_task("robot-hours written", total=hours)
         for robot in robots:
             _record(cloud, robot, batches)
-            progress.advance(writing)
+            bars.advance(writing)
         before, began = _cpu_s(embedded), time.monotonic()
         run = analysis.start(cloud, AnalysisRequest((), start_us, start_us + round(HOUR_S) * _S, again=True))
-        finding = progress.add_task("robots searched for drives", total=None)
-        analysing = progress.add_task("drives analysed", total=None, start=False)
+        finding = bars.add_task("robots searched for drives", total=None)
+        analysing = bars.add_task("drives analysed", total=None, start=False)
         for last in analysis.watch(cloud, run):
             if last.drives is not None:
-                progress.update(finding, total=hours, completed=hours)
-                progress.start_task(analysing)
-                progress.update(analysing, total=last.drives, completed=last.done)
+                bars.update(finding, total=hours, completed=hours)
+                bars.start_task(analysing)
+                bars.update(analysing, total=last.drives, completed=last.done)
         took_s, after = time.monotonic() - began, _cpu_s(embedded)
     without = [robot for robot in robots if not findings.drives(cloud, robot)]
     if without:

@@ -18,16 +18,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from bench import ROOT
+from bench.command import progress
 from bench.proof import recordings, report, speed
 from bench.proof.analysing import Analysed, analysed, on_all_cores
 from bench.proof.cars import DriveSpec
@@ -69,24 +62,22 @@ def main() -> None:
 
 
 def _measure(plan: Plan, console: Console) -> list[Section]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+    with progress(console) as bars:
         specs = list(plan.all_drives())
-        driving = progress.add_task("drives simulated and analysed", total=len(specs))
-        drives = dict(
-            zip(specs, on_all_cores(analysed, specs, lambda: progress.advance(driving)), strict=True)
-        )
-        judging = progress.add_task("cars judged", total=plan.cars)
-        judged = on_all_cores(judge, _cars(plan, drives), lambda: progress.advance(judging))
-        hours = progress.add_task("hours timed", total=1)
+        driving = bars.add_task("drives simulated and analysed", total=len(specs))
+        drives = dict(zip(specs, on_all_cores(analysed, specs, lambda: bars.advance(driving)), strict=True))
+        judging = bars.add_task("cars judged", total=plan.cars)
+        judged = on_all_cores(judge, _cars(plan, drives), lambda: bars.advance(judging))
+        hours = bars.add_task("hours timed", total=1)
         timed = _timed(plan)
-        progress.advance(hours)
+        bars.advance(hours)
     return _sections(plan, drives, judged, timed)
 
 
 def _timed(plan: Plan) -> Section:
     hour = speed.hour_cpu_s(car=0)
-    return report.speed(hour, _ROBOT_HOURS, speed.bill(_ROBOT_HOURS, hour.cpu_s, plan.seconds))
+    ours, floor = (speed.bill(_ROBOT_HOURS, cpu_s, plan.seconds) for cpu_s in (hour.cpu_s, hour.floor_s))
+    return report.speed(hour, _ROBOT_HOURS, ours, floor)
 
 
 def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:

@@ -1,4 +1,4 @@
-"""The parts that all commands share: options, figures as a file, confirmation, and an orderly end."""
+"""What all commands share: options, figures as a file, progress, confirmation, and an orderly end."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.prompt import Confirm
 
 from bench.report import machine
@@ -36,6 +44,12 @@ def write(path: Path | None, figures: Any) -> None:
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def progress(console: Console) -> Progress:
+    """Bars of what is done, how long it took and how long the rest takes."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, TimeRemainingColumn(), console=console)
 
 
 def confirm(console: Console, text: str, error: type[Exception]) -> None:

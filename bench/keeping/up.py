@@ -31,22 +31,21 @@ class Up:
 
     def __init__(self, state: Path) -> None:
         self.state = state
+        self.cloud: Cloud
         self._child: Child
 
     def __enter__(self) -> Self:
         self._start()
-        self._wait_for((self.state / EMBEDDED.name).exists, _FIRST_S)
+        file = self.state / EMBEDDED.name
+        self._wait_for(file.exists, _FIRST_S)
+        # The file is there only while the cloud is up, and a kept cloud has the same address and keys again.
+        self.cloud = Cloud.load(file)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._child.stop()
-
-    @property
-    def cloud(self) -> Cloud:
-        """The cloud's address and keys."""
-        return Cloud.load(self.state / EMBEDDED.name)
 
     @property
     def emulator(self) -> int | None:

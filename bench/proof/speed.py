@@ -1,17 +1,25 @@
-"""The processor time that the analysis of a robot-hour takes, and what 1,000 of them take and cost on AWS."""
+"""The processor time of a robot-hour's analysis, beside its floor, and what 1,000 of them take and cost on
+AWS."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.errors import BenchError
+from bench.floors.decoding import columns
 from bench.proof.cars import drive_of
 from bench.proof.drives import RATE_HZ
 from bench.proof.stored import stored
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
+from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cost.analysing import Function, drive_items
 from iort_station.cost.usage import Usage
@@ -21,11 +29,12 @@ _REPEATS = 3
 
 
 class Hour(NamedTuple):
-    """The processor time in seconds to decode the stored batches of an hour's drive and to analyse them; and
-    its samples, of all streams."""
+    """The processor time in seconds to decode the stored batches of an hour's drive and to analyse them; that
+    of the floor, which only decodes them (`bench.floors.decoding`); and the samples of all streams."""
 
     decode_s: float
     analyse_s: float
+    floor_s: float
     samples: int
 
     @property
@@ -43,7 +52,7 @@ class Bill:
 
 
 def hour_cpu_s(car: int) -> Hour:
-    """Analyse an hour's drive from its stored batches, some times; the median."""
+    """Analyse an hour's drive from its stored batches, in turns with the floor; the median turn."""
     spec = drive_of(car, 0, seconds=HOUR_S)
     items, end_us = stored(spec), spec.key.start_us + round(HOUR_S * 1e6)
     hours = []
@@ -52,8 +61,20 @@ def hour_cpu_s(car: int) -> Hour:
         streams = {name: recorded(spec.key, end_us, name, some).block for name, some in items.items()}
         decoded = time.process_time()
         result = analyse(spec.key, streams, F1TENTH, {"mass_kg": spec.vehicle.mass_kg})
-        hours.append(Hour(decoded - began, time.process_time() - decoded, result.samples))
-    return sorted(hours, key=lambda hour: hour.cpu_s)[_REPEATS // 2]
+        analysed = time.process_time()
+        floor = {name: columns(some) for name, some in items.items()}
+        floor_s = time.process_time() - analysed
+        _check(streams, floor)
+        hours.append(Hour(decoded - began, analysed - decoded, floor_s, result.samples))
+    return sorted(hours, key=lambda hour: hour.cpu_s / hour.floor_s)[_REPEATS // 2]
+
+
+def _check(streams: Mapping[str, Block], floor: Mapping[str, Mapping[str, NDArray[np.float64]]]) -> None:
+    """Raise `BenchError` if the floor has not decoded what we have."""
+    for stream, block in streams.items():
+        for name, column in block.columns.items():
+            if not np.array_equal(column, floor[stream][name]):
+                raise BenchError(f"{stream}.{name}: the floor must decode the same values")
 
 
 def bill(robot_hours: float, cpu_s: float, drive_s: float, function: Function | None = None) -> Bill:

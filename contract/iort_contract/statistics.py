@@ -53,7 +53,8 @@ def summarize_second(
                 columns.setdefault(name, [None] * len(times)).extend(column[first:end])
             times.extend(batch.times_us[first:end])
             for column in columns.values():
-                column.extend([None] * (len(times) - len(column)))
+                if len(column) < len(times):
+                    column.extend([None] * (len(times) - len(column)))
         if start_us <= batch.t_us < end_us:
             nonfinite += batch.nonfinite
         if first:
@@ -122,10 +123,11 @@ def missing_before(batch: BatchId, near: Sequence[BatchId], previous: Sequence[R
 def count_holes(times_us: Sequence[int]) -> int:
     """Steps between samples over three times the median step; at least three steps are needed."""
     steps = list(map(sub, times_us[1:], times_us))
-    if len(steps) < 3:
+    # Nearly always the least step decides, which the median is not below.
+    if len(steps) < 3 or max(steps) <= _HOLE * min(steps):
         return 0
     limit = _HOLE * median(steps)
-    return 0 if max(steps) <= limit else sum(step > limit for step in steps)
+    return sum(step > limit for step in steps)
 
 
 def statistics_of(column: Sequence[Value]) -> Statistics:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 from iort_contract.checks import checked, shown
@@ -69,11 +70,17 @@ def build_topic(lane: str, robot: str, name: str, namespace: str = DEFAULT_NAMES
 
 def parse_topic(topic: str) -> Topic:
     """Parse a topic; raises `ContractError` for one that `build_topic` cannot have built."""
-    levels = topic.split("/") if isinstance(topic, str) else []
-    if len(levels) != 4:
+    if not isinstance(topic, str) or topic.count("/") != len(Topic._fields) - 1:
         raise ContractError(f"topic must be <lane>/<namespace>/<robot>/<name>, got {shown(topic)}")
-    build_topic(levels[0], levels[2], levels[3], levels[1])
-    return Topic(*levels)
+    return _parsed(topic)
+
+
+# Each message names its topic, and most of them the same.
+@lru_cache(maxsize=4096)
+def _parsed(topic: str) -> Topic:
+    found = Topic(*topic.split("/"))
+    build_topic(found.lane, found.robot, found.name, found.namespace)
+    return found
 
 
 def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:

@@ -41,6 +41,7 @@ class Tables:
         self.ledger = ledger
         self._items: dict[str, Items] = {}
         self._written: tuple[Item, str] | None = None
+        self._miscounted = False
         ledger.define(_SCHEMA)
         ledger.on_undo.append(self._undone)
 
@@ -82,7 +83,16 @@ class Tables:
             with self.ledger.write():
                 self._learn_ttl(items)
                 items.expire(now_s)
+                if self._miscounted:
+                    self._count(items.table)
+        self._miscounted = False
         self.ledger.commit()
+
+    @staticmethod
+    def _count(table: Table) -> None:
+        """AWS, too, counts items now and then."""
+        table["ItemCount"] = table["items"].count()
+        table["TableSizeBytes"] = table["ItemCount"] * 200
 
     def _learn_ttl(self, items: Items) -> None:
         _, _, _, region, account, _ = items.table["TableArn"].split(":", 5)
@@ -119,7 +129,7 @@ class Tables:
             load(data)
             for table in dynamodb._tables.all_values():
                 self.adopt(table)
-                dynamodb._update_counts(table)
+                self._count(table)
 
         return loaded
 
@@ -144,7 +154,7 @@ class Tables:
                 items.table["items"] = {}
                 del self._items[name]
             items.table.pop(dynamodb._INDEX_MEMBERS, None)
-            dynamodb._update_counts(items.table)
+        self._miscounted = True
 
 
 def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:

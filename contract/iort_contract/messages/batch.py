@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any, Mapping, NamedTuple, Sequence
 
@@ -81,13 +82,25 @@ class BatchId(NamedTuple):
 
 def batch_id(text: Any) -> BatchId:
     """Parse an id; raises `ContractError`."""
-    match = _BATCH_ID.fullmatch(text) if isinstance(text, str) else None
+    if not isinstance(text, str):
+        raise _not_an_id(text)
+    return _parsed_id(text)
+
+
+# Lambda 2 meets each of an event's ids several times.
+@lru_cache(maxsize=1024)
+def _parsed_id(text: str) -> BatchId:
+    match = _BATCH_ID.fullmatch(text)
     if match is None:
-        raise ContractError(f"{BATCH} must be <16 digits of microseconds>-<run>-<number>, got {shown(text)}")
+        raise _not_an_id(text)
     found = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
     check_time(found.t_us, BATCH)
     check_header(found.boot, found.seq, 0)
     return found
+
+
+def _not_an_id(text: Any) -> ContractError:
+    return ContractError(f"{BATCH} must be <16 digits of microseconds>-<run>-<number>, got {shown(text)}")
 
 
 def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:

@@ -57,11 +57,14 @@ class Session:
             raise
         self._accepted(self._receive(CONNACK)[1])
 
-    def round_trip(self, topic: str, payload: bytes, answer_topic: str, timeout_s: float) -> bytes | None:
-        """Publish a message and return the first one on the answer's topic; None without one in time."""
-        # Packet id 1, no properties; QoS 0.
-        self._send(SUBSCRIBE << 4 | 2, b"\x00\x01\x00" + _text(answer_topic) + b"\x00")
+    def subscribe(self, topic: str) -> None:
+        """Subscribe to a topic, with QoS 0."""
+        # Packet id 1, which is free again with each answer; no properties.
+        self._send(SUBSCRIBE << 4 | 2, b"\x00\x01\x00" + _text(topic) + b"\x00")
         self._accepted(self._receive(SUBACK)[-1])
+
+    def round_trip(self, topic: str, payload: bytes, answer_topic: str, timeout_s: float) -> bytes | None:
+        """Publish a message, with QoS 0, and return the next one on a topic; None without one in time."""
         self._send(PUBLISH << 4, _text(topic) + b"\x00" + payload)
         deadline = time.monotonic() + timeout_s
         try:

@@ -44,7 +44,7 @@ def secured(config: Config, raw: socket.socket, address: str) -> ssl.SSLSocket:
     except ssl.SSLCertVerificationError as error:
         raise BlockedError("server certificate", *_distrusted(config, address, error)) from error
     except (OSError, ValueError) as error:
-        raise BlockedError("TLS", *_no_tls(config, error)) from error
+        raise BlockedError("TLS", *no_tls(config, error)) from error
 
 
 def _distrusted(config: Config, address: str, error: ssl.SSLCertVerificationError) -> tuple[str, str]:
@@ -90,8 +90,8 @@ def _unverified(config: Config, address: str) -> Certificate | None:
     return None
 
 
-def _no_tls(config: Config, error: Exception) -> tuple[str, str]:
-    """Why there is no TLS, and what to do."""
+def no_tls(config: Config, error: Exception) -> tuple[str, str]:
+    """Why a connection does not come to TLS, and what to do."""
     reason = str(getattr(error, "reason", None) or error)
     if (refused := refused_ours(config, reason)) is not None:
         return refused

@@ -6,33 +6,41 @@ The first step that fails says what to do, and ends the way: the later ones woul
 from __future__ import annotations
 
 import errno
+import hashlib
 import http.client
 import socket
 import ssl
 import time
+import uuid
 from contextlib import closing, suppress
 from email.utils import parsedate_to_datetime
 from ipaddress import ip_address
 from typing import Any, Generator, Iterator, NamedTuple
+from urllib.parse import urlsplit
 
 from iort_agent.common.state import Status
 from iort_agent.config import Config
+from iort_agent.files.http import trusting
 from iort_agent.mqtt.by_hand import RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
-from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, refused_ours, secured, utc
+from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, no_tls, refused_ours, secured, utc
 from iort_contract.limits import ContractError
+from iort_contract.messages.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.messages.live import decode_pong, encode_ping
-from iort_contract.topics import PING, PONG, RULE, build_topic
+from iort_contract.topics import FILE, PING, PONG, RULE, build_topic
 
 # A certificate that ends sooner should have been replaced by now.
 _ENDS_SOON_S = 3 * 86_400
 # This agent cannot run before 2026-01-01.
 _EARLIEST_S = 1_767_225_600
 _CLOCK_OFF_S = 5.0
+# A function that was not used for long starts first.
+_FILE_ANSWER_S = 15.0
+_TLS_PORT = 443
 
 
 class _Offset(NamedTuple):
-    """The cloud's clock minus the robot's, and who says so."""
+    """The cloud's clock minus the robot's, and how that is known."""
 
     seconds: float
     by: str
@@ -46,7 +54,7 @@ def way(config: Config, running: Status | None = None) -> Iterator[Finding]:
         literal = addresses == [config.endpoint]
         yield Finding("name", OK, f"{config.endpoint} is {'an address' if literal else ', '.join(addresses)}")
         yield Finding("route", OK, _route(addresses))
-        raw, address = _connected(addresses, config.port)
+        raw, address = _connected(config, addresses)
         yield Finding("port", OK, f"{address} listens on {config.port}")
         with closing(raw), closing(secured(config, raw, address)) as secure:
             yield _served(secure)
@@ -100,14 +108,17 @@ def _family(address: str) -> int:
     return socket.AF_INET6 if ":" in address else socket.AF_INET
 
 
-def _connected(addresses: list[str], port: int) -> tuple[socket.socket, str]:
-    problem: OSError = OSError()
+def _connected(config: Config, addresses: list[str]) -> tuple[socket.socket, str]:
+    port, problem = config.port, OSError()
     for address in addresses:
         try:
             return socket.create_connection((address, port), TIMEOUT_S), address
         except OSError as error:  # noqa: PERF203 - the next address may answer
             problem = error
     address = addresses[-1]
+    if problem.errno == errno.ECONNRESET:
+        # Accepted, and ended before we could say anything.
+        raise BlockedError("TLS", *no_tls(config, problem)) from problem
     if problem.errno == errno.ECONNREFUSED:
         text = f"{address} answers, but nothing listens on {port}"
         todo = "is the cloud running there (`make up`, `iort doctor`), and is `port` right?"
@@ -143,7 +154,7 @@ def _served(secure: ssl.SSLSocket) -> Finding:
 
 
 def _broker(config: Config, secure: ssl.SSLSocket) -> Generator[Finding, None, _Offset | None]:
-    """The broker's answer to the robot, then the cloud's to a ping. Returns the clock's offset, or None."""
+    """The broker's answer to the robot, then the cloud's. Returns the clock's offset, or None."""
     robot = config.robot
     with Session(secure) as session:
         try:
@@ -157,24 +168,60 @@ def _broker(config: Config, secure: ssl.SSLSocket) -> Generator[Finding, None, _
         except OSError as error:
             raise BlockedError("broker", *_no_connack(config, error)) from error
         yield Finding("broker", OK, f"accepts {robot}")
-        ping, pong = (build_topic(lane, robot, RULE, config.namespace) for lane in (PING, PONG))
-        sent_s, sent_us = time.monotonic(), time.time_ns() // 1000
-        why = f"no answer in {TIMEOUT_S:g} s"
         try:
-            answer = session.round_trip(ping, encode_ping(0, sent_us), pong, TIMEOUT_S)
-            received_ms = None if answer is None else decode_pong(answer).received_ms
+            session.subscribe(build_topic(PONG, robot, RULE, config.namespace))
+            session.subscribe(build_topic(PONG, robot, FILE, config.namespace))
+            offset = _ping(config, session)
+            yield Finding("rules", OK, f"answer a ping, {offset.by}")
+            yield _files(config, session)
         except (OSError, RefusalError, ContractError) as error:
-            received_ms, why = None, str(error)
-        trip_s = time.monotonic() - sent_s
-        if received_ms is None:
             todo = (
                 f"is `namespace: {config.namespace}` the deployment's, and is it deployed whole? "
                 "`iort doctor` there"
             )
-            yield Finding("rules", WARN, f"the cloud's rules do not answer a ping: {why}", todo)
+            yield Finding("rules", WARN, f"the cloud's rules do not answer: {error}", todo)
             return None
-        yield Finding("rules", OK, f"answer a ping in {trip_s * 1000:.0f} ms")
-        return _Offset(received_ms / 1000 - sent_us / 1e6 - trip_s / 2, "the answer to a ping")
+        return offset
+
+
+def _ping(config: Config, session: Session) -> _Offset:
+    """Compare the clocks by a rule's answer. Raises `OSError` without one."""
+    ping, pong = (build_topic(lane, config.robot, RULE, config.namespace) for lane in (PING, PONG))
+    sent_s, sent_us = time.monotonic(), time.time_ns() // 1000
+    answer = session.round_trip(ping, encode_ping(0, sent_us), pong, TIMEOUT_S)
+    trip_s = time.monotonic() - sent_s
+    received_ms = None if answer is None else decode_pong(answer).received_ms
+    if received_ms is None:
+        raise OSError(f"nothing in {TIMEOUT_S:g} s")
+    return _Offset(
+        received_ms / 1000 - sent_us / 1e6 - trip_s / 2, f"by a round trip of {trip_s * 1000:.0f} ms"
+    )
+
+
+def _files(config: Config, session: Session) -> Finding:
+    """Whether files could be sent: the cloud names the address, and nothing is sent there."""
+    nothing = hashlib.sha256(b"").hexdigest()
+    empty = File("check", "other", "application/octet-stream", 0, nothing, time.time_ns() // 1000)
+    request = encode_file_request(FileRequest(uuid.uuid4().hex, empty, {1: nothing}))
+    ask, answered = (build_topic(lane, config.robot, FILE, config.namespace) for lane in (PING, PONG))
+    told = session.round_trip(ask, request, answered, _FILE_ANSWER_S)
+    if told is None:
+        todo = "`iort errors` and `iort alarms` at the cloud tell of the function Upload"
+        return Finding("files", WARN, f"the cloud names no address in {_FILE_ANSWER_S:g} s", todo)
+    answer = decode_file_answer(told)
+    if not answer.addresses:
+        return Finding(
+            "files", WARN, f"refused: {answer.refused}", "is the robot registered? `iort robots list`"
+        )
+    url = urlsplit(answer.addresses[0].url)
+    host, port = url.hostname or "", url.port or _TLS_PORT
+    try:
+        with socket.create_connection((host, port), TIMEOUT_S) as raw:
+            trusting(config.root_ca).wrap_socket(raw, server_hostname=host).close()
+    except (OSError, ValueError) as error:
+        todo = f"let port {port} of {host} through the firewall. Recordings do not need it"
+        return Finding("files", WARN, f"cannot be sent to {host}:{port}: {error}", todo)
+    return Finding("files", OK, f"could be sent to {host}:{port}")
 
 
 def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
@@ -195,7 +242,7 @@ def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
 def _other_offset(config: Config, running: Status | None) -> _Offset | None:
     """The clock's offset by others than the broker."""
     if running is not None and running.clock is not None:
-        return _Offset(running.clock.offset_ms / 1000, "the running agent's pings")
+        return _Offset(running.clock.offset_ms / 1000, "by the running agent's pings")
     if not config.endpoint.endswith(".amazonaws.com"):
         return None
     # To the second; nothing without a valid answer.
@@ -203,7 +250,9 @@ def _other_offset(config: Config, running: Status | None) -> _Offset | None:
     with suppress(OSError, http.client.HTTPException, TypeError, ValueError), closing(connection):
         connection.request("HEAD", "/")
         date = connection.getresponse().getheader("Date", "")
-        return _Offset(parsedate_to_datetime(date).timestamp() + 0.5 - time.time(), "AWS' answer over HTTPS")
+        return _Offset(
+            parsedate_to_datetime(date).timestamp() + 0.5 - time.time(), "by AWS' answer over HTTPS"
+        )
     return None
 
 
@@ -214,6 +263,6 @@ def _clock(offset: _Offset | None) -> Finding:
             return Finding("clock", FAIL, f"says {shown}, which is long past", SET_CLOCK)
         return Finding("clock", OK, f"says {shown}, which is plausible; nothing to compare it with yet")
     if abs(offset.seconds) > _CLOCK_OFF_S:
-        text = f"is {-offset.seconds:+.1f} s off, by {offset.by}: samples are stamped wrong"
+        text = f"is {-offset.seconds:+.1f} s off, {offset.by}: samples are stamped wrong"
         return Finding("clock", WARN, text, SET_CLOCK)
-    return Finding("clock", OK, f"is {-offset.seconds:+.3f} s off, by {offset.by}")
+    return Finding("clock", OK, f"is {-offset.seconds:+.3f} s off, {offset.by}")

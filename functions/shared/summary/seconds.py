@@ -60,7 +60,7 @@ def summarize_topic(
         seconds = set(touched)
         previous: Batch | None = None
         missing: dict[int, int] = defaultdict(int)
-        for batch, _, beyond in stored:
+        for batch, _, _, beyond in stored:
             second = batch.t_us // _SECOND_US
             # The seconds before and after a range are read in part, and belong to another range.
             if previous is not None and previous.id in known and second >= touched[0]:

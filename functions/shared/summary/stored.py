@@ -28,11 +28,12 @@ _NEIGHBOURS = 10
 
 
 class Stored(NamedTuple):
-    """A batch as stored in the telemetry table. One ``beyond`` its second's limit only marks the start of the
-    next second."""
+    """A batch as stored in the telemetry table, with the estimated memory of its columns. One ``beyond`` its
+    second's limit only marks the start of the next second."""
 
     batch: Batch
     expires_s: int | None
+    size: int
     beyond: bool = False
 
 
@@ -67,7 +68,7 @@ class Reader:
                 break
             if entry is not None:
                 stored.append(entry)
-                size += _bytes(entry.batch)
+                size += entry.size
                 if t_us >= end_us:
                     after_s = t_us // _SECOND_US
         if stored and stored[0].batch.t_us >= start_us:
@@ -110,7 +111,7 @@ class Reader:
                 if t_us // _SECOND_US != second:
                     second, count, size = t_us // _SECOND_US, 0, 0
                 elif entry is not None:
-                    size += _bytes(entry.batch)
+                    size += entry.size
                 if count >= SECOND_BATCHES or size >= _SECOND_BYTES:
                     self.full.add(second)
                     from_us = (second + 1) * _SECOND_US
@@ -135,7 +136,7 @@ class Reader:
                 expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
             except (ContractError, KeyError, TypeError, ValueError, OverflowError):
                 continue
-            yield Stored(batch, expires_s)
+            yield Stored(batch, expires_s, _bytes(batch))
 
     def _decoded(self, item: Mapping[str, Any]) -> Batch:
         self.check()

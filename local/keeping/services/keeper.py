@@ -53,12 +53,13 @@ class Services:
         self._deploying = False
         self._interrupted: list[executions.Key] = []
         ledger.define(_SCHEMA)
+        ledger.on_undo.append(self._undone)
 
     def install(self) -> None:
         """Load the state when the emulator starts, and write it from then on."""
         app.PERSIST_STATE = True
         app._load_persisted_state = self.load
-        app.save_all = lambda _states: self.save_all()
+        app.save_all = lambda _states: self._save_later()
         for name, handler in app.SERVICE_HANDLERS.items():
             app.SERVICE_HANDLERS[name] = self._kept(app.SERVICE_REGISTRY[name]["module"], handler)
         iot.update_thing_shadow = self._keeping_shadow(iot.update_thing_shadow)
@@ -80,6 +81,10 @@ class Services:
             states.load(app._get_module(service), state)
         self._drop_blobs()
         threading.Thread(target=self._tick, daemon=True, name="keeping").start()
+
+    def _undone(self) -> None:
+        # A deployment may be among what is not written any more.
+        self._deploying = True
 
     def go_on(self) -> None:
         """Begin anew what was interrupted."""
@@ -188,10 +193,13 @@ class Services:
 
     def _save_later(self) -> None:
         try:
+            executions.forget_old()
             self.save_all()
             self._ledger.commit()
         except LedgerError as error:
             _log.warning("changes that no call made are written later: %s", error)
+        except Exception:  # noqa: BLE001 - the thread has to write later changes
+            _log.exception("changes that no call made are not written")
 
 
 class Retained(dict[str, Any]):

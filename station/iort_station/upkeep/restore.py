@@ -45,7 +45,7 @@ def restore(
         )
     with held(folder), _beside(folder) as made:
         manifest = _read(archive, made, progress)
-        for path in made.rglob("*"):
+        for path in made.iterdir():
             if path.is_file() and is_database(path):
                 _check_database(path)
         os.sync()

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from iort_station.errors import StationError
-from iort_station.upkeep.state import MADE_ANEW
+from iort_station.upkeep.state import MADE_ANEW, UNFINISHED
 
 _FOLDER = ".backup"
 _ATTEMPTS = 20
@@ -92,7 +92,8 @@ class _Links:
                 continue
             # It may have been deleted meanwhile.
             with suppress(FileNotFoundError):
-                if is_database(self._source / name):
+                # A robot's file may be a database, too: it is copied byte by byte.
+                if "/" not in name and is_database(self._source / name):
                     self.databases.add(name)
                     continue
                 _link(self._source / name, self.folder / name)
@@ -105,7 +106,7 @@ def _files(folder: Path, prefix: str = "") -> Iterator[tuple[str, int]]:
     """The files that a backup has: their paths in the folder, and their inodes."""
     with os.scandir(folder) as entries:
         for entry in entries:
-            if _made_anew(entry.name):
+            if entry.name.endswith(UNFINISHED) or (not prefix and _made_anew(entry.name)):
                 continue
             if entry.is_dir(follow_symlinks=False):
                 with suppress(FileNotFoundError):

@@ -12,8 +12,11 @@ from iort_station import kept
 from iort_station.errors import StationError
 
 VERSION, LAST_BACKUP = "VERSION", "last-backup.json"
-# A start makes these anew, so no backup has them: the running cloud's addresses, logs, files in use.
-MADE_ANEW = (kept.UP, kept.CLOUD, LAST_BACKUP, "tmp", "*.tmp", "*.log", "*.sock", "*-wal", "*-shm")
+# A start makes these anew, so no backup has them: addresses, logs, files in use. A robot's
+# files below s3/ may have such names, too.
+MADE_ANEW = (kept.UP, kept.CLOUD, LAST_BACKUP, "tmp", "*.log", "*.log.*", "*.sock", "*-wal", "*-shm")
+# A file that is being written, in any folder.
+UNFINISHED = ".tmp"
 
 
 @contextmanager

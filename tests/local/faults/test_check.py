@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import time
 from collections.abc import Callable, Iterator
 
@@ -32,13 +33,25 @@ def test_the_way_to_a_cloud_that_works(
     car = bundle()
     findings = go(car, proxy)
     assert {one.level for one in findings.values()} == {OK}
-    assert list(findings) == ["name", "route", "port", "server certificate", "broker", "rules", "clock"]
-    assert "by the answer to a ping" in findings["clock"].text
+    assert list(findings) == [
+        "name",
+        "route",
+        "port",
+        "server certificate",
+        "broker",
+        "rules",
+        "files",
+        "clock",
+    ]
+    assert "by a round trip of" in findings["clock"].text
     now_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: now_ns() - 100_000_000_000)
-    clock = go(car, proxy)["clock"]
-    assert clock.level == WARN
-    assert clock.text.startswith("is -100.")
+    # Files go to another server, which this machine does not trust.
+    monkeypatch.setattr(way, "trusting", lambda _: ssl.create_default_context())
+    findings = go(car, proxy)
+    assert findings["clock"].level == findings["files"].level == WARN
+    assert findings["clock"].text.startswith("is -100.")
+    assert "cannot be sent to 127.0.0.1" in findings["files"].text
 
 
 @pytest.mark.parametrize(

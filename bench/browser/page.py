@@ -1,6 +1,6 @@
 """`make bench-page`: the cost of the page in the browser, with 20 cars at 10 Hz.
 
-    python -m bench.page [--cars 20] [--rate 10] [--seconds 30] [--soak 300] [--json FILE]
+    python -m bench.browser.page [--cars 20] [--rate 10] [--seconds 30] [--soak 300] [--json FILE]
 
 Processor time of the page's main thread and of its worker, as shares of a processor, on the fleet's view
 and on that of one car, by Chromium's own counters; and the JavaScript heap after a collection, every half

@@ -1,0 +1,1 @@
+"""Commands that look at the page in Chromium, or drive from it."""
