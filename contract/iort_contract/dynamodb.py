@@ -25,6 +25,7 @@ _WRITE_ATTEMPTS = 8
 _FIRST_S, _LAST_S = -(2**53), 2**53
 # Where a request's JSON waits in botocore's context.
 _BODY = "iort_body"
+_ANY_WRITE: Mapping[str, Any] = {"DeleteRequest": {"Key": {}}}
 _Client = TypeVar("_Client")
 
 
@@ -74,8 +75,8 @@ def _set_aside(params: Mapping[str, Any], context: dict[str, Any], **_: Any) -> 
         context[_BODY] = COMPACT.encode(params).encode()
     except TypeError:
         return params
-    # Where the request goes may follow from the tables' names.
-    return {**params, "RequestItems": {table: [] for table in params["RequestItems"]}}
+    # Where the request goes may follow from the tables' names. A client that validates wants one item each.
+    return {**params, "RequestItems": {table: [_ANY_WRITE] for table in params["RequestItems"]}}
 
 
 def _put_back(params: dict[str, Any], context: Mapping[str, Any], **_: Any) -> None:

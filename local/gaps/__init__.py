@@ -14,6 +14,7 @@ from typing import Protocol, cast
 # In the order of their installation: a later wrapper is around an earlier one.
 NAMES = (
     "broker.client_certificate",
+    "broker.delivery_time",
     "broker.https_port",
     "broker.rule_time",
     "broker.server_certificate",

@@ -16,6 +16,18 @@ from local.keeping.places import place_of
 Item = dict[str, Any]
 Table = dict[str, Any]
 
+# A machine that was off for a month has millions of expired items.
+_EXPIRED_ROWS = 500
+# No partition has an empty key.
+_SCANNED = ""
+# Steps from partition to partition, where DISTINCT would read every key.
+_PARTITIONS = """
+WITH RECURSIVE one (pk) AS (
+    SELECT min(pk) FROM items WHERE tab = ?1
+    UNION ALL
+    SELECT (SELECT min(pk) FROM items WHERE tab = ?1 AND pk > one.pk) FROM one WHERE one.pk IS NOT NULL)
+SELECT pk FROM one WHERE pk IS NOT NULL
+"""
 # DynamoDB reads at most this for a page.
 PAGE_BYTES = 1024 * 1024
 
@@ -48,7 +60,9 @@ class Items(MutableMapping[str, "Bucket"]):
         sort = table.get("sk_name")
         self.kind: str = dynamodb._get_attr_type(table, sort) if sort else ""
 
-    def __getitem__(self, partition: str) -> Bucket:
+    def __getitem__(self, partition: str) -> Any:
+        if partition == _SCANNED and (shown := self.scanned):
+            return dict(enumerate(shown.items))
         return Bucket(self, partition)
 
     def get(self, partition: str, _default: Any = None) -> Bucket:
@@ -72,12 +86,43 @@ class Items(MutableMapping[str, "Bucket"]):
         return bool(self[str(partition)])
 
     def __iter__(self) -> Iterator[str]:
-        rows = self.ledger.read("SELECT DISTINCT pk FROM items WHERE tab = ? ORDER BY pk", (self.number,))
-        return iter([partition for (partition,) in rows])
+        if self.scanned is not None:
+            return iter([_SCANNED])
+        return iter([partition for (partition,) in self.ledger.read(_PARTITIONS, (self.number,))])
 
     def __len__(self) -> int:
-        ((count,),) = self.ledger.read("SELECT count(DISTINCT pk) FROM items WHERE tab = ?", (self.number,))
+        return len(list(iter(self)))
+
+    def count(self) -> int:
+        """The number of items."""
+        ((count,),) = self.ledger.read("SELECT count(*) FROM items WHERE tab = ?", (self.number,))
         return int(count)
+
+    def texts(self, cursor: tuple[str, str] | None, most: int | None) -> list[tuple[int, str]]:
+        """Sizes and JSON texts of the items after a partition and a sort key, in the order of their keys."""
+        after = "" if cursor is None else " AND (pk, sk) > (?, ?)"
+        place = () if cursor is None else (cursor[0], place_of(self.kind, cursor[1]))
+        return self.page(f"1{after} ORDER BY pk, sk", place, most)
+
+    def page(self, where: str, arguments: Iterable[Any], most: int | None) -> list[tuple[int, str]]:
+        """Sizes and JSON texts: as many as a page may have, and one more."""
+        sql = f"SELECT size, item FROM items WHERE tab = ? AND {where} LIMIT ?"  # noqa: S608 - our own words
+        found, left = [], PAGE_BYTES
+        with self.ledger.reading() as connection:
+            for size, text in connection.execute(
+                sql, (self.number, *arguments, -1 if most is None else most)
+            ):
+                found.append((size, text))
+                left -= size
+                if left < 0:
+                    break
+        return found
+
+    @property
+    def scanned(self) -> Shown | None:
+        """What the running Scan of this table may see."""
+        shown = SHOWN.get()
+        return shown if shown is not None and shown.of == (self.number, _SCANNED) else None
 
     def __deepcopy__(self, _memo: Any) -> dict[str, Any]:
         """Nothing: ministack copies tables to save them, and the ledger has the items already."""
@@ -108,15 +153,18 @@ class Items(MutableMapping[str, "Bucket"]):
             )
         self.ttl = attribute
 
-    def expire(self, now_s: float) -> None:
-        """Delete the items whose time to live has passed."""
+    def expire(self, now_s: float) -> bool:
+        """Delete some of the items whose time to live has passed; returns whether there may be more."""
         with self.ledger.write() as connection:
             done = connection.execute(
-                "DELETE FROM items WHERE tab = ? AND expires_s <= ?", (self.number, now_s)
+                "DELETE FROM items WHERE id IN"
+                " (SELECT id FROM items WHERE tab = ? AND expires_s <= ? LIMIT ?)",
+                (self.number, now_s, _EXPIRED_ROWS),
             )
         if done.rowcount:
             self.table.pop(dynamodb._INDEX_MEMBERS, None)
             self.table["ItemCount"] = max(0, self.table["ItemCount"] - done.rowcount)
+        return done.rowcount == _EXPIRED_ROWS
 
     def expires_s(self, item: Item) -> float | None:
         """When the item's time to live passes."""
@@ -212,41 +260,27 @@ class Bucket(MutableMapping[str, Item]):
     def values(self) -> Any:
         """All items, or those that the running Query asks for."""
         shown = SHOWN.get()
-        if shown is None or shown.partition != self._at(""):
+        if shown is None or shown.of != (self.items_of.number, self.partition):
             return [item for _, item in self.items()]
         return shown.items
 
     def texts(self, wanted: Wanted) -> list[tuple[int, str]]:
-        """Sizes and JSON texts of the items in the range, in the order asked for: as many as a page may have,
-        and one more."""
-        sql, arguments = "", [self.items_of.number, self.partition]
+        """Sizes and JSON texts of the items in the range, in the order asked for."""
+        sql, arguments = "pk = ?", [self.partition]
         for bound, operator in ((wanted.low, ">"), (wanted.high, "<")):
             if bound is not None:
                 sql += f" AND sk {operator}{'' if bound.open else '='} ?"
                 arguments.append(bound.at)
-        order = "" if wanted.forward else " DESC"
-        sql = f"SELECT size, item FROM items WHERE tab = ? AND pk = ?{sql} ORDER BY sk{order} LIMIT ?"  # noqa: S608 - only operators are filled in
-        found, left = [], PAGE_BYTES
-        with self._ledger.reading() as connection:
-            for size, text in connection.execute(
-                sql, [*arguments, -1 if wanted.most is None else wanted.most]
-            ):
-                found.append((size, text))
-                left -= size
-                if left < 0:
-                    break
-        return found
-
-    def show(self, texts: Iterable[str], cursor: Mapping[str, Any] | None) -> Shown:
-        """Items that the running Query may see."""
-        return Shown(self._at(""), [json.loads(text) for text in texts], cursor)
+        return self.items_of.page(
+            f"{sql} ORDER BY sk{'' if wanted.forward else ' DESC'}", arguments, wanted.most
+        )
 
 
 @dataclass
 class Shown:
-    """The items that the running Query may see."""
+    """The items of a table's partition, or of the whole table, that the running Query or Scan may see."""
 
-    partition: tuple[int, str, str]
+    of: tuple[int, str]
     items: list[Item]
     cursor: Mapping[str, Any] | None
     # The key condition is the same for all items, so that it is evaluated once.

@@ -49,6 +49,8 @@ class Ledger:
         self._lock = threading.RLock()
         self._writing = False
         self._connection = self._open()
+        self._reading = threading.Lock()
+        self._reader = self._open()
         self._committed = 0
         self._disk_lock = threading.Lock()
         self._on_disk = 0
@@ -137,10 +139,11 @@ class Ledger:
             return self._connection.execute(sql, arguments).fetchall()
 
     def read_committed(self, sql: str, arguments: Sequence[Any] = ()) -> list[Row]:
-        """Commit, and read rows: none of them can be undone."""
+        """Commit, and read rows: none of them can be undone. Others go on writing."""
         with self._lock:
             self._commit()
-            return self._connection.execute(sql, arguments).fetchall()
+        with self._reading:
+            return self._reader.execute(sql, arguments).fetchall()
 
     @property
     def pending(self) -> bool:
@@ -240,6 +243,7 @@ class Ledger:
         try:
             self.commit()
         finally:
-            with self._lock:
+            with self._lock, self._reading:
                 self._connection.close()
+                self._reader.close()
             os.close(self._wal)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 from ministack.services import dynamodb
@@ -31,6 +32,7 @@ _WRITES = (
     "_batch_execute_statement",
     "_execute_transaction",
 )
+_PAUSE_S = 0.01
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -41,6 +43,7 @@ class Tables:
         self.ledger = ledger
         self._items: dict[str, Items] = {}
         self._written: tuple[Item, str] | None = None
+        self._miscounted = False
         ledger.define(_SCHEMA)
         ledger.on_undo.append(self._undone)
 
@@ -81,8 +84,16 @@ class Tables:
         for items in list(self._items.values()):
             with self.ledger.write():
                 self._learn_ttl(items)
-                items.expire(now_s)
-        self.ledger.commit()
+                if self._miscounted:
+                    self._count(items.table)
+            gently(self.ledger, partial(items.expire, now_s))
+        self._miscounted = False
+
+    @staticmethod
+    def _count(table: Table) -> None:
+        """AWS, too, counts items now and then."""
+        table["ItemCount"] = table["items"].count()
+        table["TableSizeBytes"] = table["ItemCount"] * 200
 
     def _learn_ttl(self, items: Items) -> None:
         _, _, _, region, account, _ = items.table["TableArn"].split(":", 5)
@@ -119,7 +130,7 @@ class Tables:
             load(data)
             for table in dynamodb._tables.all_values():
                 self.adopt(table)
-                dynamodb._update_counts(table)
+                self._count(table)
 
         return loaded
 
@@ -144,7 +155,15 @@ class Tables:
                 items.table["items"] = {}
                 del self._items[name]
             items.table.pop(dynamodb._INDEX_MEMBERS, None)
-            dynamodb._update_counts(items.table)
+        self._miscounted = True
+
+
+def gently(ledger: Ledger, delete: Callable[[], bool]) -> None:
+    """Delete a little at a time until nothing is left to delete; others write in between."""
+    while delete():
+        ledger.commit()
+        time.sleep(_PAUSE_S)
+    ledger.commit()
 
 
 def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -200,7 +200,7 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         page.get_by_role("button", name="Release all").click()
         assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
         # Only what the fleet's stop has stopped.
-        page.get_by_role("button", name="Really release car-9: may move").click()
+        page.get_by_role("button", name="Really release car-9: it may move").click()
         until(lambda: words.inner_text().startswith(stands), "the release of car-9")
         assert lab.asked[-1] == {"stopped": "false"}
         page.goto(f"{server.url}#/car/car-1")
@@ -208,6 +208,8 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         page.get_by_role("button", name="Really release car-1").click()
         until(lambda: not words.is_visible(), "the release")
     assert lab.asked[-1] == {"stopped": "false", "robot": "car-1"}
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    page.get_by_text("The page's server does not answer: nobody can be stopped here").wait_for()
 
 
 def test_the_log_of_a_car_that_never_warned_is_not_asked_for(

@@ -148,11 +148,13 @@ class Shadow:
         if document is None:
             return
         version = _version(document)
-        self._newest = max(self._newest, version)
-        if self._reported is None or version <= self._version:
+        # AWS counts on for 48 hours after a shadow was deleted, and then from 0.
+        anew = self._reported is not None and version <= self._version
+        self._newest = version if anew else max(self._newest, version)
+        if self._reported is None:
             return
-        if version > self._version + 1:
-            # A change was missed.
+        if version != self._version + 1:
+            # A change was missed, or this one came late.
             self._fetch_at = self._clock.monotonic()
             return
         self._version = version

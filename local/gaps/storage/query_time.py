@@ -1,9 +1,10 @@
-"""The time of a Query.
+"""The time of a Query and of a Scan.
 
 AWS: stores a partition in the order of its sort key, so that a Query reads only what it returns
   (https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/Query.html).
 ministack: sorts the whole partition for every Query and parses the key condition again for each item. Each
-  Query took longer with every minute of a drive. The answers are the same. The items are in the ledger
+  Query took longer with every minute of a drive, as did each page of a Scan. The answers are the same, but a
+  Scan's order, which AWS does not define. The items are in the ledger
   (local/keeping/items.py), which reads a range of keys; whole items go into the answer as they are.
 Test: tests/local/gaps/test_table_gap.py::test_a_query_reads_only_the_requested_keys
 Patch: none; it needs another data structure for the items of a table
@@ -15,26 +16,37 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from decimal import InvalidOperation
 from functools import lru_cache, wraps
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import Mock, patch
 
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb
 
-from local.keeping.items import PAGE_BYTES, SHOWN, Bound, Bucket, Item, Items, Wanted
+from local.keeping.items import PAGE_BYTES, SHOWN, Bound, Bucket, Item, Items, Shown, Wanted
 from local.keeping.places import place_of
 
 _REMEMBERED_CONDITIONS = 16_384
 _OK, _NEXT = 200, "LastEvaluatedKey"
+# ministack's sort key of a table without one.
+_NO_SORT = "__no_sort__"
 # With one of these an answer has not all items of the range as they are.
-_PARTS = {"FilterExpression", "QueryFilter", "ProjectionExpression", "AttributesToGet", "Select"}
+_PARTS = {
+    "FilterExpression",
+    "QueryFilter",
+    "ScanFilter",
+    "ProjectionExpression",
+    "AttributesToGet",
+    "Select",
+}
 _LOW, _HIGH = {"EQ", "GE", "GT"}, {"EQ", "LE", "LT"}
 
 
 def install() -> None:
     """Close the gap in this process."""
     dynamodb._condition_syntax_error = lru_cache(_REMEMBERED_CONDITIONS)(dynamodb._condition_syntax_error)
-    dynamodb._query = narrowing(dynamodb._query)
+    dynamodb._query = narrowing(dynamodb._query, asked)
+    dynamodb._scan = narrowing(dynamodb._scan, scanned)
+    dynamodb._apply_exclusive_start_key_scan = continuing(dynamodb._apply_exclusive_start_key_scan)
     dynamodb._evaluate_condition = evaluating(dynamodb._evaluate_condition)
 
 
@@ -62,37 +74,43 @@ def is_open() -> bool:
             dynamodb._delete_table({"TableName": name})
 
 
-def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
-    """A Query that looks only at items that it may return."""
+class Found(NamedTuple):
+    """Sizes and texts of the items that a call may return, and of which table and partition they are."""
 
-    @wraps(query)
+    table: Mapping[str, Any]
+    of: tuple[int, str]
+    texts: Sequence[tuple[int, str]]
+
+
+def narrowing(
+    read: Callable[..., Any], found: Callable[[Mapping[str, Any]], Found | None]
+) -> Callable[..., Any]:
+    """A Query or Scan that looks only at items that it may return."""
+
+    @wraps(read)
     def narrowed(data: Mapping[str, Any]) -> Any:
-        found = asked(data)
-        if found is None:
-            return query(data)
-        partition, wanted = found
-        texts = partition.texts(wanted)
-        # ministack checks the Query with one item at least.
-        whole = not _PARTS & data.keys() and len(texts) > 1
-        cursor = data.get("ExclusiveStartKey")
-        token = SHOWN.set(partition.show([text for _, text in texts[: 1 if whole else None]], cursor))
+        wanted = found(data)
+        if wanted is None:
+            return read(data)
+        # ministack checks the call with one item at least.
+        whole = not _PARTS & data.keys() and len(wanted.texts) > 1
+        items = [json.loads(text) for _, text in wanted.texts[: 1 if whole else None]]
+        token = SHOWN.set(Shown(wanted.of, items, data.get("ExclusiveStartKey")))
         try:
-            answer = query(data)
+            answer = read(data)
         finally:
             SHOWN.reset(token)
-        return _whole(answer, partition, texts, data.get("Limit")) if whole and answer[0] == _OK else answer
+        return _whole(answer, wanted, data.get("Limit")) if whole and answer[0] == _OK else answer
 
     return narrowed
 
 
-def _whole(
-    answer: tuple[int, Any, bytes], partition: Bucket, texts: Sequence[tuple[int, str]], limit: Any
-) -> tuple[int, Any, bytes]:
-    """The answer to a Query with these items, instead of the one that it was checked with."""
+def _whole(answer: tuple[int, Any, bytes], wanted: Found, limit: Any) -> tuple[int, Any, bytes]:
+    """The answer with these items, instead of the one that the call was checked with."""
     status, headers, body = answer
     size = 0
     page: list[str] = []
-    for one, text in texts:
+    for one, text in wanted.texts:
         if page and (size >= PAGE_BYTES or size + one > PAGE_BYTES or len(page) == limit):
             break
         page.append(text)
@@ -101,9 +119,9 @@ def _whole(
     del told["Items"]
     told.pop(_NEXT, None)
     told |= {"Count": len(page), "ScannedCount": len(page)}
-    if len(page) < len(texts) or len(page) == limit or size >= PAGE_BYTES:
-        table = partition.items_of.table
-        told[_NEXT] = dynamodb._build_key(json.loads(page[-1]), table["pk_name"], table["sk_name"])
+    if len(page) < len(wanted.texts) or len(page) == limit or size >= PAGE_BYTES:
+        keys = wanted.table["pk_name"], wanted.table["sk_name"]
+        told[_NEXT] = dynamodb._build_key(json.loads(page[-1]), *keys)
     rest = json.dumps(told, ensure_ascii=False)
     return status, headers, f'{{"Items": [{", ".join(page)}], {rest[1:]}'.encode()
 
@@ -125,31 +143,68 @@ def evaluating(evaluate: Callable[..., bool]) -> Callable[..., bool]:
     return condition
 
 
-def asked(data: Mapping[str, Any]) -> tuple[Bucket, Wanted] | None:
-    """The partition and range of a Query; None if ministack has to look at all items."""
-    table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))
+def continuing(skip: Callable[..., Any]) -> Callable[..., Any]:
+    """A Scan's cursor, which has skipped its items already."""
+
+    @wraps(skip)
+    def after(items: Any, *cursor: Any) -> Any:
+        return skip(items, *cursor) if SHOWN.get() is None else items
+
+    return after
+
+
+def asked(data: Mapping[str, Any]) -> Found | None:
+    """What a Query may return; None if ministack has to look at all items."""
     condition = data.get("KeyConditionExpression")
-    if not table or not isinstance(condition, str) or data.get("IndexName") or data.get("KeyConditions"):
+    items = _items(data)
+    if items is None or not isinstance(condition, str) or data.get("KeyConditions"):
         return None
-    items = table["items"]
-    if not isinstance(items, Items) or items.kind not in {"N", "S"}:
+    table, kind = items.table, items.kind
+    if kind not in {"N", "S"}:
         return None
     try:
         conditions = _conditions(condition, data)
         compared, (value,) = conditions[table["pk_name"]]
         if compared != "EQ":
             return None
-        partition, kind = items[dynamodb._extract_key_val(value)], items.kind
         low, high = _range(kind, *conditions.get(table["sk_name"], ("", ())))
-        most, cursor = data.get("Limit"), data.get("ExclusiveStartKey")
-        forward = data.get("ScanIndexForward", True) is not False
+        cursor, forward = data.get("ExclusiveStartKey"), data.get("ScanIndexForward", True) is not False
         if cursor and forward:
             low = Bound(place_of(kind, cursor[table["sk_name"]][kind]), open=True)
         elif cursor:
             high = Bound(place_of(kind, cursor[table["sk_name"]][kind]), open=True)
-        return partition, Wanted(low, high, forward, None if most is None else int(most) + 1)
+        partition: Bucket = items[dynamodb._extract_key_val(value)]
+        texts = partition.texts(Wanted(low, high, forward, _most(data)))
     except (KeyError, TypeError, ValueError, AttributeError, InvalidOperation):
         return None
+    return Found(table, (items.number, partition.partition), texts)
+
+
+def scanned(data: Mapping[str, Any]) -> Found | None:
+    """What a Scan may return; None if ministack has to look at all items."""
+    items = _items(data)
+    if items is None or "Segment" in data or "TotalSegments" in data:
+        return None
+    table, cursor = items.table, data.get("ExclusiveStartKey")
+    names = [name for name in (table["pk_name"], table["sk_name"]) if name]
+    try:
+        after = [dynamodb._extract_key_val(cursor[name]) for name in names] if cursor else []
+        texts = items.texts(
+            (after[0], after[-1] if len(after) > 1 else _NO_SORT) if after else None, _most(data)
+        )
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+    return Found(table, (items.number, ""), texts)
+
+
+def _items(data: Mapping[str, Any]) -> Items | None:
+    table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))
+    items = table["items"] if table and not data.get("IndexName") else None
+    return items if isinstance(items, Items) else None
+
+
+def _most(data: Mapping[str, Any]) -> int | None:
+    return int(data["Limit"]) + 1 if data.get("Limit") is not None else None
 
 
 def _range(

@@ -59,11 +59,12 @@ class CloudOptions:
             ) from error
 
     def means_kept(self, folder: Path) -> bool:
-        """Whether the cloud of `make up` in this folder is meant, be it up or not."""
+        """Whether the cloud of `make up` in this folder is meant: it is up, or was killed."""
         if self.embedded is not None:
             return self.embedded.absolute().parent == folder
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
-        return folder.is_dir() and (self.local or not said) and find_embedded(Path.cwd()) is None
+        there = (folder / kept.UP).exists()
+        return there and (self.local or not said) and find_embedded(Path.cwd()) is None
 
     def account(self, *, region: str) -> Cloud:
         """An AWS account, never an embedded cloud; ``region`` is the default.

@@ -20,6 +20,7 @@ from iort_station.cli import completion
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
 from iort_station.times import duration_us, has_zone, time_us
+from iort_station.upkeep.state import VERSION
 
 Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
 Stream = Annotated[
@@ -82,7 +83,7 @@ def to_file(help_text: str) -> Any:
 def state_folder(context: typer.Context, state: Path | None) -> Path:
     """The state folder of the kept cloud that is meant: --state, that of --embedded, or the user's own."""
     embedded: Path | None = context.obj.embedded
-    if state is None and embedded is not None and (embedded.parent / kept.UP).exists():
+    if state is None and embedded is not None and (embedded.parent / VERSION).exists():
         state = embedded.parent
     return (state or kept.folder()).expanduser().absolute()
 

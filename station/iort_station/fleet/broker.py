@@ -47,6 +47,8 @@ class Broker:
         # Set once the connection can be used, or has failed.
         self._tried, self._stopped = threading.Event(), threading.Event()
         self._failure: str | None = None
+        # Why the newest subscription was refused.
+        self._refused: str | None = None
         self._client: mqtt5.Client
 
     def __enter__(self) -> Self:
@@ -67,7 +69,12 @@ class Broker:
         self._stop()
 
     def publish(self, topic: str, message: bytes) -> None:
-        """Send a message; without a connection it is dropped."""
+        """Send a message; without a connection it is dropped.
+
+        Raises `StationError` if the broker has refused the subscriptions since: no answer would be heard.
+        """
+        if self._refused is not None:
+            raise StationError(f"the broker refuses a {self._role.name}: {self._refused}")
         self._client.publish(mqtt5.PublishPacket(topic=topic, payload=message, qos=mqtt5.QoS.AT_MOST_ONCE))
 
     def _new_client(self) -> mqtt5.Client:
@@ -114,10 +121,11 @@ class Broker:
 
     def _subscribed(self, asked: Any) -> None:
         error = asked.exception()
+        self._refused = None
         if error is not None:
             self._failure = str(error)
         elif refused := [code for code in asked.result().reason_codes if code >= 0x80]:
-            self._failure = f"its subscription is refused ({refused[0].name})"
+            self._failure = self._refused = f"its subscription is refused ({refused[0].name})"
         self._tried.set()
 
     def _failed(self, event: mqtt5.LifecycleConnectFailureData) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from iort_contract.messages.commands import MAX_LEASE_MS
 from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
-from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, Flag, Number
+from iort_contract.messages.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
@@ -66,6 +66,8 @@ def settings(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
 def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
     """Change the setting ``name`` of ``robot`` to ``value``; without a value, car.yaml's applies again."""
     robot, name = text(asked, "robot"), text(asked, "name")
+    if name == MOTION_STOPPED:
+        raise StationError("the emergency stop has a button of its own")
     value = fleet_settings.parsed(name, asked["value"]) if "value" in asked else None
     changed = fleet_settings.change(cloud, robot, {name: value}, _ANSWER_S)
     reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
@@ -87,6 +89,8 @@ def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
             "reason": reasons.get(name) or rejected.get(name, ""),
         }
         for name in (*SETTINGS, *selections)
+        # It has a button of its own, which asks before it releases and tells who did.
+        if name != MOTION_STOPPED
     ]
 
 

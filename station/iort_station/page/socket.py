@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from iort_contract.cloud import DRIVER, IOT, PUBNUB, VIEWER, client_prefix
 from iort_contract.messages.page import Identity, SocketAnswer
 from iort_station.cloud import Cloud
+from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.roles import Role, has_drivers, transport
 from iort_station.page import keys
@@ -31,6 +32,11 @@ def reaching(cloud: Cloud, live: str) -> dict[str, Any]:
 
     Raises `StationError` if that way cannot be used.
     """
+    if live == PUBNUB and transport(cloud) == IOT:
+        raise StationError(
+            "this deployment sends nothing to PubNub (live_transport=iot): leave --live away, or deploy with "
+            "-c live_transport=pubnub"
+        )
     pubnub = keys.load(cloud).reading() if live == PUBNUB else {}
     # A driver's commands go to the broker, whichever way the page listens.
     broker = {"broker": _origin(cloud)} if live == IOT or has_drivers(cloud) else {}

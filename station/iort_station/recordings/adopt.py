@@ -95,7 +95,7 @@ def adopt(
     for read, items in ahead(_pages(cloud, table, robot)):
         new = list(_adoptable(items, cloud.namespace, done))
         for start in range(0, 0 if dry_run else len(new), WRITE_ITEMS):
-            _write(new_table, new[start : start + WRITE_ITEMS], units_per_s)
+            write(new_table, new[start : start + WRITE_ITEMS], units_per_s)
         progress(read)
     return done
 
@@ -139,7 +139,8 @@ def _checked(item: Item, namespace: str) -> tuple[Topic, Batch]:
     return topic, batch
 
 
-def _write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+def write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+    """Write items at so many write units a second; raises `StationError` if DynamoDB rejects them."""
     began = time.monotonic()
     try:
         table.put(items)

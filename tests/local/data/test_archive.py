@@ -12,6 +12,7 @@ from boto3.dynamodb.types import TypeSerializer
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_station import data
+from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.operations import archive, audit
@@ -35,21 +36,26 @@ def batches() -> list[Batch]:
     return made
 
 
-@pytest.fixture(scope="module")
-def items(embedded: EmbeddedCloud) -> list[dict]:
-    """The stored items; they expire in an hour, so that they are read from the archive."""
-    serialize, cloud = TypeSerializer().serialize, embedded.cloud
+def stored(cloud: Cloud, robot: str) -> list[dict]:
+    """The batches as items; they expire in an hour, so that they are read from the archive."""
+    serialize = TypeSerializer().serialize
     more = {
-        TOPIC: topic_of(cloud, ROBOT, STREAM),
+        TOPIC: topic_of(cloud, robot, STREAM),
         EXPIRES_S: int(time.time()) + 3600,
         RECEIVED_MS: START // 1000,
     }
-    stored = []
+    items = []
     for batch in batches():
         item = {**json.loads(encode_batch(batch)), **more}
-        stored.append({name: serialize(value) for name, value in item.items()})
-    telemetry_table(cloud).put(stored)
-    return stored
+        items.append({name: serialize(value) for name, value in item.items()})
+    return items
+
+
+@pytest.fixture(scope="module")
+def items(embedded: EmbeddedCloud) -> list[dict]:
+    found = stored(embedded.cloud, ROBOT)
+    telemetry_table(embedded.cloud).put(found)
+    return found
 
 
 def answers(embedded: EmbeddedCloud, folder: Path) -> tuple:

@@ -34,7 +34,7 @@ def ledger(tmp_path_factory):
 def query(ledger):
     """Query in both ways, compare the answers, and return the answer if it is successful."""
     plain, evaluate = dynamodb._query, dynamodb._evaluate_condition
-    narrowed = query_time.narrowing(plain)
+    narrowed = query_time.narrowing(plain, query_time.asked)
     dynamodb._evaluate_condition = query_time.evaluating(evaluate)
 
     def ask(**data):
@@ -141,8 +141,8 @@ def test_the_pages_contain_every_item_once(query, table):
 def test_a_query_reads_only_the_requested_keys(query, table):
     table(range(10, 100))
     with request_scope(ACCOUNT, REGION):
-        partition, wanted = query_time.asked(asked((">", 90), table.kind) | {"Limit": 2})
-    items = [json.loads(text) for _, text in partition.texts(wanted)]
+        found = query_time.asked(asked((">", 90), table.kind) | {"Limit": 2})
+    items = [json.loads(text) for _, text in found.texts]
     assert [item["t"] for item in items] == [key(table.kind, n) for n in (91, 92, 93)]
 
 
@@ -162,6 +162,50 @@ def test_pages_end_at_a_megabyte_as_unpatched(query, table):
         data["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
     assert sum(pages) == 30
     assert len(pages) > 1
+
+
+@pytest.fixture
+def scan(monkeypatch):
+    """Scan all pages, and return the items and the number of pages."""
+    skip = query_time.continuing(dynamodb._apply_exclusive_start_key_scan)
+    monkeypatch.setattr(dynamodb, "_apply_exclusive_start_key_scan", skip)
+    narrowed = query_time.narrowing(dynamodb._scan, query_time.scanned)
+
+    def pages(**data):
+        items, number = [], 0
+        while True:
+            with request_scope(ACCOUNT, REGION):
+                status, _, body = narrowed({"TableName": TABLE, **data})
+            assert status == 200, body
+            answer = json.loads(body)
+            items += answer["Items"]
+            number += 1
+            if "LastEvaluatedKey" not in answer:
+                return items, number
+            data["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
+
+    return pages
+
+
+def test_the_pages_of_a_scan_contain_every_item_once(scan, table):
+    held = table(range(-3, 12))
+    with request_scope(ACCOUNT, REGION):
+        for n in (1, 2):
+            item = {"topic": {"S": "b"}, "t": key(table.kind, n), "odd": {"BOOL": bool(n % 2)}}
+            dynamodb._set_item(held, "b", *item["t"].values(), item)
+    for limit, pages in ((None, 1), (5, 4)):
+        more = {} if limit is None else {"Limit": limit}
+        items, number = scan(**more)
+        found = {(item["topic"]["S"], *item["t"].values()) for item in items}
+        assert (len(items), len(found), number) == (17, 17, pages)
+        names, values = {"#o": "odd"}, {":odd": {"BOOL": True}}
+        odd, _ = scan(
+            **more,
+            FilterExpression="#o = :odd",
+            ExpressionAttributeNames=names,
+            ExpressionAttributeValues=values,
+        )
+        assert odd == [item for item in items if item["odd"]["BOOL"]]
 
 
 @pytest.mark.parametrize(

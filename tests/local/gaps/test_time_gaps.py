@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from unittest.mock import Mock, patch
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from ministack.core import iam_actions
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, iot
 
-from local.gaps.broker import rule_time
+from local.gaps.broker import delivery_time, rule_time
 from local.gaps.storage import request_time
 from tests.local.gaps import series_table
 
@@ -69,3 +72,37 @@ def test_a_rule_is_taken_apart_once():
         assert iot._rule_event(sql, "dt/iort/car/vesc", b'{"n": 2}') == before
     found = iot._rule_select_clause.cache_info()
     assert (found.misses, found.hits) == (1, 2)
+
+
+LEVELS = st.sampled_from(["a", "b", "", "$aws", "events"])
+FILTERS = st.lists(st.one_of(LEVELS, st.just("+")), min_size=1, max_size=4).flatmap(
+    lambda levels: st.sampled_from(["/".join(levels), "/".join([*levels, "#"]), "#"])
+)
+
+
+@given(
+    st.lists(FILTERS, unique=True),
+    st.sets(st.integers(0, 3)),
+    st.lists(LEVELS, min_size=1, max_size=5).map("/".join),
+)
+def test_a_message_meets_the_subscriptions_that_match(filters, ended, topic):
+    async def heard(subscriptions, publish):
+        found = []
+
+        async def deliver(_topic, payload, _qos):
+            found.append(payload)
+
+        with patch.object(iot, "_subscriptions", subscriptions):
+            ids = [await iot.broker_subscribe(ACCOUNT, REGION, one, deliver) for one in filters]
+            for place in ended & {*range(len(ids))}:
+                await iot.broker_unsubscribe(ids[place])
+            await publish(ACCOUNT, REGION, topic, b"one")
+            for sid in ids:
+                await iot.broker_unsubscribe(sid)
+            assert not subscriptions
+        return found
+
+    tree = delivery_time.Subscriptions()
+    found = asyncio.run(heard(tree, delivery_time.asking(iot.broker_publish)))
+    assert found == asyncio.run(heard({}, iot.broker_publish))
+    assert not tree._root.next

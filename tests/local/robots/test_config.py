@@ -126,6 +126,7 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
         assert "did you mean speed?" in sped[-1]["reason"]
         with pytest.raises(StationError, match="got 40; nothing is changed"):
             control.change(embedded.cloud, {**rate, "value": "40"})
+        assert "motion.stopped" not in {one["name"] for one in told}
         ended = "command drive: nobody renews it, stopping"
         until(lambda: ended in recorded(LOG_STREAM, "text"))
         # Then its own driver drives on.

@@ -278,6 +278,19 @@ def test_an_emergency_stop_outlives_the_shadow_that_asked_for_it() -> None:
     assert not rig.applied[-1].motion_stopped
 
 
+def test_an_emergency_stop_in_a_shadow_that_was_deleted_days_ago_is_not_missed() -> None:
+    rig = Rig(live={"rate_hz": 2})
+    assert rig.version > 1
+    # AWS counts the versions of a shadow from 0 again, 48 hours after it was deleted.
+    rig.document, rig.version = {}, 0
+    rig.change({"desired": {"motion": {"stopped": True}}})
+    rig.dispatcher.run_pending()
+    assert not rig.shadow.known(), "no motion before it is known what is asked for"
+    rig.settle()
+    assert rig.shadow.known()
+    assert rig.applied[-1].motion_stopped
+
+
 def test_a_stop_of_the_robots_own_file_is_not_the_operators_to_release() -> None:
     base = replace(BASE, motion_stopped=True)
     settings, rejected = overlay(base, base, {"motion.stopped": False}, {})

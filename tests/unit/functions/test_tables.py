@@ -52,8 +52,9 @@ def put(client, table, item):
         client.put_item(TableName=table, Item=item)
 
 
-def test_a_quick_client_writes_and_reads_what_botocore_does(dynamodb):
-    quickly = quick(boto3.client("dynamodb", config=Config(parameter_validation=False)))
+@pytest.mark.parametrize("validates", [False, True])
+def test_a_quick_client_writes_and_reads_what_botocore_does(dynamodb, validates):
+    quickly = quick(boto3.client("dynamodb", config=Config(parameter_validation=validates)))
     calls = [quickly.query, dynamodb.query, quickly.scan, dynamodb.scan]
     for samples in (
         {"S": "\u00e4\n"},

@@ -8,6 +8,7 @@ from urllib.request import proxy_bypass
 import pytest
 from typer.testing import CliRunner
 
+from iort_station import kept
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
 from iort_station.cloud import Cloud, find_embedded
@@ -50,6 +51,15 @@ def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
     described.touch()
     assert find_embedded(inside) == find_embedded(tmp_path / "checkout") == described
     assert find_embedded(tmp_path) is None
+
+
+def test_the_doctor_looks_at_a_stopped_cloud_where_nothing_else_is_meant(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "no AWS region" in str(CliRunner().invoke(app, ["doctor"]).exception)
+    kept.folder().mkdir(parents=True)
+    looked = CliRunner().invoke(app, ["doctor"])
+    assert looked.exit_code == 1
+    assert f"no cloud is up in {kept.folder()}" in looked.stdout.replace("\n", "")
 
 
 def test_the_error_outside_a_checkout_says_how_to_name_the_file(tmp_path, monkeypatch):

@@ -85,6 +85,8 @@ def test_a_page_is_told_where_it_listens_and_may_connect_there(monkeypatch):
     assert "sub-c-" not in str(config(namespace="iort", **told))
     assert told["vehicles"] == {"car1": {}}, "nobody is told of a car that the site does not show"
     assert reaching(cloud, "iot") == {"live": "iot", "broker": "wss://abc-ats.iot.eu-west-1.amazonaws.com"}
+    with pytest.raises(StationError, match="sends nothing to PubNub"):
+        reaching(cloud, "pubnub")
     assert actions(cloud).keys() == {"drive"}
     assert not actions(Cloud())  # type: ignore[arg-type]  # a fake
 

@@ -15,7 +15,7 @@ from iort_contract.messages.driving import DriveLimits, encode_limits
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
 from iort_station.operations.alarms import user
-from iort_station.page import motion
+from iort_station.page import control, motion
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 
@@ -127,6 +127,12 @@ def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):
     told = motion.actions(cloud)["stop"]({"stopped": "true"})
     assert "Throttling" in told["failed"]["car7"]
     assert told["robots"]["car8"]["asked"]
+
+
+def test_the_pages_settings_release_nothing(cloud):
+    with pytest.raises(StationError, match="a button of its own"):
+        control.change(cloud, {"robot": "car7", "name": "motion.stopped", "value": "false"})
+    assert "desired" not in cloud.states["car7"]
 
 
 def test_a_stranger_or_an_unclear_wish_changes_nothing(cloud):

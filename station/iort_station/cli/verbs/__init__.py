@@ -33,6 +33,7 @@ VERBS = {
     "upkeep.backup": "Write the cloud of `make up` into one file, while it runs.",
     "upkeep.restore": "Make the cloud of `make up` from a backup.",
     "operations.adopt": "Copy batches of an old telemetry table.",
+    "operations.move": "Copy robots and their recordings into another cloud.",
     "fleet.send": "Send a command and print the robot's answer.",
     "fleet.drive": "Drive a car by the keys of this terminal.",
     "fleet.stop": "Stop robots in an emergency, until --release.",

@@ -48,8 +48,8 @@ export class StopControl {
 
   private ask(sure: boolean): void {
     this.sure = sure;
-    const whom = this.robot ?? listed(this.stops.held.fleet);
-    this.release.textContent = sure ? `Really release ${whom}: may move` : `Release ${this.robot ?? "all"}`;
+    const whom = this.robot === undefined ? this.stops.held.fleet : [this.robot];
+    this.release.textContent = sure ? `Really release ${listed(whom)}: ${whom.length === 1 ? "it" : "they"} may move` : `Release ${this.robot ?? "all"}`;
     setAttribute(this.release, "data-sure", String(sure));
   }
 
@@ -64,10 +64,11 @@ export class StopControl {
       ...(this.robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
       ...(one?.reason ? [`${this.robot} rejects the ${one.asked ? "stop" : "release"}: ${one.reason}.`] : []),
       ...(this.stops.error ? [`${this.stops.error}.`] : []),
+      ...(this.stops.away ? ["The page's server does not answer: nobody can be stopped here, and cars may stand or move by now."] : []),
     ];
     this.words.set(texts.join(" "));
     this.strip.hidden = texts.length === 0;
-    setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== ""));
+    setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== "" || this.stops.away));
     const any = this.robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
     this.release.hidden = !this.stops.able || !any;
   }

@@ -12,6 +12,8 @@ const SOON_FOR_MS = 20_000;
 export class Stops {
   /** Why the newest request failed, for the viewer. */
   error = "";
+  /** Whether the page's server has stopped to answer: what is known may be of the past. */
+  away = false;
   /** Whether this browser may stop cars, and release them. */
   readonly able: boolean;
   /** Who drives, unless the viewer gives a name. */
@@ -19,6 +21,7 @@ export class Stops {
   private robots: Readonly<Record<string, MotionEntry>> = {};
   private timer: number | undefined;
   private soonUntil_ms = 0;
+  private answered = false;
 
   constructor(
     config: Config,
@@ -71,8 +74,10 @@ export class Stops {
       this.take(await ask<MotionAnswer>("motion", {}));
       this.changed();
     } catch (error) {
-      // What was known stays; an older server does not answer at all.
       if (!(error instanceof AnswerError)) throw error;
+      // What was known stays. A server that has never answered is an older one.
+      this.away = this.answered;
+      this.changed();
     }
     this.later(this.stopped.pending.length > 0 && performance.now() < this.soonUntil_ms ? SOON_MS : POLL_MS);
   }
@@ -85,6 +90,7 @@ export class Stops {
   private take({ robots, user }: MotionAnswer): void {
     this.robots = { ...this.robots, ...robots };
     this.user = user;
+    [this.answered, this.away] = [true, false];
   }
 }
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, State, state_folder
 from iort_station.cli.words import examples
+from iort_station.errors import StationError
 
 if TYPE_CHECKING:
     from iort_station.upkeep.finding import Finding
@@ -43,7 +44,13 @@ def _findings(context: typer.Context, state: Path | None) -> Iterator[Finding]:
     folder = state_folder(context, state)
     if state is not None or context.obj.means_kept(folder):
         return doctor.of_kept(folder)
-    return doctor.of_cloud(context.obj.cloud())
+    try:
+        return doctor.of_cloud(context.obj.cloud())
+    except StationError:
+        if not folder.is_dir():
+            raise
+        # It was stopped, and nothing else is meant.
+        return doctor.of_kept(folder)
 
 
 def _print(finding: Finding) -> None:
