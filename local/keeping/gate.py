@@ -11,6 +11,7 @@ import asyncio
 import json
 import logging
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import wraps
 from typing import Any
@@ -35,6 +36,8 @@ class Gate:
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
         self._committing: asyncio.Task[None] | None = None
+        # Not the loop's own threads: functions may have them all, and wait for answers.
+        self._disk = ThreadPoolExecutor(1, "gate")
 
     def install(self) -> None:
         """Stand before everything that leaves the emulator; the last to be installed."""
@@ -57,7 +60,7 @@ class Gate:
         # It runs when all who are ready have written; whoever comes later needs the next one.
         self._committing = None
         if self._ledger.sync == "full":
-            await asyncio.to_thread(self._ledger.commit)
+            await asyncio.get_running_loop().run_in_executor(self._disk, self._ledger.commit)
         else:
             self._ledger.commit()
 

@@ -16,6 +16,8 @@ from local.keeping.places import place_of
 Item = dict[str, Any]
 Table = dict[str, Any]
 
+# A machine that was off for a month has millions of expired items.
+_EXPIRED_ROWS = 500
 # No partition has an empty key.
 _SCANNED = ""
 # Steps from partition to partition, where DISTINCT would read every key.
@@ -151,15 +153,18 @@ class Items(MutableMapping[str, "Bucket"]):
             )
         self.ttl = attribute
 
-    def expire(self, now_s: float) -> None:
-        """Delete the items whose time to live has passed."""
+    def expire(self, now_s: float) -> bool:
+        """Delete some of the items whose time to live has passed; returns whether there may be more."""
         with self.ledger.write() as connection:
             done = connection.execute(
-                "DELETE FROM items WHERE tab = ? AND expires_s <= ?", (self.number, now_s)
+                "DELETE FROM items WHERE id IN"
+                " (SELECT id FROM items WHERE tab = ? AND expires_s <= ? LIMIT ?)",
+                (self.number, now_s, _EXPIRED_ROWS),
             )
         if done.rowcount:
             self.table.pop(dynamodb._INDEX_MEMBERS, None)
             self.table["ItemCount"] = max(0, self.table["ItemCount"] - done.rowcount)
+        return done.rowcount == _EXPIRED_ROWS
 
     def expires_s(self, item: Item) -> float | None:
         """When the item's time to live passes."""

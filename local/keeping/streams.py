@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import partial, wraps
 from itertools import takewhile
 from typing import Any, overload
 
 from ministack.services import dynamodb, lambda_svc
 
 from local.keeping.ledger import Ledger
-from local.keeping.tables import Tables
+from local.keeping.tables import Tables, gently
 
 Record = dict[str, Any]
 
@@ -25,7 +25,7 @@ CREATE TABLE IF NOT EXISTS marks (mapping TEXT PRIMARY KEY, arn TEXT NOT NULL, p
 """
 _SPAN = 1 << 40
 _RETENTION_S = 24 * 3600
-_TRIM_ROWS = 1_000
+_TRIMMED_ROWS = 500
 
 
 def install(ledger: Ledger) -> Streams:
@@ -118,14 +118,14 @@ class Streams:
     def trim(self, now_s: float) -> None:
         """Delete records of more than 24 hours ago that every mapping has finished."""
         alive = {mapping["UUID"] for _, _, mapping in lambda_svc._iter_all_esms()}
+        marks = self.ledger.read("SELECT mapping, arn, position FROM marks")
         with self.ledger.write() as connection:
-            marks = connection.execute("SELECT mapping, arn, position FROM marks").fetchall()
-            for mapping, _, _ in marks:
-                if mapping not in alive:
-                    connection.execute("DELETE FROM marks WHERE mapping = ?", (mapping,))
-            for (arn,) in connection.execute("SELECT arn FROM streams").fetchall():
-                needed = [position for mapping, of, position in marks if mapping in alive and of == arn]
-                self._stream(arn).trim(now_s - _RETENTION_S, min(needed, default=_SPAN))
+            for mapping in {mapping for mapping, _, _ in marks} - alive:
+                connection.execute("DELETE FROM marks WHERE mapping = ?", (mapping,))
+        for (arn,) in self.ledger.read("SELECT arn FROM streams"):
+            needed = [position for mapping, of, position in marks if mapping in alive and of == arn]
+            finished = min(needed, default=_SPAN)
+            gently(self.ledger, partial(self._stream(arn).trim, now_s - _RETENTION_S, finished))
 
     def _trimming(self, expire: Callable[[float], None]) -> Callable[[float], None]:
         @wraps(expire)
@@ -212,19 +212,21 @@ class Stream(Sequence[Record]):
         (record,) = self.since(self.start + wanted, 1)
         return record
 
-    def trim(self, before_s: float, finished: int) -> None:
-        """Delete records that are older, up to a position. The newest stays: its position is the count."""
+    def trim(self, before_s: float, finished: int) -> bool:
+        """Delete some of the records that are older, up to a position; returns whether there may be more.
+
+        The newest stays: its position is the count.
+        """
         end = self._first + min(finished, self.end - 1)
-        with self._ledger.write() as connection:
-            while True:
-                rows = connection.execute(
-                    "SELECT id, at_s FROM records WHERE id >= ? AND id < ? ORDER BY id LIMIT ?",
-                    (self._first, end, _TRIM_ROWS),
-                ).fetchall()
-                old = list(takewhile(lambda row: row[1] < before_s, rows))
-                if not old:
-                    return
+        rows = self._ledger.read(
+            "SELECT id, at_s FROM records WHERE id >= ? AND id < ? ORDER BY id LIMIT ?",
+            (self._first, end, _TRIMMED_ROWS),
+        )
+        old = list(takewhile(lambda row: row[1] < before_s, rows))
+        if old:
+            with self._ledger.write() as connection:
                 connection.execute("DELETE FROM records WHERE id >= ? AND id <= ?", (self._first, old[-1][0]))
+        return len(old) == _TRIMMED_ROWS
 
     def delete(self) -> None:
         """Delete the stream."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 from ministack.services import dynamodb
@@ -31,6 +32,7 @@ _WRITES = (
     "_batch_execute_statement",
     "_execute_transaction",
 )
+_PAUSE_S = 0.01
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -82,11 +84,10 @@ class Tables:
         for items in list(self._items.values()):
             with self.ledger.write():
                 self._learn_ttl(items)
-                items.expire(now_s)
                 if self._miscounted:
                     self._count(items.table)
+            gently(self.ledger, partial(items.expire, now_s))
         self._miscounted = False
-        self.ledger.commit()
 
     @staticmethod
     def _count(table: Table) -> None:
@@ -155,6 +156,14 @@ class Tables:
                 del self._items[name]
             items.table.pop(dynamodb._INDEX_MEMBERS, None)
         self._miscounted = True
+
+
+def gently(ledger: Ledger, delete: Callable[[], bool]) -> None:
+    """Delete a little at a time until nothing is left to delete; others write in between."""
+    while delete():
+        ledger.commit()
+        time.sleep(_PAUSE_S)
+    ledger.commit()
 
 
 def together(ledger: Ledger, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -56,12 +56,12 @@ class Cloud:
         return sqs._queue_by_arn(f"arn:aws:sqs:{REGION}:{ACCOUNT}:gate")["messages"]
 
 
-@pytest.fixture
-def cloud(tmp_path, monkeypatch):
+@pytest.fixture(params=["normal", "full"])
+def cloud(tmp_path, monkeypatch, request):
     for name in ("broker_publish", "_dispatch_rule_action", "_fleet_provisioning_reply"):
         monkeypatch.setattr(iot, name, getattr(iot, name))
     monkeypatch.setattr(app, "app", app.app)
-    with request_scope(ACCOUNT, REGION), kept(tmp_path / "ledger.db") as streams:
+    with request_scope(ACCOUNT, REGION), kept(tmp_path / "ledger.db", request.param) as streams:
         Gate(streams.ledger).install()
         dynamodb._create_table(
             {

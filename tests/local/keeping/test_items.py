@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
+from local.keeping import items
 from local.keeping.ledger import LedgerError
 from local.keeping.places import place_of
 from tests.local.gaps import series_table
@@ -168,7 +169,7 @@ def test_items_expire_by_an_index(streams):
     dynamodb._expire_items(150.0)
     assert numbers() == [2, 3, 4]
     put(5, ends={"N": "150"})
-    plan = streams.ledger.read("EXPLAIN QUERY PLAN DELETE FROM items WHERE tab = 1 AND expires_s <= 1")
+    plan = streams.ledger.read("EXPLAIN QUERY PLAN SELECT id FROM items WHERE tab = 1 AND expires_s <= 1")
     assert "items_expires" in plan[0][-1]
     dynamodb._expire_items(200.0)
     assert numbers() == [3, 4]
@@ -177,6 +178,19 @@ def test_items_expire_by_an_index(streams):
     put(6, ends={"N": "1"})
     dynamodb._expire_items(10**10)
     assert numbers() == [3, 4, 6]
+
+
+def test_many_items_expire_a_few_at_a_time(streams, monkeypatch):
+    monkeypatch.setattr(items, "_EXPIRED_ROWS", 3)
+    put(*range(10), ends={"N": "1"})
+    put(10, ends={"N": "9"})
+    dynamodb._ttl_settings[NAME] = {"TimeToLiveStatus": "ENABLED", "AttributeName": "ends"}
+    kept_at_commits = []
+    commit = streams.ledger.commit
+    monkeypatch.setattr(streams.ledger, "commit", lambda: kept_at_commits.append(len(numbers())) or commit())
+    dynamodb._expire_items(5.0)
+    del dynamodb._ttl_settings[NAME]
+    assert kept_at_commits[-4:] == [8, 5, 2, 1]
 
 
 def test_a_stream_is_trimmed_up_to_what_its_mappings_finished(streams, monkeypatch):
