@@ -30,6 +30,7 @@ from bench.errors import BenchError
 from bench.floors import mosquitto
 from bench.meters import live_lane, usage
 from bench.meters.waiting import reached
+from bench.report import thesis
 from bench.report.result import Table
 from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import CORE
@@ -41,9 +42,10 @@ from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 
 RATES_HZ = (50, 1000)
-# What the figures are held against, here and in the README.
-CPU_US = {50: 300.0, 1000: 100.0}
-TARGETS = {"live_ms_p50": 0.7, "cycle_ms_p50": 0.1, "rss_mb": 80.0}
+# The most: processor time and live delay as a multiple of the floor's in the same run, memory, and the node's
+# cycle as a share of the thesis'.
+CPU_TIMES = {50: 3.5, 1000: 2.0}
+LIVE_TIMES, RSS_MB, CYCLE_SHARE = 2.0, 80.0, 0.05
 _WARM_UP_S = 3
 _CATCH_UP_S = 30.0
 
@@ -90,7 +92,12 @@ def main() -> None:
         options.json,
         {
             **made(),
-            "targets": {**TARGETS, "cpu_us": CPU_US},
+            "targets": {
+                "cpu / floor": CPU_TIMES,
+                "live / floor": LIVE_TIMES,
+                "rss_mb": RSS_MB,
+                "cycle / thesis": CYCLE_SHARE,
+            },
             "cycle_ms": cycle,
             "runs": [asdict(run) for run in runs],
             "mosquitto": [asdict(lane) for lane in lanes],
@@ -150,20 +157,19 @@ def _table(runs: list[Run], cycle: dict[str, float], lanes: list[live_lane.Lane]
     rows = []
     for run in runs:
         rate, ours, floor = f"at {run.rate_hz} Hz", run.agent_cpu_us, run.floor_cpu_us
-        target = f"{CPU_US[run.rate_hz]:.0f} us"
-        rows.append(
-            [f"processor a sample {rate}", f"{ours:.0f} us", target, f"{floor:.0f} us (x{ours / floor:.1f})"]
-        )
+        times = [f"{ours:.0f} us: {ours / floor:.1f} times", f"{CPU_TIMES[run.rate_hz]:g} times the floor"]
+        rows.append([f"processor a sample {rate}", *times, f"{floor:.0f} us"])
         rss = f"{run.rss_mb_first:.1f} to {run.rss_mb_last:.1f} MB"
-        rows.append([f"memory {rate}, first to last", rss, f"{TARGETS['rss_mb']:.0f} MB", ""])
+        rows.append([f"memory {rate}, first to last", rss, f"{RSS_MB:.0f} MB", ""])
         rows.append([f"samples lost {rate}", f"{run.lost} of {run.samples:,}", "0", ""])
     for lane in lanes:
         name = f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto"
         # To a hundredth of a ms: the two differ by no more.
-        delays = lane.agent_ms.text(2), f"{TARGETS['live_ms_p50']} ms", lane.floor_ms.text(2)
+        delays = lane.agent_ms.text(2), f"{LIVE_TIMES:g} times the floor", lane.floor_ms.text(2)
         rows.append([name, *delays])
     p50 = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
-    rows.append(["node's cycle, callback to spool", p50, f"{TARGETS['cycle_ms_p50']} ms", "thesis: 2 ms"])
+    share, theirs = f"{CYCLE_SHARE:g} of the thesis'", f"thesis: {thesis.NODE_CYCLE_MS} ms"
+    rows.append(["node's cycle, callback to spool", p50, share, theirs])
     return Table("The agent", ["figure", "measured", "target", "floor, same run"], rows)
 
 

@@ -126,8 +126,8 @@ class EmbeddedCloud:
             region=_REGION,
             endpoint_url=f"https://{self.host}:{self.ports['gateway']}",
             ca_bundle=str(certificate),
-            access_key_id="test",
-            secret_access_key="test",  # noqa: S106 - the emulator's name for its root user
+            access_key_id=f"AKIA{self.state.secret('owner.id', 8).upper()}",
+            secret_access_key=self.state.secret("owner.key"),
             mqtt_host=self.listen.host if self.listen else self.host,
             mqtt_port=self.ports["mqtt"],
             root_ca_pem=self.authority.pem,
@@ -161,7 +161,8 @@ class EmbeddedCloud:
         self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
 
     def _find_ports(self) -> dict[str, int]:
-        inside = dict.fromkeys(("gateway", "mqtt", "pubnub", "relay"), self.host)
+        servers = ("gateway", "mqtt", "relay", *(["pubnub"] if self.live == PUBNUB else []))
+        inside = dict.fromkeys(servers, self.host)
         # What robots connect to.
         outside = dict.fromkeys(("mqtt", "files"), self.listen.address) if self.listen else {}
         return {
@@ -215,6 +216,8 @@ class EmbeddedCloud:
             "STATE_DIR": str(self.folder / "state"),
             "S3_DATA_DIR": str(self.folder / "s3"),
             "AUTH": "true",
+            "AWS_ACCESS_KEY_ID": self.cloud.access_key_id or "",
+            "AWS_SECRET_ACCESS_KEY": self.cloud.secret_access_key or "",
             "BIND_HOST": self.host,
             "MINISTACK_HOST": self.host,
             "MINISTACK_REGION": _REGION,

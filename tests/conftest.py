@@ -34,6 +34,8 @@ GROUPS = {
     "tests/ros/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
     "tests/local/gaps/": "cloud of the robots",
+    "tests/local/network/test_network.py": "kept cloud",
+    "tests/local/network/": "cloud of the robots",
     "tests/local/robots/": "cloud of the robots",
     "tests/web/": "page",
     "tests/stacks/": "app",

@@ -1,7 +1,7 @@
 """The way of robots in a network to the files: presigned requests for one bucket pass, and nothing else.
 
-Everything else of the gateway stays on loopback. The signature and its rights are the gateway's
-affair; but the key must be a function's, because the gateway takes others for its owner's without a check.
+Everything else of the gateway stays on loopback. The signature and its rights are the gateway's affair; but
+the key must be a function's: nobody signs such an address with the owner's.
 """
 
 from __future__ import annotations

@@ -127,7 +127,6 @@ class NetworkPage(PageServer):
         self._cut(name)
         answer = _to("/")
         answer.headers["Set-Cookie"] = f"{COOKIE}=; Path=/; Secure; HttpOnly; SameSite=Strict; Max-Age=0"
-        answer.headers["Clear-Site-Data"] = '"storage"'
         return answer
 
     def _cut(self, *names: str) -> None:

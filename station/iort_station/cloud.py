@@ -148,7 +148,11 @@ class Cloud:
                     endpoint_url=self.endpoint_url,
                     verify=self.ca_bundle,
                     config=Config(
-                        retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20
+                        retries={"mode": "standard", "max_attempts": 5},
+                        connect_timeout=5,
+                        read_timeout=20,
+                        # botocore's own text is made anew for each request, in a tenth of a millisecond.
+                        user_agent="iort",
                     ),
                 )
             except BotoCoreError as error:

@@ -200,7 +200,7 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         page.get_by_role("button", name="Release all").click()
         assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
         # Only what the fleet's stop has stopped.
-        page.get_by_role("button", name="Really release car-9: may move").click()
+        page.get_by_role("button", name="Really release car-9: it may move").click()
         until(lambda: words.inner_text().startswith(stands), "the release of car-9")
         assert lab.asked[-1] == {"stopped": "false"}
         page.goto(f"{server.url}#/car/car-1")

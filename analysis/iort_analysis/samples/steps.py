@@ -23,7 +23,8 @@ _SCALES = np.array(SCALES)
 # The digits of the largest number of 53 bits: no sum of two numbers of so many leaves 64 bits.
 _MOST_DIGITS = 16
 _LATEST_US = EXACT
-_COMMA, _MINUS, _ZERO, _NINE, _COLON, _OPEN, _CLOSE = b",-09:[]"
+_COMMA, _MINUS, _COLON, _OPEN, _CLOSE = b",-:[]"
+_ZERO = np.uint8(ord("0"))
 _Integers: TypeAlias = NDArray[np.int64]
 
 
@@ -102,7 +103,9 @@ def integers(lists: bytes, lengths: _Integers) -> _Integers | None:
         return None
     if (text[opens - 1] != _COLON).any() or (text[closes + 1] != _COMMA).any():
         return None
-    is_digit = (text >= _ZERO) & (text <= _NINE)
+    # Characters below "0" wrap.
+    values = text - _ZERO
+    is_digit = values < 10
     # The first and the last character are no digits.
     edges = np.flatnonzero(is_digit[1:] != is_digit[:-1])
     starts, ends = edges[::2] + 1, edges[1::2]
@@ -121,14 +124,14 @@ def integers(lists: bytes, lengths: _Integers) -> _Integers | None:
         or int((after == _CLOSE).sum()) != len(lengths)
         or not ((before == _COMMA) | (before == _OPEN)).all()
         or int(digits.max()) > _MOST_DIGITS
-        or ((text[starts] == _ZERO) & (digits > 1)).any()
+        or ((values[starts] == 0) & (digits > 1)).any()
         or (np.diff(np.searchsorted(starts, opens), append=len(starts)) != lengths).any()
     ):
         return None
-    numbers: _Integers = text[ends].astype(np.int64) - _ZERO
+    numbers: _Integers = values[ends].astype(np.int64)
     longer = np.flatnonzero(digits > 1)
     for place in range(1, int(digits.max())):
-        numbers[longer] += 10**place * (text[ends[longer] - place].astype(np.int64) - _ZERO)
+        numbers[longer] += values[ends[longer] - place] * np.int64(10**place)
         longer = longer[digits[longer] > place + 1]
-    numbers[is_negative] *= -1
+    np.negative(numbers, out=numbers, where=is_negative)
     return numbers

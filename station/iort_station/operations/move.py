@@ -1,4 +1,5 @@
-"""Moves robots from one deployment into another: the registry's rows, the archive, and the stored batches.
+"""Moves robots from one deployment into another: the registry's rows, the archive, the stored batches, and
+what the analysis and people have written about them.
 
 Nothing is removed from the source. What the target has already is left as it is, so a move that was
 interrupted goes on, and one that is repeated copies what has come since. Both sides are then read as
@@ -35,6 +36,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
+from iort_station.data.analysis import findings
 from iort_station.data.archive import Archive, key_of
 from iort_station.data.batches import ahead, telemetry_table, topic_of
 from iort_station.data.recorded import Recorded
@@ -129,6 +131,22 @@ def _carried(row: Mapping[str, Any]) -> dict[str, Any]:
     }
     # DynamoDB has no empty set.
     return {**kept, **({STREAMS: set(kept[STREAMS])} if STREAMS in kept else {})}
+
+
+def copy_findings(source: Cloud, target: Cloud, robot: str) -> int:
+    """Copy a robot's findings, analysed drives and notes, each under its id; returns how many."""
+    old, new = findings.table(source), findings.table(target)
+    count = 0
+    for finding in old.findings(robot):
+        new.put_finding(finding)
+        count += 1
+    for drive in old.drives(robot):
+        new.put_drive(drive)
+        count += 1
+    for note in old.notes(robot):
+        new.put_note(note)
+        count += 1
+    return count
 
 
 def copy(

@@ -21,6 +21,8 @@ _MINUTES = 5
 _LATE_S, _FAR_BEHIND_S = 10.0, 300.0
 _CLOCK_OFF_S = 5.0
 _NAMED = 4
+# Below this share of its time, what an embedded cloud does besides would count as load.
+_LEAST_BUSY = 0.1
 
 
 class Load(NamedTuple):
@@ -31,8 +33,11 @@ class Load(NamedTuple):
     samples_s: float | None
 
 
-def findings(cloud: Cloud) -> Iterator[Finding]:
-    """Look at everything; ends at stacks that cannot be read."""
+def findings(cloud: Cloud, busy: float | None = None) -> Iterator[Finding]:
+    """Look at everything; ends at stacks that cannot be read.
+
+    ``busy`` is the share of its time in which the busiest part of an embedded cloud is busy.
+    """
     try:
         function = cloud.output("processing", "SummarizeFunction")
         for table in ("TelemetryTable", "RobotsTable"):
@@ -44,7 +49,7 @@ def findings(cloud: Cloud) -> Iterator[Finding]:
     rows = list(registry.listed(cloud))
     connected = sum(bool(row.get(ONLINE)) for row in rows)
     yield Finding("robots", OK, f"{connected} of {len(rows)} are connected")
-    yield _lag(load(cloud, function), connected)
+    yield _lag(load(cloud, function), connected, busy)
     yield from _alarms(cloud)
 
 
@@ -80,7 +85,7 @@ def _query(key: str, namespace: str, name: str, statistic: str, of: Mapping[str,
     return {"Id": key, "MetricStat": {"Metric": metric, "Period": 60, "Stat": statistic}}
 
 
-def _lag(found: Load, connected: int) -> Finding:
+def _lag(found: Load, connected: int, busy: float | None) -> Finding:
     """How far the summaries are behind the recordings."""
     if found.behind_s is None:
         return graded(
@@ -92,6 +97,8 @@ def _lag(found: Load, connected: int) -> Finding:
     rates = ""
     if found.batches_s is not None and found.samples_s is not None:
         rates = f", {found.batches_s:,.1f} batches and {found.samples_s:,.0f} samples a second"
+        if busy is not None and busy > _LEAST_BUSY:
+            rates += f" of about {found.batches_s / busy:,.0f} batches that this machine takes"
     return graded(
         "summaries",
         f"{found.behind_s:.1f} s behind the recordings at most{rates}",

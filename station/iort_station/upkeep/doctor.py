@@ -8,7 +8,7 @@ import shutil
 import socket
 import ssl
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -44,11 +44,12 @@ def of_kept(folder: Path) -> Iterator[Finding]:
         yield _backup(folder)
         return
     runs = kept.owner(folder) is not None and all(map(machine.runs, up.pids.values()))
+    busy = None
     yield _processes(folder, up, runs=runs)
     if runs:
         yield _version(up)
         yield from _addresses(up)
-        yield from _emulator(up.pids["emulator"])
+        busy = yield from _emulator(up.pids["emulator"])
     yield _disk(folder, up)
     yield from _certificates(up)
     yield _clock()
@@ -56,7 +57,7 @@ def of_kept(folder: Path) -> Iterator[Finding]:
     if not runs:
         return
     try:
-        yield from deployment.findings(Cloud.load(folder / kept.CLOUD))
+        yield from deployment.findings(Cloud.load(folder / kept.CLOUD), busy)
     except (StationError, ClientError, BotoCoreError) as error:
         yield Finding("deployment", FAIL, f"does not answer: {error}", "`make down`, then `make up`")
 
@@ -147,11 +148,12 @@ def _disk(folder: Path, up: Up) -> Finding:
     )
 
 
-def _emulator(pid: int) -> Iterator[Finding]:
+def _emulator(pid: int) -> Generator[Finding, None, float | None]:
+    """Memory and load; returns the share of its time in which the busiest part is busy."""
     processes, whole, cores = machine.family(pid), machine.memory(), os.cpu_count() or 1
     if not processes or whole is None:
         yield Finding("memory", OK, "this system does not tell it")
-        return
+        return None
     ours = sum(map(machine.resident_bytes, processes))
     yield graded(
         "memory",
@@ -173,6 +175,7 @@ def _emulator(pid: int) -> Iterator[Finding]:
         "fewer cars, slower streams or a faster machine: at 100 % summaries fall behind, and nothing is lost",
         warn=share > _MOST_BUSY,
     )
+    return share
 
 
 def _certificates(up: Up) -> Iterator[Finding]:

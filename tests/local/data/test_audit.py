@@ -48,6 +48,9 @@ def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedde
     assert all(one["complete"] for one in streams.values())
     wheels = streams["wheels"]
     assert (wheels["taken"], sum(run["samples"] for run in wheels["runs"])) == (200, 200)
+    told = json.loads(_run(embedded, "--all").stdout)["robots"][car.robot]["streams"]
+    assert {one["stream"]: one["complete"] for one in told} == dict.fromkeys(streams, True)
+    assert _run(embedded).exit_code == _run(embedded, car.robot, "--all").exit_code != 0
     found = list(audit.headers(embedded.cloud, car.robot, "wheels"))
     assert all("samples" not in item for item in found)
     seq = batch_id(found[3][BATCH]).seq

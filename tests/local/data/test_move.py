@@ -16,6 +16,7 @@ from iort_contract.tables import BATCH, TOPIC
 from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
+from iort_station.data.analysis import notes
 from iort_station.data.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import registry, robots, tags
@@ -41,6 +42,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     source, target = embedded.cloud, other.cloud
     robots.add(source, ROBOT, out=tmp_path / "source", vehicle=VEHICLE)
     tags.change(source, ROBOT, {"lab": "north"})
+    note = notes.write(source, ROBOT, "new tyres", by="anna")
     items = stored(source, ROBOT)
     telemetry_table(source).put(items)
     archive.run(source, topic_of(source, ROBOT, STREAM))
@@ -88,6 +90,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     row = registry.get(target, ROBOT)
     assert {name: float(row[name]) for name in VEHICLE} == VEHICLE
     assert tags.listed(target)[ROBOT]["lab"] == "north"
+    assert notes.notes(target, ROBOT) == [note]
     assert (tmp_path / "bundles" / ROBOT / "car.yaml").exists()
     # A batch whose content is another one is found, though the counts agree.
     telemetry_table(target).put([{**late, "samples": items[0]["samples"]}])

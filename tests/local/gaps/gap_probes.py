@@ -296,3 +296,12 @@ def function_credentials() -> bool:
     derived = hashlib.sha256(f"secret:{digest}".encode()).hexdigest()
     with patch.object(ministack_app, "AUTH", True):
         return bool(lambda_runtime.execution_credentials(config)["AWS_SECRET_ACCESS_KEY"] == derived)
+
+
+def root_signature() -> bool:
+    """Look whether a signature of root's is kept for its check."""
+    credential = "Credential=test/20260101/eu-west-1/dynamodb/aws4_request"
+    signed = f"AWS4-HMAC-SHA256 {credential}, SignedHeaders=host, Signature=00"
+    with patch.object(ministack_app, "AUTH", True), patch.dict(os.environ, AWS_SECRET_ACCESS_KEY="own"):
+        iam_evaluator.pin_signed_request("POST", "/", {}, [(b"authorization", signed.encode())])
+        return iam_evaluator._signed_request.get() is None

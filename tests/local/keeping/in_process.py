@@ -9,16 +9,16 @@ from pathlib import Path
 from ministack.services import dynamodb
 
 from local.keeping import streams
-from local.keeping.ledger import Ledger
+from local.keeping.ledger import Ledger, Sync
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 
 
 @contextmanager
-def kept(path: Path) -> Iterator[streams.Streams]:
+def kept(path: Path, sync: Sync = "normal") -> Iterator[streams.Streams]:
     """Keep them in this file; afterwards ministack is as before."""
     before = dict(vars(dynamodb))
-    ledger = Ledger(path, sync="normal")
+    ledger = Ledger(path, sync=sync)
     try:
         yield streams.install(ledger)
     finally:

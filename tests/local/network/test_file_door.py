@@ -109,7 +109,7 @@ def test_nothing_else_passes(send, presigned, embedded, case):
     path = presigned()
     method, target, headers = {
         "plain": ("GET", path.partition("?")[0], {}),
-        # The gateway takes these for its owner's, whatever their signature.
+        # No robot gets an address that is signed with the owner's key.
         "owner": ("PUT", presigned(aws_access_key_id="test", aws_secret_access_key="x"), {}),
         "bucket": ("PUT", presigned(bucket="another-bucket"), {}),
         "twice": ("PUT", f"{path}&x-amz-credential=test/20260101/eu-west-1/s3/aws4_request", {}),

@@ -7,6 +7,7 @@ from __future__ import annotations
 import fnmatch
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import boto3
@@ -17,6 +18,7 @@ from botocore.config import Config
 from botocore.exceptions import ClientError
 
 from iort_contract.cloud import pubnub_parameter
+from iort_station.fleet.roles import role_arn
 from tests import isolation
 from tests.stacks.roles import IOT, PUBLIC
 from tests.stacks.roles import ROLES as OF_AWS
@@ -26,6 +28,8 @@ ACCOUNT = "000000000000"
 # The embedded cloud has everybody's identity, too.
 ROLES = {**OF_AWS, "PublicRole": ("cognito-identity.amazonaws.com", PUBLIC)}
 DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "UnauthorizedOperation", "403"}
+# What services say of a wrong signature.
+FORGED = {"ForbiddenException", "InvalidSignatureException", "SignatureDoesNotMatch"}
 SERVICES = ("dynamodb", "sqs", "s3", "ssm", "lambda", "logs", "iot-data", "iam", "sts", "iot")
 
 
@@ -271,3 +275,22 @@ def test_declared_access_is_allowed(deployed, role_clients):
                     wrong.append((role, probe.action, probe.arn))
     assert wrong == []
     assert tried >= harmless
+
+
+@pytest.mark.parametrize("key", ["test", ACCOUNT, "own"])
+def test_nobody_is_the_owner_without_the_owners_secret(embedded, key):
+    cloud = embedded.cloud
+    assert cloud.client("dynamodb").list_tables()["TableNames"]
+    forged = replace(
+        cloud, access_key_id=cloud.access_key_id if key == "own" else key, secret_access_key="guess"
+    )
+    for ask in (
+        lambda: forged.client("dynamodb").list_tables(),
+        lambda: forged.client("s3").list_buckets(),
+        lambda: forged.client("iot-data").publish(topic="cmd/iort/car1/drive", payload=b"{}"),
+        lambda: forged.client("sts").assume_role(RoleArn=role_arn(cloud, "driver"), RoleSessionName="forged"),
+    ):
+        with pytest.raises(ClientError) as refused:
+            ask()
+        assert refused.value.response["ResponseMetadata"]["HTTPStatusCode"] in {400, 403}
+        assert refused.value.response["Error"]["Code"] in FORGED

@@ -15,7 +15,7 @@ import pytest
 
 from iort_station import kept
 from iort_station.errors import StationError
-from iort_station.upkeep import doctor, machine
+from iort_station.upkeep import deployment, doctor, machine
 from iort_station.upkeep.finding import FAIL, OK, WARN
 from iort_station.upkeep.state import held
 from tests.unit.station.test_data import FakeCloud, cloud_of
@@ -62,6 +62,18 @@ def test_a_deployment_on_aws_has_what_applies_there(aws, behind_s, level):
     assert found["summaries"].text.startswith(f"{behind_s}.0 s behind")
     assert found["summaries"].level == level
     assert bool(found["summaries"].todo) == (level != OK)
+
+
+def test_the_load_that_a_machine_takes_is_told_from_what_it_does_now(aws):
+    put("IteratorAge", 100, 1, FunctionName="iort-Summarize")
+    for name, value in (("BatchesSummarized", 1200), ("SamplesSummarized", 60_000)):
+        put(name, value, 120, Deployment="iort", Function="summarize")
+    cloud = Deployed(cloud_of().table)
+    told = ", 20.0 batches and 1,000 samples a second"
+    assert looked(deployment.findings(cloud, 0.25))["summaries"].text.endswith(
+        f"{told} of about 80 batches that this machine takes"
+    )
+    assert looked(deployment.findings(cloud, 0.01))["summaries"].text.endswith(told)
 
 
 def test_stacks_that_are_not_there_end_the_look(aws):

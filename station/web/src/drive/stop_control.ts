@@ -48,8 +48,8 @@ export class StopControl {
 
   private ask(sure: boolean): void {
     this.sure = sure;
-    const whom = this.robot ?? listed(this.stops.held.fleet);
-    this.release.textContent = sure ? `Really release ${whom}: may move` : `Release ${this.robot ?? "all"}`;
+    const whom = this.robot === undefined ? this.stops.held.fleet : [this.robot];
+    this.release.textContent = sure ? `Really release ${listed(whom)}: ${whom.length === 1 ? "it" : "they"} may move` : `Release ${this.robot ?? "all"}`;
     setAttribute(this.release, "data-sure", String(sure));
   }
 

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.table import Table
 from rich.text import Text
 
 from iort_contract.limits import ContractError
+from iort_contract.tables import ROBOT
 from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, Range, Robot, When, ranged
+from iort_station.cli.options import AsJson, Range, When, ranged
 from iort_station.cli.words import examples, say_archived
 from iort_station.errors import UsageError
+from iort_station.fleet import registry
 from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
+    from iort_station.cloud import Cloud
     from iort_station.operations.audit import Audit
 
 commands = typer.Typer()
@@ -27,12 +30,15 @@ commands = typer.Typer()
 _LISTED = 20
 
 
-@commands.command("audit", epilog=examples("audit car7 --last 1h"))
+@commands.command("audit", epilog=examples("audit car7 --last 1h", "audit --all"))
 @ranged
 def audit_(
     context: typer.Context,
-    robot: Robot,
     when: When,
+    robot: Annotated[
+        str | None, typer.Argument(help="The robot's name.", autocompletion=completion.robots)
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every registered robot.")] = False,
     streams: Annotated[
         list[str] | None,
         typer.Option(
@@ -55,13 +61,63 @@ def audit_(
     agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
     and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
+    if (robot is None) != every:
+        raise UsageError("give a robot, or --all")
+    within, late_us = when.range(), duration_us(late)
+    cloud = context.obj.cloud()
+    names = [robot] if robot else sorted(str(row[ROBOT]) for row in registry.listed(cloud))
+    audited = []
+    for name in names:
+        audited.append(_audit(cloud, name, within, streams, late_us, from_start=from_start))
+        if not as_json:
+            if every:
+                out.print(Text(name, "bold"))
+            _print(name, audited[-1])
+    if as_json and every:
+        print_json({"robots": {name: one.told() for name, one in zip(names, audited, strict=True)}})
+    elif as_json:
+        print_json(audited[0].told())
+    # A robot that never recorded has lost nothing, but is no proof of anything either.
+    judged = [one for one in audited if one.found] if every else audited
+    complete = sum(one.complete for one in judged)
+    if every and not as_json:
+        out.print(f"complete: {complete} of {len(judged)} robots with recordings")
+    raise typer.Exit(0 if judged and complete == len(judged) else 1)
+
+
+class _Audited(NamedTuple):
+    """A robot's streams, what its agent did not record by run and cause, and the hours of its archive."""
+
+    found: list[Audit]
+    causes: dict[str, Any]
+    archive: Any
+
+    @property
+    def complete(self) -> bool:
+        return bool(self.found) and not self.causes and all(one.complete for one in self.found)
+
+    def told(self) -> dict[str, Any]:
+        return {
+            "streams": [_as_json(one) for one in self.found],
+            "not_recorded": self.causes,
+            "archive": self.archive and between_hours(self.archive),
+        }
+
+
+def _audit(
+    cloud: Cloud,
+    robot: str,
+    within: Range,
+    streams: list[str] | None,
+    late_us: int,
+    *,
+    from_start: bool,
+) -> _Audited:
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
     from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
 
-    within, late_us = when.range(), duration_us(late)
-    cloud = context.obj.cloud()
     try:
         check_robot(robot)
         names = [check_stream(name) for name in streams or ()] or inventory.known(cloud, robot)
@@ -90,28 +146,20 @@ def audit_(
             inventory.check_there(cloud, robot, one.stream)
     if not found:
         inventory.check_recorded(cloud, robot)
-    if as_json:
-        of_archive = archived.told()
-        print_json(
-            {
-                "streams": [_as_json(one) for one in found],
-                "not_recorded": causes,
-                "archive": of_archive and between_hours(of_archive),
-            }
-        )
-    elif not found:
+    return _Audited(found, causes, archived.told())
+
+
+def _print(robot: str, audited: _Audited) -> None:
+    if not audited.found:
         errors.print(f"this range holds nothing of {robot}")
-    else:
-        for one in found:
-            _show(one)
-        for boot, sources in causes.items():
-            for source, counts in sources.items():
-                out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
-                for cause, count in counts.items():
-                    out.print(f"  {count:,} {cause}")
-    say_archived(archived.told())
-    complete = found and not causes and all(one.complete for one in found)
-    raise typer.Exit(0 if complete else 1)
+    for one in audited.found:
+        _show(one)
+    for boot, sources in audited.causes.items() if audited.found else ():
+        for source, counts in sources.items():
+            out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
+            for cause, count in counts.items():
+                out.print(f"  {count:,} {cause}")
+    say_archived(audited.archive)
 
 
 def _count(value: float | None) -> int | None:

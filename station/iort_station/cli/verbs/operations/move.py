@@ -46,7 +46,7 @@ def move_(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Copy robots into another deployment: the registry, the archive and the stored batches.
+    """Copy robots into another deployment: registry, archive, stored batches, findings and notes.
 
     The source stays as it is. A second run copies what is new, and an interrupted one goes on. Then both
     sides are compared, batch by batch and by their audits; --dry-run only compares. A moved robot has no
@@ -62,10 +62,11 @@ def move_(
     move.check(source, target)
     chosen = sorted({registry.checked(name) for name in names or ()}) or sorted(registry.presence(source))
     told: list[dict[str, Any]] = []
-    registered = 0
+    registered = findings = 0
     for robot in chosen:
         if not dry_run:
             registered += move.register(source, target, robot, bundles)
+            findings += move.copy_findings(source, target, robot)
         for stream in inventory.known(source, robot):
             with errors.status(f"{robot} {stream}") as status:
                 read = _Reading(status.update, f"{robot} {stream}")
@@ -78,9 +79,10 @@ def move_(
                 if not as_json:
                     _show(told[-1])
     if as_json:
-        print_json({"streams": told, "registered": registered})
+        print_json({"streams": told, "registered": registered, "findings": findings})
     else:
-        out.print(f"{len(chosen)} robots, {registered} of them new in the target, {len(told)} streams")
+        robots = f"{len(chosen)} robots, {registered} of them new in the target"
+        out.print(f"{robots}, {len(told)} streams, {findings} findings, analysed drives and notes")
     if registered and bundles is None:
         say("each new robot still needs a certificate there: `iort robots claim ROBOT`, docs/how-to/move.md")
     raise typer.Exit(1 if any(one["problem"] for one in told) else 0)
