@@ -24,7 +24,7 @@ from bench.load.simulated import simulated_drive
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.topics import record_topic
+from iort_contract.topics import CMD, PING_PATHS, PONG, build_topic, record_topic
 
 Columns = dict[str, list[Value]]
 _SECOND_US = 1_000_000
@@ -69,7 +69,7 @@ class Robot:
         self, name: str, folder: Path, load: Load, columns: Sequence[dict[str, list[Value]]]
     ) -> None:
         self.name = name
-        self._columns = columns
+        self._columns, self._namespace = columns, load.namespace
         self._topic = record_topic(name, VESC_STREAM, load.namespace)
         self._boot, self._first_us, self._rate_hz = os.urandom(4).hex(), 0, load.rate_hz
         self.connected = threading.Event()
@@ -94,6 +94,16 @@ class Robot:
 
     def _on_lost(self, _: Any) -> None:
         self.lost += 1
+
+    def listen(self) -> Future[Any]:
+        """Subscribe as an agent does: the broker compares each message with these."""
+        names = [(CMD, "drive"), (CMD, "stop"), *((PONG, path) for path in PING_PATHS)]
+        topics = [build_topic(lane, self.name, name, self._namespace) for lane, name in names]
+        packet = mqtt5.SubscribePacket(
+            [mqtt5.Subscription(topic, mqtt5.QoS.AT_MOST_ONCE) for topic in topics]
+        )
+        subscribed: Future[Any] = self.client.subscribe(packet)
+        return subscribed
 
     def send(self, first_us: int | None = None) -> None:
         """Send the batch of the last second, or of the one that begins then."""
@@ -144,6 +154,8 @@ def drive(load: Load) -> Sent:
             _connected(robots[i - 9 : i + 1])
             _say(connected=i + 1)
     _connected(robots)
+    for subscribed in [robot.listen() for robot in robots]:
+        subscribed.result(_CONNECT_S)
     _say(connected=len(robots), pid=os.getpid())
     pause, late_s, said = threading.Event(), 0.0, time.monotonic()
     began = time.monotonic() + 0.1

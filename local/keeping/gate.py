@@ -2,7 +2,8 @@
 
 Every answer of the gateway, every PUBACK and every message of the cloud itself waits until all that was
 written before is in the ledger. Whoever waits at the same time shares a commit. If it fails, an API call is
-answered by 503, and the connection of a robot is closed without a PUBACK: it keeps the batch.
+answered by 503, and a robot's message by a PUBACK that says so: it keeps the batch, and stays connected, so
+that it can still be stopped. MQTT 3.1.1 has no such PUBACK, and its connection is closed.
 """
 
 from __future__ import annotations
@@ -24,10 +25,16 @@ from local.keeping.ledger import Ledger, LedgerError
 _log = logging.getLogger(__name__)
 Message = dict[str, Any]
 Send = Callable[[Message], Awaitable[None]]
+# A reason of a PUBACK: MQTT 5, 3.4.2.1.
+QUOTA_EXCEEDED = 0x97
 # The record lane's action.
 _PUT = "dynamoDBv2"
 # Why the message that this task publishes was refused.
 _refusal: ContextVar[list[LedgerError] | None] = ContextVar("refusal", default=None)
+
+
+class RefusedError(ConnectionError):
+    """A message is not taken. It ends the session, as AWS does when it cannot take a message."""
 
 
 class Gate:
@@ -44,6 +51,7 @@ class Gate:
         app.app = self._answering(app.app)
         iot.broker_publish = self._acknowledging(iot.broker_publish)
         iot._dispatch_rule_action = self._refusing(iot._dispatch_rule_action)
+        iot._WSSession.handle_packet = _telling(iot._WSSession.handle_packet)
         iot._fleet_provisioning_reply = self._replying(iot._fleet_provisioning_reply)
 
     async def passed(self, since: int) -> None:
@@ -107,8 +115,7 @@ class Gate:
             if outer is not None:
                 outer += refusals
             if refusals and rest.get("qos"):
-                # It ends the session, as AWS does when it cannot take a message.
-                raise ConnectionError(f"{topic}: {refusals[0]}")
+                raise RefusedError(str(refusals[0]))
 
         return acknowledge
 
@@ -139,6 +146,25 @@ class Gate:
             return answer
 
         return committed
+
+
+def _telling(handle: Callable[..., Awaitable[bool]]) -> Callable[..., Awaitable[bool]]:
+    """A session that tells its client which message is refused."""
+
+    @wraps(handle)
+    async def tell(session: Any, kind: int, flags: int, body: bytes) -> bool:
+        try:
+            return await handle(session, kind, flags, body)
+        except RefusedError:
+            if session.protocol_version != iot.MQTT_5 or kind != iot.PKT_PUBLISH:
+                raise
+            _, place = iot._read_string(body, 0)
+            number = int.from_bytes(body[place : place + 2], "big")
+            why = [(iot.PROP_REASON_STRING, "the cloud could not store it")]
+            await session.send_bytes(iot._make_puback(number, QUOTA_EXCEEDED, why))
+            return True
+
+    return tell
 
 
 async def _refuse(send: Send, error: LedgerError) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import getpass
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -29,7 +28,7 @@ Wants=network-online.target
 Type=notify
 WorkingDirectory=$root
 ExecStart=$command
-${user}Restart=on-failure
+Restart=on-failure
 RestartSec=5
 # The first start deploys everything.
 TimeoutStartSec=900
@@ -63,29 +62,39 @@ def main() -> None:
         if getattr(options, name) is not None:
             given += [f"--{name.replace('_', '-')}", getattr(options, name)]
     of_machine = os.geteuid() == 0
-    text = unit(given, of_machine=of_machine, user=os.environ.get("SUDO_USER", ""))
+    text = unit(given, of_machine=of_machine)
     try:
         if options.print:
             _say(text)
         elif options.remove:
             _remove(of_machine=of_machine)
         else:
+            _check()
             _make_password(options.state, options.page)
             _install(text, of_machine=of_machine)
     except LocalError as error:
         sys.exit(f"up-service: {error}")
 
 
-def unit(options: list[str], *, of_machine: bool, user: str = "") -> str:
+def unit(options: list[str], *, of_machine: bool) -> str:
     """The text of the unit."""
     command = [sys.executable, "-m", "local.up.run", *options]
     return _UNIT.substitute(
         root=_quoted(str(ROOT), inner=True),
         command=" ".join(_quoted(one) for one in command),
-        # Nothing in it needs root's rights.
-        user=f"User={user}\n" if of_machine and user else "",
         wanted="multi-user.target" if of_machine else "default.target",
     )
+
+
+def _check() -> None:
+    """Raise `LocalError` where it could not run."""
+    if not Path("/run/systemd/system").is_dir():
+        raise LocalError(
+            "systemd must run this machine, got none: run `make up` in a terminal that stays, such as tmux"
+        )
+    if os.environ.get("SUDO_USER"):
+        # Checkout and state are the user's, and root's files in them would be in the way.
+        raise LocalError("must run without sudo: a service of the user starts with the machine, too")
 
 
 def _make_password(folder: Path, page: str | None) -> None:
@@ -138,10 +147,7 @@ def _linger() -> None:
 
 
 def _systemctl(*arguments: str, of_machine: bool) -> None:
-    systemctl = shutil.which("systemctl")
-    if systemctl is None:
-        raise LocalError("this machine has no systemd: run `make up` in a terminal that stays, such as tmux")
-    command = [systemctl, *([] if of_machine else ["--user"]), *arguments]
+    command = ["systemctl", *([] if of_machine else ["--user"]), *arguments]
     done = subprocess.run(command, check=False, capture_output=True, text=True)  # noqa: S603 - as above
     if done.returncode:
         raise LocalError(f"`{' '.join(command)}` failed: {done.stderr.strip()}")

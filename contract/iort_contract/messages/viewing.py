@@ -18,7 +18,7 @@ from iort_contract.topics import VIEW, build_topic
 VIEW_LEASE_MS = 15_000
 # How often a viewer renews, so that two renewals may get lost.
 VIEW_RENEW_S = 5.0
-# Viewers of a robot at once.
+# Viewers of a robot with a lease of their own.
 MAX_VIEWERS = 32
 # The last level of the topic.
 LEASE = "lease"

@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 # A robot that is connected and still not subscribed after this time will not be.
 _DEAF_S = 5.0
+# The name of the lease that all viewers beyond `MAX_VIEWERS` share. No viewer has it.
+_CROWD = "crowd"
 
 
 class _Look(NamedTuple):
@@ -32,6 +34,12 @@ class _Look(NamedTuple):
 
     until: float
     demand: Demand
+
+
+def _both(one: _Look, other: _Look) -> _Look:
+    rate_hz = max(one.demand.rate_hz, other.demand.rate_hz)
+    to_broker = one.demand.to_broker or other.demand.to_broker
+    return _Look(max(one.until, other.until), Demand(rate_hz, to_broker))
 
 
 class Viewers:
@@ -79,19 +87,17 @@ class Viewers:
         except ContractError as error:
             self._rejections.warn("malformed", f"live: a viewer's lease is rejected: {error}")
             return
-        until = message.at + lease.lease_ms / 1000
+        look = _Look(message.at + lease.lease_ms / 1000, Demand(lease.rate_hz, lease.broker))
         with self._lock:
-            begins = lease.viewer not in self._looks
-            if until <= self._clock.monotonic():
-                self._looks.pop(lease.viewer, None)
-                begins = False
-            elif begins and len(self._looks) >= MAX_VIEWERS:
-                self._rejections.warn(
-                    "too_many", f"live: a viewer's lease is rejected: {MAX_VIEWERS} look already"
-                )
-                return
+            full = lease.viewer not in self._looks and len(self._looks.keys() - {_CROWD}) >= MAX_VIEWERS
+            viewer = _CROWD if full else lease.viewer
+            begins = viewer not in self._looks
+            if look.until > self._clock.monotonic():
+                self._looks[viewer] = look if begins or not full else _both(self._looks[viewer], look)
             else:
-                self._looks[lease.viewer] = _Look(until, Demand(lease.rate_hz, lease.broker))
+                begins = False
+                # A viewer of the crowd that ends does not end the others'.
+                self._looks.pop(lease.viewer, None)
             self._tell(at_once=begins)
 
     def _demand(self) -> Demand:

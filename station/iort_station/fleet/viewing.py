@@ -18,6 +18,8 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 
 _AT_ONCE = 8
+# Without a network a request takes a minute to fail. The robots forget the viewer in less.
+_GOODBYE_S = 3.0
 
 
 def view(cloud: Cloud, robots: Iterable[str], lease: Lease) -> int:
@@ -75,8 +77,14 @@ class Viewer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._end.set()
+        goodbye = threading.Thread(target=self._leave, name="viewer's end", daemon=True)
+        goodbye.start()
+        goodbye.join(_GOODBYE_S)
+
+    def _leave(self) -> None:
         self._thread.join()
-        self._publish(self._held, 0)
+        if not self.problem:
+            self._publish(self._held, 0)
 
     def _run(self) -> None:
         while not self._end.wait(self._every_s):

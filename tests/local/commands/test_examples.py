@@ -24,7 +24,7 @@ from tests.manual import COMMANDS, examples
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
 # Laps need minutes of driving, and `iort drive` a terminal.
 NOT_RUN = {
-    *("adopt", "backup", "dashboard", "drive", "files empty", "laps", "pubnub", "restore"),
+    *("adopt", "backup", "dashboard", "drive", "files empty", "laps", "move", "pubnub", "restore"),
     *("robots revoke-claims", "site"),
 }
 # Runs until Ctrl-C.

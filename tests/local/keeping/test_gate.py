@@ -12,11 +12,10 @@ from ministack import app
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, iot, sqs
 
-from local.keeping.gate import Gate
+from local.keeping.gate import QUOTA_EXCEEDED, Gate
 from tests.local.keeping.in_process import ACCOUNT, REGION, kept
 
 NAME = "gate-items"
-CONNECT = bytes([0x10, 13, 0, 4, *b"MQTT", 4, 2, 0, 60, 0, 1, *b"c"])
 PUBACK = 0x40
 
 
@@ -27,24 +26,30 @@ class Cloud:
         self.ledger = ledger
         # What was committed when each acknowledgement left.
         self.acknowledged = {}
+        self.refused = []
 
     def committed(self):
         with closing(sqlite3.connect(self.ledger.path)) as other:
             return {key for (key,) in other.execute("SELECT pk FROM items")}
 
-    async def publish(self, key, *, qos=1):
+    async def publish(self, key, *, qos=1, version=4):
         """Publish a record; returns whether the connection stays."""
         number = len(self.acknowledged) + 1
 
         async def send(message):
             data = message.get("bytes") or b"\0"
-            if data[0] == PUBACK:
+            if data[0] == PUBACK and len(data) > 4 and data[4] >= 0x80:
+                self.refused.append((int.from_bytes(data[2:4], "big"), data[4]))
+            elif data[0] == PUBACK:
                 self.acknowledged[key] = self.committed()
 
         session = iot._WSSession(send, ACCOUNT, REGION, ACCOUNT)
-        assert await iot._feed_session(session, CONNECT.replace(b"\0\1c", b"\0\1" + key.encode()), 10_000)
-        topic, payload = b"record", json.dumps({"key": key, "text": "x" * 60}).encode()
-        body = bytes([0, len(topic)]) + topic + bytes([0, number] if qos else []) + payload
+        properties = b"\0" if version == 5 else b""
+        name = bytes([0, 4]) + b"MQTT" + bytes([version, 2, 0, 60]) + properties + bytes([0, len(key)])
+        connect = name + key.encode()
+        assert await iot._feed_session(session, bytes([0x10, len(connect)]) + connect, 10_000)
+        payload = json.dumps({"key": key, "text": "x" * 60}).encode()
+        body = b"\0\6record" + bytes([0, number] if qos else []) + properties + payload
         packet = bytes([0x30 | qos << 1, len(body)]) + body
         try:
             return await iot._feed_session(session, packet, 10_000)
@@ -61,6 +66,7 @@ def cloud(tmp_path, monkeypatch, request):
     for name in ("broker_publish", "_dispatch_rule_action", "_fleet_provisioning_reply"):
         monkeypatch.setattr(iot, name, getattr(iot, name))
     monkeypatch.setattr(app, "app", app.app)
+    monkeypatch.setattr(iot._WSSession, "handle_packet", iot._WSSession.handle_packet)
     with request_scope(ACCOUNT, REGION), kept(tmp_path / "ledger.db", request.param) as streams:
         Gate(streams.ledger).install()
         dynamodb._create_table(
@@ -140,6 +146,15 @@ def test_records_are_refused_before_the_disk_is_full(cloud):
     cloud.ledger.floor_bytes = 0
     assert asyncio.run(cloud.publish("a"))
     assert cloud.acknowledged == {"a": {"a"}}
+
+
+def test_a_robot_stays_connected_when_its_record_is_refused(cloud):
+    cloud.ledger.floor_bytes = 1 << 60
+    assert asyncio.run(cloud.publish("a", version=5))
+    assert (cloud.acknowledged, cloud.refused) == ({}, [(1, QUOTA_EXCEEDED)])
+    cloud.ledger.floor_bytes = 0
+    assert asyncio.run(cloud.publish("a", version=5))
+    assert (cloud.acknowledged, len(cloud.refused)) == ({"a": {"a"}}, 1)
 
 
 async def call(action, **data):

@@ -9,7 +9,7 @@ import ssl
 import time
 import urllib.request
 import zipfile
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import paho.mqtt.client as mqtt
 import pytest
@@ -65,15 +65,17 @@ def robot(emulator, tmp_path):
     """Return a context manager: a connection of a robot with a certificate."""
     iot = emulator.client("iot")
     made = iot.create_keys_and_certificate(setAsActive=True)
-    iot.create_policy(policyName="everything", policyDocument=json.dumps(_EVERYTHING))
+    with suppress(iot.exceptions.ResourceAlreadyExistsException):
+        iot.create_policy(policyName="everything", policyDocument=json.dumps(_EVERYTHING))
     iot.attach_policy(policyName="everything", target=made["certificateArn"])
     files = {"ca": _root(emulator), "crt": made["certificatePem"], "key": made["keyPair"]["PrivateKey"]}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
 
     @contextmanager
-    def connected():
-        client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, client_id="car", clean_session=False)
+    def connected(protocol=mqtt.MQTTv311):
+        version = mqtt.CallbackAPIVersion.VERSION2
+        client = mqtt.Client(version, client_id="car", protocol=protocol)
         client.tls_set(*(str(tmp_path / name) for name in ("ca", "crt", "key")))
         client.reconnect_delay_set(0.1, 0.1)
         client.connect("127.0.0.1", emulator.mqtt_port)
@@ -96,27 +98,48 @@ def stored(emulator):
     return {item["key"]["S"] for item in emulator.client("dynamodb").scan(TableName=TABLE)["Items"]}
 
 
+@contextmanager
+def full_disk(emulator):
+    """Let no file of the emulator grow beyond a page of the ledger."""
+    limit, unlimited = (4096, resource.RLIM_INFINITY), (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+    resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, limit)
+    try:
+        yield
+    finally:
+        resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)
+
+
 def test_a_robot_keeps_a_record_that_the_full_disk_refused(emulator, robot):
     with robot() as car:
         car.publish("record", b'{"key": "before"}', qos=1).wait_for_publish(60)
         lost = []
         car.on_disconnect = lambda *_: lost.append(time.monotonic())
-        # No file may grow beyond a page of the ledger.
-        unlimited = resource.prlimit(
-            emulator.process.pid, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY)
-        )
-        try:
+        with full_disk(emulator):
             refused = car.publish("record", b'{"key": "refused"}', qos=1)
             until(lambda: len(lost) > 1)
             assert not refused.is_published()
             assert stored(emulator) == {"before"}
-        finally:
-            resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)
         # The client sends it again by itself.
         refused.wait_for_publish(60)
         assert refused.is_published()
         emulator.restart()
     assert stored(emulator) == {"before", "refused"}
+
+
+def test_a_robot_of_mqtt_5_stays_connected_on_a_full_disk(emulator, robot):
+    with robot(mqtt.MQTTv5) as car:
+        said, lost = [], []
+        car.on_publish = lambda _client, _data, _number, reason, _properties: said.append(str(reason))
+        car.on_disconnect = lambda *_: lost.append(time.monotonic())
+        with full_disk(emulator):
+            for n in (1, 2):
+                car.publish("record", b'{"key": "five"}', qos=1)
+                until(lambda n=n: len(said) == n)
+        car.publish("record", b'{"key": "five"}', qos=1)
+        until(lambda: len(said) == 3)
+        assert said[:2] == ["Quota exceeded"] * 2
+        assert not lost
+    assert "five" in stored(emulator)
 
 
 def test_a_mapping_goes_on_after_a_kill_with_what_it_had_not_finished(emulator, tmp_path):

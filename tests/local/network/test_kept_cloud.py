@@ -133,12 +133,11 @@ def test_up_json_is_read_as_it_was_written(tmp_path):
 
 @pytest.mark.parametrize("of_machine", [True, False])
 def test_the_unit_starts_this_checkout_with_the_options(of_machine):
-    text = service.unit(["--state", "/srv/100% iort/$x"], of_machine=of_machine, user="lab")
+    text = service.unit(["--state", "/srv/100% iort/$x"], of_machine=of_machine)
     assert f"WorkingDirectory={ROOT}\n" in text
     assert '-m" "local.up.run" "--state" "/srv/100%% iort/$$x"\n' in text
     assert "Type=notify\n" in text
     assert "Restart=on-failure\n" in text
-    assert ("User=lab\n" in text) == of_machine
     assert re.search(r"WantedBy=(multi-user|default)\.target\n", text)[1] == (
         "multi-user" if of_machine else "default"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import defaultdict
 from dataclasses import replace
 from typing import Any
@@ -68,6 +69,27 @@ def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go() -> None:
         while not cloud.heard["b"]:
             assert cloud.renewed.acquire(timeout=10)
     assert cloud.heard["a"][-1].lease_ms == 0
+
+
+def test_a_viewer_whose_network_is_gone_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewing, "_GOODBYE_S", 0.1)
+    cloud: Any = Cloud()
+    asked, network = threading.Semaphore(0), threading.Event()
+
+    def robots() -> list[str]:
+        asked.release()
+        # The second time it hangs.
+        assert not cloud.heard or network.wait(60)
+        return ["a"]
+
+    viewer = viewing.Viewer(cloud, robots, every_s=0.01)
+    with viewer:
+        assert asked.acquire(timeout=10)
+        assert asked.acquire(timeout=10)
+        began = time.monotonic()
+    assert time.monotonic() - began < 30, "it did not wait for the network"
+    network.set()
+    viewer._thread.join(10)
 
 
 def test_who_may_not_wake_robots_is_told_and_looks_on() -> None:
