@@ -11,12 +11,12 @@ from bench.keeping.week import Soak
 from bench.report import plots
 
 _HEAD = """\
-# The kept cloud: killed, and for a week
+# The kept cloud: killed, and soaked
 
 <!-- written by `make bench-kept OUT=docs/bench` -->
 
-`make bench-kept` kills the cloud of `make up` at random moments of a drive, and lets it live through a week
-on a clock that is set forward. docs/explanation/kept-cloud.md says what the figures mean.
+`make bench-kept` kills the cloud of `make up` at random moments of a drive, and lets it live through
+hours of a clock that is set forward: [what that is, and what it says](../explanation/kept-cloud.md).
 """
 
 
@@ -41,11 +41,15 @@ def write(folder: Path, killed: Kills | None, soaked: Soak | None, figures: dict
             y_label="MB",
         )
         (folder / "kept.svg").write_text(draw(title))
-        parts += [f"## A week\n\n{table.title}.", f"![{title}](kept.svg)", table.as_markdown()]
+        parts += [
+            f"## {soaked.hours} hours of the clock\n\n{table.title}.",
+            f"![{title}](kept.svg)",
+            table.as_markdown(),
+        ]
     (folder / "kept.md").write_text("\n\n".join(parts) + "\n")
     (folder / "kept.json").write_text(json.dumps(figures, indent=2) + "\n")
 
 
 def _machine(found: dict[str, Any]) -> str:
-    day, commit = found["date"][:10], found["commit"]
-    return f"{found['cores']} cores of {found['cpu']}, {found['memory']}, {day}, {commit}."
+    made = f"{found['date'][:10]}, {found['commit']}, a load of {found['load_1min']} at the end"
+    return f"{found['cores']} cores of {found['cpu']}, {found['memory']}, {made}."

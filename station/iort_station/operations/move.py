@@ -105,22 +105,27 @@ def register(source: Cloud, target: Cloud, robot: str, bundles: Path | None = No
     """Register a robot in the target with what the source knows of it; False if it was there already.
 
     With ``bundles`` it gets a certificate there, in the bundle ``bundles/<robot>``; otherwise it claims one.
-    Its tags follow once it has a thing. A robot that the source has removed stays removed.
+    A robot that the source has removed stays removed.
     """
     row = registry.find(source, robot)
     if row is None:
         return False
-    new = registry.find(target, robot) is None
-    if new:
-        carried = _carried(row)
-        if bundles is not None:
-            robots.add(target, robot, out=bundles, vehicle=carried)
-        else:
-            registry.enter(target, robot, carried)
-    wanted = tags.listed(source).get(robot, {})
-    if wanted and robot in tags.listed(target):
-        tags.change(target, robot, dict(wanted))
-    return new
+    if registry.find(target, robot) is not None:
+        return False
+    if bundles is not None:
+        robots.add(target, robot, out=bundles, vehicle=_carried(row))
+    else:
+        registry.enter(target, robot, _carried(row))
+    return True
+
+
+def copy_tags(source: Cloud, target: Cloud, names: Sequence[str]) -> None:
+    """Copy the tags of robots that have a thing in the target: the others have yet to claim their names."""
+    old, new = tags.listed(source), tags.listed(target)
+    for robot in names:
+        wanted = old.get(robot, {})
+        if robot in new and not wanted.items() <= new[robot].items():
+            tags.change(target, robot, dict(wanted))
 
 
 def _carried(row: Mapping[str, Any]) -> dict[str, Any]:

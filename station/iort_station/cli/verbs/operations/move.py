@@ -63,10 +63,11 @@ def move_(
     chosen = sorted({registry.checked(name) for name in names or ()}) or sorted(registry.presence(source))
     told: list[dict[str, Any]] = []
     registered = findings = 0
+    if not dry_run:
+        registered = sum(move.register(source, target, robot, bundles) for robot in chosen)
+        move.copy_tags(source, target, chosen)
+        findings = sum(move.copy_findings(source, target, robot) for robot in chosen)
     for robot in chosen:
-        if not dry_run:
-            registered += move.register(source, target, robot, bundles)
-            findings += move.copy_findings(source, target, robot)
         for stream in inventory.known(source, robot):
             with errors.status(f"{robot} {stream}") as status:
                 read = _Reading(status.update, f"{robot} {stream}")
