@@ -27,7 +27,7 @@ class Authority:
         if folder is None or not (folder / "authority.key").exists():
             self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
             if folder is not None:
-                self.write_own(folder / "authority.pem")
+                write_private(folder / "authority.pem", self.pem.encode())
                 # The key last: without it both are made anew.
                 write_private(folder / "authority.key", self._authority.private_key_pem.bytes())
         else:
@@ -139,6 +139,11 @@ def write_private(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
+    parent = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(parent)
+    finally:
+        os.close(parent)
 
 
 def is_address(host: str) -> bool:

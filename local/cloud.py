@@ -3,8 +3,8 @@
     with EmbeddedCloud(folder) as embedded:
         embedded.cloud.client("dynamodb")...
 
-It writes below its folder only and stops on exit what it has started. Every socket listens on loopback,
-but for the two that robots need with ``listen``.
+It writes below its folder only and stops on exit what it has started. Every socket listens on loopback;
+with ``listen`` the two that robots need do so in a network, too.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ class EmbeddedCloud:
         self.authority = Authority(self.folder if self.kept else None)
         # Only this machine reaches the gateway, and it reads its certificate once.
         certificate, key = self.authority.write(self.folder, "gateway", self.host)
-        robots = self.listen.hosts if self.listen else (self.host,)
-        broker = self.certificate("broker", robots)
+        robots = self.listen.hosts if self.listen else ()
+        broker = self.certificate("broker", tuple(dict.fromkeys([*robots, self.host])))
         self.cloud = Cloud(
             namespace=self.namespace,
             region=_REGION,
@@ -162,13 +162,19 @@ class EmbeddedCloud:
 
     def _find_ports(self) -> dict[str, int]:
         servers = ("gateway", "mqtt", "relay", *(["pubnub"] if self.live == PUBNUB else []))
-        inside = dict.fromkeys(servers, self.host)
-        # What robots connect to.
-        outside = dict.fromkeys(("mqtt", "files"), self.listen.address) if self.listen else {}
+        here: tuple[str, ...] = (self.host,)
+        hosts = dict.fromkeys(servers, here)
+        if self.listen:
+            hosts |= {"mqtt": self._broker_hosts, "files": (self.listen.address,)}
         return {
-            name: self.state.port(name, host, self.ports.get(name, 0))
-            for name, host in {**inside, **outside}.items()
+            name: self.state.port(name, *there, wanted=self.ports.get(name, 0))
+            for name, there in hosts.items()
         }
+
+    @property
+    def _broker_hosts(self) -> tuple[str, ...]:
+        """Where the broker listens: also on loopback, for the robots of this machine."""
+        return tuple(dict.fromkeys([*([self.listen.address] if self.listen else []), self.host]))
 
     def certificate(self, name: str, hosts: tuple[str, ...]) -> ServerCertificate:
         """A server's certificate, for as long as this cloud runs: see `renew`."""
@@ -223,7 +229,7 @@ class EmbeddedCloud:
             "MINISTACK_REGION": _REGION,
             "GATEWAY_PORT": str(self.ports["gateway"]),
             "IOT_MTLS_PORT": str(self.ports["mqtt"]),
-            "IOT_MTLS_HOST": self.listen.address if self.listen else self.host,
+            "IOT_MTLS_HOST": ",".join(self._broker_hosts),
             "IORT_BROKER_CERTIFICATE": str(broker.path),
             **(self._kept_variables() if self.kept else {}),
             **({"ROBOTS_S3_ENDPOINT": self.files_url} if self.listen else {}),

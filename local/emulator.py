@@ -7,6 +7,7 @@ them the state ends with the process.
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import cast
@@ -18,14 +19,17 @@ from local.gaps.functions.async_invocations import AsyncInvocations
 from local.gaps.metrics import alarm_timer
 from local.keeping import kept, presence, streams
 from local.keeping.gate import Gate
-from local.keeping.ledger import Ledger, Sync
+from local.keeping.ledger import Ledger, LedgerError, Sync
 
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT."""
     path = os.environ.get("IORT_LEDGER")
     sync = cast(Sync, os.environ.get("IORT_LEDGER_SYNC", "normal") if path else "off")
-    ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
+    try:
+        ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
+    except LedgerError as error:
+        sys.exit(f"{error}; `iort restore` brings a backup back")
     # Before the gaps, which read streams.
     streams.install(ledger)
     gaps.install()

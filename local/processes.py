@@ -87,7 +87,9 @@ class Child:
     def shorten_log(self, most_bytes: int) -> None:
         """Begin the log anew once it is larger; one older part is kept, as ``<log>.1``."""
         if self.log is not None and self.log.stat().st_size > most_bytes:
-            shutil.copyfile(self.log, f"{self.log}.1")
+            # There is no room for it on a full disk.
+            with suppress(OSError):
+                shutil.copyfile(self.log, f"{self.log}.1")
             os.truncate(self.log, 0)
 
     def interrupt(self) -> None:

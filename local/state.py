@@ -9,6 +9,7 @@ import os
 import secrets
 import shutil
 import socket
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,17 @@ class StateFolder:
     def take(self, stack: ExitStack) -> None:
         """Lock the folder until the stack closes, and clean it. Raises `LocalError` if that is not
         possible."""
-        self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
+            # The file stays open and locked while this cloud runs. Nobody else may lock it.
+            opened = os.open(lock_of(self.path), os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o600)
+            lock = stack.enter_context(os.fdopen(opened, "a+"))
+        except OSError as error:
+            raise LocalError(
+                f"you must be able to write {self.path} and the folder that it is in: {error}"
+            ) from error
         if shutil.disk_usage(self.path).free < _LEAST_FREE_BYTES:
             raise LocalError(f"{self.path} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
-        # The file stays open and locked while this cloud runs.
-        lock = stack.enter_context(lock_of(self.path).open("a+"))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -92,21 +99,21 @@ class StateFolder:
             text = json.dumps({**self.settings(), **settings}, indent=2)
             write_private(self._settings_path, f"{text}\n".encode())
 
-    def port(self, name: str, host: str, wanted: int = 0) -> int:
-        """The port ``wanted``, or the one of the last start, or a free one. Raises `LocalError` if it is in
-        use."""
+    def port(self, name: str, *hosts: str, wanted: int = 0) -> int:
+        """The port ``wanted``, or the one of the last start, or a free one, on every host. Raises
+        `LocalError` if it is in use."""
         known = self.settings().get("ports", {})
         asked = wanted or known.get(name, 0)
         usual = _USUAL.get(name, 0) if self.kept and not asked else 0
-        found = _free(host, usual) if usual else None
+        found = _free(hosts, usual) if usual else None
         if found is None:
-            found = _free(host, asked)
+            found = _free(hosts, asked)
         if found is None:
             # A kept port is in the cars' bundles.
             advice = "give another, or none"
             if asked == known.get(name):
                 advice = f"or choose another in {self._settings_path}"
-            raise LocalError(f"port {asked} ({name}) is in use on {host}: free it, {advice}")
+            raise LocalError(f"port {asked} ({name}) is in use on {' or '.join(hosts)}: free it, {advice}")
         self.remember(ports={**known, name: found})
         return found
 
@@ -118,14 +125,16 @@ class StateFolder:
         return path.read_text()
 
 
-def _free(host: str, port: int) -> int | None:
-    """The port, or a free one for 0; None if it is in use."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                return None
-            raise LocalError(f"cannot listen on {host}:{port}: {error}") from error
-        return int(probe.getsockname()[1])
+def _free(hosts: Sequence[str], port: int) -> int | None:
+    """The port, or a free one for 0; None if it is in use on a host."""
+    for host in hosts:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    return None
+                raise LocalError(f"cannot listen on {host}:{port}: {error}") from error
+            port = int(probe.getsockname()[1])
+    return port

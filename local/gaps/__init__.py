@@ -26,6 +26,7 @@ NAMES = (
     "storage.number_checks",
     "storage.object_expiry",
     "storage.request_time",
+    "storage.own_paths",
     "metrics.embedded_metrics",
     "metrics.lambda_metrics",
     "metrics.iot_metrics",

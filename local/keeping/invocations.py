@@ -11,6 +11,7 @@ import time
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from functools import partial, wraps
+from itertools import count
 from typing import Any, Protocol
 
 from ministack.core.responses import get_account_id, get_region
@@ -53,6 +54,9 @@ class Invocations:
     def __init__(self, ledger: Ledger, events: Events) -> None:
         self._ledger, self._events = ledger, events
         ledger.define(_SCHEMA)
+        ((last,),) = ledger.read("SELECT coalesce(max(number), 0) FROM invocations")
+        # SQLite would give the number of an undone row again, while that event still runs.
+        self._numbers = count(last + 1)
 
     def install(self) -> None:
         """Keep what rules and schedules invoke from now on."""
@@ -70,10 +74,11 @@ class Invocations:
             self._events.dispatch(account, region, function_arn, event)
             return
         with self._ledger.write() as connection:
-            number = connection.execute(
-                "INSERT INTO invocations (account, region, function, event, queued_s) VALUES (?, ?, ?, ?, ?)",
-                (account, region, function_arn, json.dumps(event), time.time()),
-            ).lastrowid
+            number = next(self._numbers)
+            connection.execute(
+                "INSERT INTO invocations VALUES (?, ?, ?, ?, ?, ?)",
+                (number, account, region, function_arn, json.dumps(event), time.time()),
+            )
             self._events.queue(account, region, function_arn, event, done=partial(self._remove, number))
 
     def go_on(self) -> None:
@@ -87,7 +92,7 @@ class Invocations:
                 _log.warning("an event is given up: %s", error)
                 done()
 
-    def _remove(self, number: int | None) -> None:
+    def _remove(self, number: int) -> None:
         with self._ledger.write() as connection:
             connection.execute("DELETE FROM invocations WHERE number = ?", (number,))
 

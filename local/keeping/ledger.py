@@ -48,6 +48,8 @@ class Ledger:
         self.on_undo: list[Callable[[], object]] = []
         self._lock = threading.RLock()
         self._writing = False
+        # SQLite calls a transaction over when its commit begins, which may fail.
+        self._changed = False
         self._connection = self._open()
         self._reading = threading.Lock()
         self._reader = self._open()
@@ -114,6 +116,7 @@ class Ledger:
             try:
                 if not self._connection.in_transaction:
                     self._connection.execute("BEGIN")
+                self._changed = True
                 self._connection.execute("SAVEPOINT call")
                 yield self._connection
                 self._connection.execute("RELEASE call")
@@ -148,7 +151,7 @@ class Ledger:
     @property
     def pending(self) -> bool:
         """Whether `commit` has anything to do."""
-        return self._connection.in_transaction or (self.sync == "full" and self._on_disk < self._committed)
+        return self._changed or (self.sync == "full" and self._on_disk < self._committed)
 
     def commit(self, since: int | None = None) -> None:
         """Commit all changes of all callers; one call of several at a time does it for all of them.
@@ -171,6 +174,7 @@ class Ledger:
             except sqlite3.Error as error:
                 raise self._undo(error) from error
             self._committed += 1
+        self._changed = False
 
     def _wait_for_disk(self) -> None:
         wanted = self._committed
@@ -195,6 +199,7 @@ class Ledger:
             if self._connection.in_transaction:
                 self._connection.execute("ROLLBACK")
         self.undone += 1
+        self._changed = False
         self._forget()
         return LedgerError(f"cannot write {self.path}: {error}")
 

@@ -24,7 +24,8 @@ Message = dict[str, Any]
 def install(ledger: Ledger) -> None:
     """Keep the messages of each queue from now on, and give a loaded queue its messages back."""
     ledger.define(_SCHEMA)
-    sqs._queues = _Queues(ledger)
+    queues = sqs._queues = _Queues(ledger)
+    ledger.on_undo.append(queues.forget_undone)
 
 
 class _Queues(AccountRegionScopedDict):  # type: ignore[misc]  # ministack has no types
@@ -43,6 +44,11 @@ class _Queues(AccountRegionScopedDict):  # type: ignore[misc]  # ministack has n
         """Put in queues that the emulator had before its end."""
         for key, queue in other._data.items():
             self._data[key] = _Queue(self._ledger, key[2], queue)
+
+    def forget_undone(self) -> None:
+        """Forget the messages that the ledger has undone; whoever sent one is told so."""
+        for queue in list(self._data.values()):
+            queue["messages"].forget_undone()
 
     def pop_scoped(self, account_id: str, region: str, key: str, *default: Any) -> Any:
         """Delete a queue with its messages."""
@@ -79,7 +85,7 @@ class _Messages(list[Message]):
         with self._ledger.write() as connection:
             values = (self._url, message["id"], json.dumps(message))
             connection.execute("INSERT OR REPLACE INTO messages (queue, id, text) VALUES (?, ?, ?)", values)
-        super().append(message)
+            super().append(message)
 
     def remove(self, message: Message) -> None:
         """Remove one message."""
@@ -97,6 +103,13 @@ class _Messages(list[Message]):
         names = {message["id"] for message in kept}
         self._delete(message for message in self if message["id"] not in names)
         self[:] = kept
+
+    def forget_undone(self) -> None:
+        """Forget the messages that the ledger does not have."""
+        known = {
+            name for (name,) in self._ledger.read("SELECT id FROM messages WHERE queue = ?", (self._url,))
+        }
+        self[:] = [message for message in self if message["id"] in known]
 
     def _delete(self, messages: Iterable[Message]) -> None:
         with self._ledger.write() as connection:

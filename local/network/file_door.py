@@ -6,13 +6,16 @@ the key must be a function's: nobody signs such an address with the owner's.
 
 from __future__ import annotations
 
+import asyncio
 import re
 import ssl
+from collections import Counter
 from pathlib import Path
 
 from aiohttp import ClientError, ClientSession, TCPConnector, web
 from yarl import URL
 
+from iort_contract.messages.files import PART_BYTES, UPLOAD_URL_S
 from iort_station.page.background import BackgroundServer
 from local.certificates import ServerCertificate
 
@@ -35,6 +38,8 @@ _ANSWERED = re.compile(r"content-(length|type|range)|etag|last-modified|x-amz-[a
 _CHUNK_BYTES = 256 * 1024
 # A connection without a request is closed after this time.
 _IDLE_S = 30.0
+# Requests that pass at once, and those of one address.
+_MOST, _MOST_OF_ONE = 32, 8
 
 
 class FileDoor(BackgroundServer):
@@ -50,14 +55,31 @@ class FileDoor(BackgroundServer):
         bucket: str,
         certificate: ServerCertificate,
     ) -> None:
-        super().__init__(host, port, tls=certificate.context(), keepalive_timeout=_IDLE_S)
+        super().__init__(host, port, tls=certificate.context(), idle_s=_IDLE_S)
         self._gateway, self._bucket = gateway, bucket
+        self._passing: Counter[str] = Counter()
         self._trusts = ssl.create_default_context(cafile=authority)
 
     async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
         """Pass on one request for a file."""
         if not self._passes(request):
             return web.Response(status=403, text="only presigned requests for files pass here\n")
+        address = request.remote or ""
+        length = request.content_length
+        if request.method == "PUT" and (length is None or length > PART_BYTES):
+            # The gateway holds a body in memory before it judges the signature.
+            return web.Response(status=413, text=f"a part of a file must have up to {PART_BYTES} bytes\n")
+        if self._passing[address] >= _MOST_OF_ONE or self._passing.total() >= _MOST:
+            return web.Response(status=503, text="too many files pass at once: try again\n")
+        self._passing[address] += 1
+        try:
+            return await asyncio.wait_for(self._pass(request), UPLOAD_URL_S)
+        except asyncio.TimeoutError:
+            return web.Response(status=408, text=f"a part must be here within {UPLOAD_URL_S} s\n")
+        finally:
+            self._passing -= Counter([address])
+
+    async def _pass(self, request: web.BaseRequest) -> web.StreamResponse:
         # The signature covers the Host that the robot sent, and path and query as they are.
         address = URL(f"{self._gateway}{request.raw_path}", encoded=True)
         headers = [(name, value) for name, value in request.headers.items() if _PASSED.fullmatch(name)]

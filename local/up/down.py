@@ -41,7 +41,10 @@ def stop(folder: Path) -> bool:
         return False
     # It may end by itself meanwhile.
     with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGTERM)
+        try:
+            os.kill(pid, signal.SIGTERM)
+        except PermissionError as error:
+            raise LocalError(f"process {pid} is another user's, who must stop it") from error
     deadline = time.monotonic() + _ENDS_S
     while owner(folder) is not None:
         if time.monotonic() > deadline:

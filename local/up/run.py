@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import resource
 import signal
 import sys
 import threading
@@ -55,6 +56,9 @@ def main() -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
+    # For sockets: whoever opens many must not take those of the robots. The emulator inherits it.
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     try:
         _Kept(options, stopped).run()
     except (LocalError, StationError) as error:
@@ -146,8 +150,15 @@ class _Kept:
             embedded.emulator.shorten_log(_MOST_LOG_BYTES)
             if time.monotonic() - renewed > _RENEW_S:
                 renewed = time.monotonic()
-                if embedded.renew():
-                    self._write(embedded, page)
+                self._renew(embedded, page)
+
+    def _renew(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
+        try:
+            if embedded.renew():
+                self._write(embedded, page)
+        except OSError as error:
+            # A month is left to try again; on a full disk the cloud must go on and refuse records.
+            _say(f"the certificates are renewed later: {error}")
 
     def _settings(self) -> dict[str, Any]:
         """The options, and what an earlier start remembers where they say nothing."""
@@ -189,7 +200,9 @@ class _Kept:
         robots = ".venv/bin/iort robots add car1"
         if state:
             robots = f"{EMBEDDED_VARIABLE}={embedded.folder / kept.CLOUD} {robots}"
-        told = [("kept in", str(embedded.folder)), ("page here", pages.here.invitation())]
+        # An invitation lets whoever is first drive: it is for a terminal, which nobody else reads.
+        here = pages.here.invitation() if sys.stdout.isatty() else pages.here.url
+        told = [("kept in", str(embedded.folder)), ("page here", here)]
         if pages.network is not None:
             how = f"the password of `make up-password{state}`"
             if pages.new_password:

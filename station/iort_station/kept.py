@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,7 +27,9 @@ def folder(environment: Mapping[str, str] = os.environ) -> Path:
 
 def lock_of(folder: Path) -> Path:
     """The file that an embedded cloud locks while it runs; it has its process id."""
-    return folder.parent / f"{folder.name}.lock"
+    # A link to the folder means the same cloud.
+    real = folder.resolve()
+    return real.parent / f"{real.name}.lock"
 
 
 def owner(folder: Path) -> int | None:
@@ -36,10 +39,27 @@ def owner(folder: Path) -> int | None:
             try:
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except OSError:
-                return int(lock.read())
+                pid = int(lock.read())
+                return pid if _has_open(pid, lock.fileno()) else None
     except (FileNotFoundError, ValueError):
         pass
     return None
+
+
+def _has_open(pid: int, file: int) -> bool:
+    """Whether a process has this file open; the number in it may be that of an earlier owner."""
+    ours = os.fstat(file)
+    with suppress(FileNotFoundError):
+        try:
+            opened = list(Path(f"/proc/{pid}/fd").iterdir())
+        except PermissionError:
+            # Another user's: nothing tells.
+            return True
+        for one in opened:
+            with suppress(FileNotFoundError):
+                if os.path.samestat(one.stat(), ours):
+                    return True
+    return not Path("/proc/self/fd").is_dir()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from typing import Any
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
-from local.gaps.parts.stream_mapping import Answer, Settings, Stream
+from local.gaps.parts.stream_mapping import Answer, Discarded, Settings, Stream
 from local.keeping.ledger import LedgerError
 from local.keeping.streams import Streams, position_of
 
@@ -65,6 +65,8 @@ class _Running:
     position: int
     marked: int | None
     busy: set[int] = field(default_factory=set)
+    # Discarded records whose destination has no message yet.
+    untold: list[Discarded] = field(default_factory=list)
     pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
     windows: dict[int, float] = field(default_factory=dict)
 
@@ -174,16 +176,24 @@ class StreamMappings:
         # No mark may pass records that are on their way to the destination.
         with self._telling:
             with self._lock:
-                discarded = running.stream.discarded()
+                running.untold += running.stream.discarded()
                 position = running.position
                 oldest = running.stream.oldest
             if oldest is not None:
                 position = position_of(oldest)
-            for one in discarded:
+            since = self._streams.ledger.undone
+            for one in running.untold:
                 _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
                 lambda_svc._send_ddb_stream_failure_record(
                     mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
                 )
+            if running.untold:
+                try:
+                    self._streams.ledger.commit(since)
+                except LedgerError as error:
+                    _log.warning("the destination of %s is told again: %s", mapping["UUID"], error)
+                    return
+                running.untold.clear()
             if position != running.marked:
                 # A full disk: the records are read again after a restart.
                 with suppress(LedgerError):

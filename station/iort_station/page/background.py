@@ -18,12 +18,23 @@ from typing_extensions import Self
 class BackgroundServer:
     """Calls `handle` for every request, from `start` to `stop` or within a ``with`` block.
 
-    ``port=0`` takes a free port. With ``tls`` it speaks HTTPS. ``options`` are those of `aiohttp.web.Server`.
+    ``port=0`` takes a free port. With ``tls`` it speaks HTTPS. A connection without a request is closed
+    after ``idle_s``, or up to twice that before its first one. ``options`` are those of `aiohttp.web.Server`.
     """
 
-    def __init__(self, host: str, port: int, *, tls: ssl.SSLContext | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        tls: ssl.SSLContext | None = None,
+        idle_s: float | None = None,
+        **options: Any,
+    ) -> None:
         self.host, self.port = host, port
-        self._tls, self._options = tls, options
+        self._tls, self._options, self._idle_s = tls, options, idle_s
+        if idle_s is not None:
+            self._options["keepalive_timeout"] = idle_s
         self._scheme = "http" if tls is None else "https"
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
@@ -68,14 +79,25 @@ class BackgroundServer:
         self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
         logger = logging.getLogger(f"aiohttp.server.{type(self).__name__}")
         logger.addFilter(_is_our_fault)
+        asked: set[Any] = set()
+
+        async def handle(request: web.BaseRequest) -> web.StreamResponse:
+            asked.add(request.protocol)
+            return await self.handle(request)
+
         server = web.Server(
-            self.handle, handler_cancellation=True, access_log=None, logger=logger, **self._options
+            handle, handler_cancellation=True, access_log=None, logger=logger, **self._options
         )
         runner = web.ServerRunner(server, shutdown_timeout=1)
         await runner.setup()
         await web.SockSite(runner, listening, ssl_context=self._tls).start()
         started.set()
+        closing = None
+        if self._idle_s is not None:
+            closing = asyncio.create_task(_close_silent(server, asked, self._idle_s))
         await self._stopping.wait()
+        if closing is not None:
+            closing.cancel()
         # Stop accepting before dropping connections: asyncio loses one that comes while it closes.
         self._loop.remove_reader(listening)
         await _drop_connections(server)
@@ -85,6 +107,19 @@ class BackgroundServer:
 def _is_our_fault(record: logging.LogRecord) -> bool:
     """Whether a fault is ours: aiohttp logs a traceback for malformed requests too, after its answer 400."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
+async def _close_silent(server: web.Server, asked: set[Any], idle_s: float) -> None:
+    """Close connections without a first request, for which aiohttp waits for ever."""
+    before: set[Any] = set()
+    while True:
+        await asyncio.sleep(idle_s)
+        now = set(server.connections)
+        asked &= now
+        for connection in (before & now) - asked:
+            if connection.transport is not None:
+                connection.transport.abort()
+        before = now
 
 
 async def _drop_connections(server: web.Server) -> None:

@@ -102,7 +102,7 @@ class PageServer(BackgroundServer):
         built: Path = BUILT,
         context: ssl.SSLContext | None = None,
     ) -> None:
-        super().__init__(host, port, tls=context, keepalive_timeout=IDLE_S)
+        super().__init__(host, port, tls=context, idle_s=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
         keyed, free = actions or {}, open_actions or {}
         self._actions = {f"/{name}.json": action for name, action in {**free, **keyed}.items()}

@@ -7,12 +7,15 @@ from __future__ import annotations
 import json
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc, sqs
 
 from local.gaps.functions.stream_retries import StreamMappings
+from local.keeping import queues
+from local.keeping.ledger import LedgerError
 from tests.local.gaps import series_table
 from tests.local.keeping.in_process import ACCOUNT, REGION, kept
 
@@ -48,6 +51,10 @@ def cloud(monkeypatch, streams):
             lambda_svc, "_get_func_record_for_qualifier", lambda *_: (function, function["config"])
         )
         yield Cloud(monkeypatch, streams)
+        # An invocation notes how far its mapping is after the function has answered.
+        for thread in threading.enumerate():
+            if thread.name.endswith("(_invoke)"):
+                thread.join(60)
         del lambda_svc._esms["gap-mapping"]
         dynamodb._delete_table({"TableName": "gap"})
         sqs._queues.clear()
@@ -56,6 +63,7 @@ def cloud(monkeypatch, streams):
 class Cloud:
     def __init__(self, monkeypatch, streams):
         self.streams, self.mappings, self.seen = streams, StreamMappings(streams), []
+        self.mapping = "gap-mapping", dynamodb._tables["gap"]["LatestStreamArn"]
         self.answer = lambda _numbers: {"body": None}
         self.running = self.most = 0
         self._lock = threading.Lock()
@@ -110,6 +118,29 @@ def test_only_the_failing_record_goes_to_the_destination(cloud):
     assert message["requestContext"]["condition"] == "RetryAttemptsExhausted"
     info = message["DDBStreamBatchInfo"]
     assert (info["batchSize"], info["startSequenceNumber"]) == (1, info["endSequenceNumber"])
+
+
+def test_a_destination_is_told_again_if_its_message_is_undone(cloud, monkeypatch):
+    monkeypatch.setattr(sqs, "_queues", sqs._queues)
+    ledger, send = cloud.streams.ledger, lambda_svc._send_ddb_stream_failure_record
+    queues.install(ledger)
+    sqs._act_create_queue({"QueueName": "gap-destination"}, "")
+    undone = []
+
+    def send_and_undo(*arguments):
+        send(*arguments)
+        if not undone:
+            undone.append(cloud.told)
+            with suppress(LedgerError), ledger.write() as connection:
+                connection.execute("INSERT INTO nowhere VALUES (1)")
+
+    monkeypatch.setattr(lambda_svc, "_send_ddb_stream_failure_record", send_and_undo)
+    cloud.answer = lambda numbers: {"error": 2 in numbers, "body": None}
+    cloud.put(*range(5))
+    ledger.commit()
+    cloud.poll_until(lambda: [4] in cloud.seen and cloud.streams.position(*cloud.mapping) == 5)
+    assert (len(undone[0]), len(cloud.told)) == (1, 1)
+    assert ledger.read_committed("SELECT count(*) FROM messages") == [(1,)]
 
 
 def test_a_partial_failure_is_retried_from_its_lowest_sequence_number(cloud):

@@ -238,3 +238,18 @@ def test_the_record_lane_leaves_room_on_the_disk(tmp_path):
     ledger.floor_bytes = 0
     ledger.check_room()
     ledger.close()
+
+
+def test_changes_are_pending_until_their_commit_is_over(ledger):
+    with closing(sqlite3.connect(ledger.path)) as other:
+        for n in range(20):
+            with ledger.write() as connection:
+                # It is written by the commit, which takes a while.
+                connection.execute("INSERT INTO n VALUES (?, ?)", (n, "x" * 1_500_000))
+            committing = threading.Thread(target=ledger.commit)
+            committing.start()
+            while ledger.pending:
+                pass
+            found = other.execute("SELECT count(*) FROM n").fetchone()
+            committing.join()
+            assert found == (n + 1,)

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import ssl
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import boto3
 import pytest
 from botocore.config import Config
 
+from iort_contract.messages.files import PART_BYTES
 from local.certificates import Authority, ServerCertificate
+from local.network import file_door
 from local.network.file_door import FileDoor
+from tests.local.conftest import until
 
 HOST = "127.0.0.2"
 BODY = b"content"
@@ -119,6 +124,49 @@ def test_nothing_else_passes(send, presigned, embedded, case):
         "inside": ("GET", f"/_ministack/health?{path.partition('?')[2]}", {}),
     }[case]
     assert send(method, target, **headers) == (403, "only presigned requests for files pass here\n")
+
+
+@pytest.mark.parametrize("length", ["none", str(PART_BYTES + 1)])
+def test_no_body_passes_that_is_larger_than_a_part_of_a_file(door, presigned, embedded, length):
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=30)
+    connection.putrequest("PUT", presigned())
+    told = ("Transfer-Encoding", "chunked") if length == "none" else ("Content-Length", length)
+    connection.putheader(*told)
+    connection.endheaders()
+    assert connection.getresponse().status == 413
+    connection.close()
+
+
+def test_one_address_cannot_take_every_place(door, presigned, embedded, send):
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    with ExitStack() as stack:
+        for _ in range(file_door._MOST_OF_ONE):
+            raw = stack.enter_context(socket.create_connection((HOST, door.port), timeout=30))
+            slow = stack.enter_context(trusts.wrap_socket(raw, server_hostname=HOST))
+            head = f"PUT {presigned()} HTTP/1.1\r\nHost: {HOST}:{door.port}\r\nContent-Length: 9\r\n\r\n"
+            slow.sendall(head.encode())
+        until(lambda: door._passing.total() == file_door._MOST_OF_ONE)
+        assert send("PUT", presigned())[0] == 503
+    until(lambda: send("PUT", presigned())[0] == 200)
+
+
+def test_a_connection_that_never_asks_is_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr(file_door, "_IDLE_S", 0.2)
+    authority = Authority()
+    certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
+    certificate.renew()
+    authority.write_own(tmp_path / "ca.pem")
+    trusts = ssl.create_default_context(cafile=tmp_path / "ca.pem")
+    given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
+    with (
+        FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door,
+        socket.create_connection((HOST, door.port), timeout=10) as raw,
+        trusts.wrap_socket(raw, server_hostname=HOST) as silent,
+    ):
+        silent.sendall(b"GET /files/")
+        with suppress(ConnectionResetError, ssl.SSLEOFError):
+            assert silent.recv(1) == b""
 
 
 def test_the_door_takes_over_a_renewed_certificate(tmp_path):

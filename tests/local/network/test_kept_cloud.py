@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import re
 import socket
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -73,6 +76,42 @@ def test_down_knows_whether_a_cloud_is_up(tmp_path):
         StateFolder(tmp_path / "cloud", kept=True).take(stack)
         assert owner(tmp_path / "cloud")
     assert owner(tmp_path / "cloud") is None
+
+
+def test_a_link_to_the_folder_is_the_same_cloud(state):
+    link = state.path.with_name("link")
+    link.symlink_to(state.path)
+    with ExitStack() as stack, pytest.raises(LocalError, match="already running"):
+        StateFolder(link, kept=True).take(stack)
+
+
+def test_down_never_ends_a_process_that_only_has_the_number_of_an_earlier_cloud(tmp_path):
+    stranger = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    with stranger, kept.lock_of(tmp_path / "cloud").open("a+") as lock:
+        # As between the lock of a new cloud and its own number.
+        lock.write(str(stranger.pid))
+        lock.flush()
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert not stop(tmp_path / "cloud")
+        stranger.communicate(b"\n")
+    assert stranger.returncode == 0
+
+
+def test_nobody_else_can_lock_the_folder(state):
+    assert kept.lock_of(state.path).stat().st_mode & 0o777 == 0o600
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_that_says_so(tmp_path):
+    (tmp_path / "file").touch()
+    with ExitStack() as stack, pytest.raises(LocalError, match="must be able to write"):
+        StateFolder(tmp_path / "file" / "cloud", kept=True).take(stack)
+
+
+def test_a_port_is_free_on_each_of_its_addresses(state):
+    with socket.create_server(("127.0.0.2", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(LocalError, match="is in use"):
+            state.port("mqtt", "127.0.0.1", "127.0.0.2", wanted=port)
 
 
 @pytest.mark.parametrize("text", ["", "iort.lab", "0.0.0.0", "::", "192.0.2.1/24", "192.0.2.1,no name"])

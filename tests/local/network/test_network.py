@@ -151,6 +151,11 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         assert sent.wait(60.0) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car1")
         check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
+        # A car of the cloud's own machine that was registered before LISTEN.
+        config = bundle / "car.yaml"
+        (bundle / "here.yaml").write_text(config.read_text().replace(address, "127.0.0.1"))
+        here = laboratory.cloud.run(*check[:-1], str(bundle / "here.yaml"))
+        assert "rules: answer a ping" in here
         way = laboratory.car.run(*check)
         assert f"route: from {laboratory.car.address} to {address}" in way
         assert "rules: answer a ping" in way
