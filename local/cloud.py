@@ -120,7 +120,7 @@ class EmbeddedCloud:
         # Only this machine reaches the gateway, and it reads its certificate once.
         certificate, key = self.authority.write(self.folder, "gateway", self.host)
         robots = self.listen.hosts if self.listen else ()
-        broker = self.certificate("broker", tuple(dict.fromkeys([*robots, self.host])))
+        broker = self.certificate("broker", tuple(dict.fromkeys([*robots, self.host, "localhost"])))
         self.cloud = Cloud(
             namespace=self.namespace,
             region=_REGION,
