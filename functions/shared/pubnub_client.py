@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from typing import Any
 from urllib.parse import quote
 
@@ -23,6 +24,8 @@ for _logger in ("httpx", "httpcore", "urllib3", "pubnub"):
     logging.getLogger(_logger).setLevel(logging.WARNING)
 # A live sample is stale after 2 s; a longer wait for PubNub only delays the next one.
 _TIMEOUT_S = 1
+# Lambda freezes an idle environment, which does not see that PubNub or a router ends its connection.
+_IDLE_S = 5
 
 
 class PublishError(Exception):
@@ -33,11 +36,14 @@ class _Requests(BaseRequestHandler):  # type: ignore[misc]  # the SDK has no typ
     """The SDK's requests over urllib3, which takes a quarter of httpx' processor time; publishing only."""
 
     def __init__(self, pubnub: PubNub) -> None:
+        self._origin = f"{pubnub.config.scheme()}://{pubnub.config.origin}"
+        self._pool = self._connections()
+        self._used_s = 0.0
+
+    def _connections(self) -> urllib3.HTTPConnectionPool:
         # A failed publish is not repeated: the next sample is newer.
-        self._pool = urllib3.connection_from_url(
-            f"{pubnub.config.scheme()}://{pubnub.config.origin}",
-            timeout=urllib3.Timeout(connect=_TIMEOUT_S, read=_TIMEOUT_S),
-            retries=False,
+        return urllib3.connection_from_url(
+            self._origin, timeout=urllib3.Timeout(connect=_TIMEOUT_S, read=_TIMEOUT_S), retries=False
         )
 
     def sync_request(
@@ -45,6 +51,10 @@ class _Requests(BaseRequestHandler):  # type: ignore[misc]  # the SDK has no typ
     ) -> Envelope:
         """Send a request and return the answer, or raise PubNub's exception."""
         asked = endpoint_call_options
+        # The monotonic clock may stand still in a frozen environment.
+        if not 0 <= time.time() - self._used_s < _IDLE_S:
+            self.close()
+            self._pool = self._connections()
         try:
             answer = self._pool.request(
                 asked.method_string,
@@ -57,6 +67,7 @@ class _Requests(BaseRequestHandler):  # type: ignore[misc]  # the SDK has no typ
             raise PubNubException(errormsg=type(error).__name__) from error
         if found is None:
             raise PubNubException(errormsg="refused", status_code=answer.status)
+        self._used_s = time.time()
         status = asked.create_status(PNStatusCategory.PNAcknowledgmentCategory, found, None, None)
         return Envelope(asked.create_response(found), status)
 

@@ -7,6 +7,7 @@ import json
 import logging
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -123,10 +124,17 @@ def test_a_publish_to_a_silent_server_times_out(publisher):
 
 @contextmanager
 def answering(status: int, body: bytes) -> Iterator[str]:
-    """A server other than PubNub: a proxy's login page, a gateway's error."""
+    """A server other than PubNub: a proxy's login page, a gateway's error. It answers once a connection."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        answered = False
+
         def do_POST(self):
+            if self.answered:
+                self.close_connection = True
+                return
+            self.answered = True
             self.rfile.read(int(self.headers["Content-Length"]))
             self.send_response(status)
             self.send_header("Content-Length", str(len(body)))
@@ -160,3 +168,12 @@ def answering(status: int, body: bytes) -> Iterator[str]:
 def test_an_answer_without_confirmation_raises_a_publish_error(publisher, status, body):
     with answering(status, body) as origin:
         refused(publisher(origin))
+
+
+def test_a_publish_after_a_pause_uses_no_connection_that_may_have_ended(publisher, monkeypatch):
+    with answering(200, b'[1,"Sent","17000000000000000"]') as origin:
+        one = publisher(origin)
+        one.publish("iort.car", MESSAGE)
+        now_s = time.time()
+        monkeypatch.setattr(time, "time", lambda: now_s + 10)
+        one.publish("iort.car", MESSAGE)
