@@ -42,10 +42,9 @@ class Events(Protocol):
         function_arn: str,
         event: Any,
         *,
-        age_s: float = 0.0,
         done: Callable[[], object] = ...,
     ) -> None:
-        """Queue one event of this age, and call ``done`` when it needs no more attempts."""
+        """Queue one event, and call ``done`` when it needs no more attempts."""
 
 
 class Invocations:
@@ -84,10 +83,11 @@ class Invocations:
     def go_on(self) -> None:
         """Queue again what was waiting, or running, when the emulator ended."""
         rows = self._ledger.read("SELECT * FROM invocations ORDER BY number")
-        for number, account, region, function, event, queued_s in rows:
-            age_s, done = time.time() - queued_s, partial(self._remove, number)
+        for number, account, region, function, event, _ in rows:
+            done = partial(self._remove, number)
             try:
-                self._events.queue(account, region, function, json.loads(event), age_s=age_s, done=done)
+                # Its age begins anew: it could not run while the emulator was off.
+                self._events.queue(account, region, function, json.loads(event), done=done)
             except LookupError as error:
                 _log.warning("an event is given up: %s", error)
                 done()

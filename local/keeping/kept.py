@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from functools import wraps
+
 from ministack import app
+from ministack.services import dynamodb
 
 from local.keeping import objects, queues
 from local.keeping.invocations import Events, Invocations
 from local.keeping.ledger import Ledger
 from local.keeping.services.keeper import Services
+
+# As long as the archive takes for what became due while the machine was off; its plan comes every hour.
+FIRST_S = 2 * 3600.0
 
 
 def install(ledger: Ledger, events: Events) -> None:
@@ -17,6 +25,7 @@ def install(ledger: Ledger, events: Events) -> None:
     services, invocations = Services(ledger), Invocations(ledger, events)
     services.install()
     invocations.install()
+    dynamodb._expire_items = not_at_first(dynamodb._expire_items)
     ready = app._run_ready_scripts
 
     async def go_on() -> None:
@@ -27,3 +36,16 @@ def install(ledger: Ledger, events: Events) -> None:
         services.go_on()
 
     app._run_ready_scripts = go_on
+
+
+def not_at_first(expire: Callable[[float], None]) -> Callable[[float], None]:
+    """Let items expire, but not soon after the start: the machine may have been off for months, and its clock
+    may be wrong still. AWS takes days, too."""
+    began_s = time.time()
+
+    @wraps(expire)
+    def expire_later(now_s: float) -> None:
+        if not 0 <= now_s - began_s < FIRST_S:
+            expire(now_s)
+
+    return expire_later

@@ -84,7 +84,9 @@ class _Files:
             raise
         for path, temporary in unfinished.items():
             temporary.rename(path)
-        for folder in {path.parent for path in contents}:
+        # A new folder is in the one above it.
+        root = Path(s3.DATA_DIR)
+        for folder in {above for path in contents for above in path.parents if above.is_relative_to(root)}:
             self._sync(folder)
 
     def _sync(self, path: Path) -> None:

@@ -28,7 +28,7 @@ _POLICY = (
     f"default-src 'none'; style-src 'sha256-{base64.b64encode(_STYLE).decode()}'; form-action 'self'; "
     "base-uri 'none'; frame-ancestors 'none'"
 )
-_MOST_BYTES = 8 * 1024
+_MOST_BYTES, _FORM_S = 8 * 1024, 10.0
 
 
 class NetworkPage(PageServer):
@@ -104,11 +104,15 @@ class NetworkPage(PageServer):
     async def _log_in(self, request: web.BaseRequest) -> web.Response:
         if not self._own(request):
             return self._form("A login needs this page's own form.", 403)
-        if (request.content_length or 0) > _MOST_BYTES:
+        length = request.content_length
+        if length is None or length > _MOST_BYTES:
             return self._form("This is no password.", 413)
-        told = parse_qs((await request.content.read(_MOST_BYTES)).decode(errors="replace")).get(
-            "password", [""]
-        )[0]
+        try:
+            # It may come in pieces, and must not come for ever.
+            body = await asyncio.wait_for(request.content.readexactly(length), _FORM_S)
+        except (asyncio.TimeoutError, asyncio.IncompleteReadError):
+            return self._form("The password has not arrived.", 408)
+        told = parse_qs(body.decode(errors="replace")).get("password", [""])[0]
         async with self._checking:
             wait_s = self._tries.wait_s(request.remote or "")
             if wait_s:

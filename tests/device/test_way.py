@@ -149,8 +149,14 @@ REFUSES = b"\x20\x03\x00\x87\x00"
         ),
         (with_tls(GOOD), "broker", "hangs up on car7", "`iort robots list`"),
         (with_tls(GOOD, REFUSES), "broker", "refuses car7: not authorized", "thing car7"),
+        # An older broker refuses the version in two bytes.
+        (with_tls(GOOD, b"\x20\x02\x00\x01"), "broker", "not in MQTT 5", "is `port` right"),
+        (with_tls(GOOD, b"\x20" + b"\xff" * 9), "broker", "not in MQTT 5", "is `port` right"),
     ],
-    ids=["http", "silent", "hung-up", "authority", "name", "ended", "early", "certificate", "refused"],
+    ids=[
+        *("http", "silent", "hung-up", "authority", "name", "ended", "early"),
+        *("certificate", "refused", "mqtt-3", "no-mqtt"),
+    ],
 )
 def test_what_the_server_does_wrong_is_named_with_a_remedy(
     tmp_path: Path, answer: Callable[..., object], what: str, text: str, todo: str

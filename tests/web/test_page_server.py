@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import gc
 import gzip
 import http.client
 import json
 import socket
 import threading
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from aiohttp import web
+from aiohttp.web_protocol import RequestHandler
 
 from iort_station.errors import StationError
+from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer, on_loopback
 
@@ -463,3 +467,22 @@ def test_the_pubnub_sdk_is_served_unmodified_with_its_licence() -> None:
     published = (modules / "dist" / "web" / "pubnub.min.js").read_bytes()
     assert (BUILT / "pubnub.min.js").read_bytes() == published
     assert (modules / "LICENSE").read_text().strip() in (BUILT / "licences.txt").read_text()
+
+
+def test_a_server_forgets_connections_that_have_ended() -> None:
+    class Plain(BackgroundServer):
+        async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+            return web.Response()
+
+    def connections() -> int:
+        gc.collect()
+        return sum(isinstance(one, RequestHandler) for one in gc.get_objects())
+
+    with Plain("127.0.0.1", 0) as server:
+        before = connections()
+        for _ in range(20):
+            connection = http.client.HTTPConnection("127.0.0.1", server.port)
+            with closing(connection):
+                connection.request("GET", "/", headers={"Connection": "close"})
+                connection.getresponse().read()
+        assert connections() - before < 10

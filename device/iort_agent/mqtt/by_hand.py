@@ -14,6 +14,8 @@ _KEEP_ALIVE_S = 30
 _CLEAN_START = 2
 # Reason codes from here on are refusals.
 _FIRST_REFUSAL = 0x80
+# Of a packet's length, in MQTT 5; and of an answer's body, which ends with its properties or its codes.
+_MOST_LENGTH_BYTES, _LEAST_BYTES = 4, 3
 # The codes that a robot may get.
 _REASONS = {
     0x80: "unspecified error",
@@ -28,6 +30,10 @@ _REASONS = {
 
 class RefusalError(Exception):
     """The broker has answered, and its answer is no."""
+
+
+class ForeignError(OSError):
+    """The other side speaks something else than MQTT 5."""
 
 
 class Session:
@@ -96,8 +102,12 @@ class Session:
             length = b""
             while not length or length[-1] & 128:
                 length += self._read(1)
+                if len(length) > _MOST_LENGTH_BYTES:
+                    raise ForeignError
             body = self._read(_varint(length, 0)[0])
             if first == kind:
+                if len(body) < _LEAST_BYTES:
+                    raise ForeignError
                 return body
             if first == DISCONNECT:
                 self._accepted(body[0] if body else 0)

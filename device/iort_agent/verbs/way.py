@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from iort_agent.common.state import Status
 from iort_agent.config import Config
 from iort_agent.files.http import trusting
-from iort_agent.mqtt.by_hand import RefusalError, Session
+from iort_agent.mqtt.by_hand import ForeignError, RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, no_tls, refused_ours, secured, utc
 from iort_contract.limits import ContractError
@@ -229,6 +229,9 @@ def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
     refused = refused_ours(config, str(getattr(error, "reason", None) or error))
     if refused is not None:
         return refused
+    if isinstance(error, ForeignError):
+        text = "answers, but not in MQTT 5"
+        return text, "is `port` right? The cloud's broker speaks MQTT 5, older ones do not"
     if isinstance(error, socket.timeout):
         text = f"gives {config.robot} no answer in {TIMEOUT_S:g} s"
         return text, "the cloud hangs, or something between holds the bytes back: `iort doctor` at the cloud"

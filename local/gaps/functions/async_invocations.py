@@ -76,10 +76,9 @@ class AsyncInvocations:
         function_arn: str,
         event: Any,
         *,
-        age_s: float = 0.0,
         done: Callable[[], object] = lambda: None,
     ) -> None:
-        """As `dispatch`, for an event of some age; ``done`` is called when it needs no more attempt."""
+        """As `dispatch`; ``done`` is called when the event needs no more attempt."""
         function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(
             function_arn, account_id=account, region=region
         )
@@ -92,7 +91,7 @@ class AsyncInvocations:
             cores = os.cpu_count() or 1
             pool = Turns(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        queued_s = time.monotonic() - age_s
+        queued_s = time.monotonic()
 
         def run() -> None:
             invoke(account, region, record, event, queued_s)

@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ministack.core.responses import request_scope
@@ -75,7 +75,7 @@ class StreamMappings:
     """All stream mappings; `poll` replaces ministack's own poller."""
 
     def __init__(self, streams: Streams, clock: Callable[[], float] = time.time) -> None:
-        self._streams, self._clock = streams, clock
+        self._streams, self._clock, self._began_s = streams, clock, clock()
         self._running: dict[str, _Running] = {}
         self._lock = threading.Lock()
         self._telling = threading.Lock()
@@ -119,7 +119,8 @@ class StreamMappings:
 
     def _of(self, account: str, region: str, mapping: dict[str, Any], table: str) -> _Running:
         running = self._running.get(mapping["UUID"])
-        settings, partition = Settings.of(mapping), dynamodb._tables[table]["pk_name"]
+        settings = replace(Settings.of(mapping), began_s=self._began_s)
+        partition = dynamodb._tables[table]["pk_name"]
         if running is None:
             latest = mapping.get("StartingPosition") == "LATEST"
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)

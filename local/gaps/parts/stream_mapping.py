@@ -37,6 +37,8 @@ class Settings:
     bisect: bool = False
     max_retries: int = _FOREVER
     max_age_s: int = _FOREVER
+    # Records do not age while the emulator is off.
+    began_s: float = 0.0
     report_failures: bool = False
     parallel: int = 1
     halve_at_checkpoint: bool = False
@@ -207,21 +209,21 @@ class Lane:
         if limit_s == _FOREVER:
             return
         for part in list(self._parts):
-            old = [record for record in part.records if _age_s(record, now_s) > limit_s]
+            old = [record for record in part.records if self._age_s(record, now_s) > limit_s]
             if old:
                 self.discarded.append(Discarded(Condition.AGE, old, part.failures))
-                part.records = [record for record in part.records if _age_s(record, now_s) <= limit_s]
+                part.records = [record for record in part.records if self._age_s(record, now_s) <= limit_s]
                 if not part.records:
                     self._parts.remove(part)
         old = []
-        while self._waiting and _age_s(self._waiting[0][0], now_s) > limit_s:
+        while self._waiting and self._age_s(self._waiting[0][0], now_s) > limit_s:
             old.append(self._taken())
         if old:
             self.discarded.append(Discarded(Condition.AGE, old, 0))
 
-
-def _age_s(record: Record, now_s: float) -> float:
-    return now_s - float(record["dynamodb"].get("ApproximateCreationDateTime", now_s))
+    def _age_s(self, record: Record, now_s: float) -> float:
+        made_s = float(record["dynamodb"].get("ApproximateCreationDateTime", now_s))
+        return now_s - max(made_s, self.settings.began_s)
 
 
 class Shard:

@@ -58,10 +58,12 @@ def _nobody(_batches: int) -> None:
 
 
 class Copied(NamedTuple):
-    """What was copied of a stream; the rest was there already."""
+    """What was copied of a stream; the rest was there already. Hours are ``left`` whose object would replace
+    another one, with hours of the target's own."""
 
     hours: int
     batches: int
+    left: int
 
 
 class Side(NamedTuple):
@@ -92,13 +94,20 @@ class Compared:
 
 def check(source: Cloud, target: Cloud) -> None:
     """Raise `StationError` unless robots can be moved between these deployments."""
-    if source == target or (source.endpoint_url is not None and source.endpoint_url == target.endpoint_url):
-        raise StationError("the target is the source itself")
     if source.namespace != target.namespace:
         raise StationError(
             f"both deployments must have one namespace, got {source.namespace} and {target.namespace}: "
             "it is part of every topic"
         )
+    if _place(source) == _place(target):
+        raise StationError("the target is the source itself")
+
+
+def _place(cloud: Cloud) -> tuple[str, ...]:
+    """Where a deployment is. Two profiles may be of one account."""
+    if cloud.endpoint_url is not None:
+        return (cloud.endpoint_url,)
+    return cloud.client("sts").get_caller_identity()["Account"], cloud.region_name or ""
 
 
 def register(source: Cloud, target: Cloud, robot: str, bundles: Path | None = None) -> bool:
@@ -139,18 +148,24 @@ def _carried(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def copy_findings(source: Cloud, target: Cloud, robot: str) -> int:
-    """Copy a robot's findings, analysed drives and notes, each under its id; returns how many."""
+    """Copy the findings, analysed drives and notes of a robot that the target lacks; returns how many."""
     old, new = findings.table(source), findings.table(target)
+    # The target may have analysed a drive again, with all of its batches.
+    analysed, there = ({one.drive for one in new.drives(robot)}, {note.id for note in new.notes(robot)})
     count = 0
     for finding in old.findings(robot):
-        new.put_finding(finding)
-        count += 1
+        if finding.drive not in analysed:
+            new.put_finding(finding)
+            count += 1
+    # After its findings: a move that ends between them goes on.
     for drive in old.drives(robot):
-        new.put_drive(drive)
-        count += 1
+        if drive.drive not in analysed:
+            new.put_drive(drive)
+            count += 1
     for note in old.notes(robot):
-        new.put_note(note)
-        count += 1
+        if note.id not in there:
+            new.put_note(note)
+            count += 1
     return count
 
 
@@ -169,7 +184,7 @@ def copy(
     a write. What was copied until then is good.
     """
     topic = topic_of(source, robot, stream)
-    hours = _copy_archive(source, target, topic)
+    hours, left = _copy_archive(source, target, topic)
     table, batches = telemetry_table(target), 0
     for items in ahead(page.items for page in telemetry_table(source).pages(topic)):
         new = list(_lacking(target, topic, items))
@@ -177,7 +192,7 @@ def copy(
             write(table, new[start : start + WRITE_ITEMS], units_per_s)
         batches += len(new)
         progress(len(items))
-    return Copied(hours, batches)
+    return Copied(hours, batches, left)
 
 
 def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]:
@@ -193,23 +208,29 @@ def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]
             yield item
 
 
-def _copy_archive(source: Cloud, target: Cloud, topic: str) -> int:
-    """Copy the hours of the archive that the target lacks; the manifest's row comes last."""
+def _copy_archive(source: Cloud, target: Cloud, topic: str) -> tuple[int, int]:
+    """Copy the hours of the archive that the target lacks; the manifest's row comes last. Returns how many,
+    and how many are left."""
     # An hour that both have is made by each from its own table; `compare` tells if one lacks something.
-    there = {row.hour for row in Archive(target, topic).rows()}
-    copied, objects = 0, _Objects(source, target)
+    rows = list(Archive(target, topic).rows())
+    there, objects = {row.hour for row in rows}, {row.key: row.sha256 for row in rows}
+    copied = left = 0
+    copies = _Objects(source, target)
     for row in Archive(source, topic).rows():
         if row.hour in there:
             continue
+        if row.key and objects.get(row.key, row.sha256) != row.sha256:
+            left += 1
+            continue
         if row.key:
-            objects.copy(row.key, row.sha256)
+            copies.copy(row.key, row.sha256)
         if row.refused:
-            objects.copy(refused_key(parse_topic(topic), parse_hour(row.hour)))
+            copies.copy(refused_key(parse_topic(topic), parse_hour(row.hour)))
         target.client("dynamodb").put_item(
             TableName=target.output("storage", "ArchiveTable"), Item=row.item()
         )
         copied += 1
-    return copied
+    return copied, left
 
 
 class _Objects:

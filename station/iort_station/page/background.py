@@ -82,7 +82,8 @@ class BackgroundServer:
         asked: set[Any] = set()
 
         async def handle(request: web.BaseRequest) -> web.StreamResponse:
-            asked.add(request.protocol)
+            if self._idle_s is not None:
+                asked.add(request.protocol)
             return await self.handle(request)
 
         server = web.Server(

@@ -204,6 +204,15 @@ def test_a_mapping_goes_on_after_a_restart_with_what_it_had_not_finished(cloud):
     assert cloud.seen == [[6, 7]]
 
 
+def test_records_do_not_age_while_the_emulator_is_off(cloud):
+    lambda_svc._esms["gap-mapping"]["MaximumRecordAgeInSeconds"] = 60
+    cloud.put(0)
+    now = time.time() + 3600
+    cloud.mappings = StreamMappings(cloud.streams, lambda: now)
+    cloud.poll_until(lambda: cloud.seen)
+    assert (cloud.seen, cloud.told) == ([[0]], [])
+
+
 def test_a_new_mapping_of_the_latest_records_misses_none_in_a_restart(cloud):
     lambda_svc._esms["gap-mapping"]["StartingPosition"] = "LATEST"
     cloud.put(0)

@@ -14,7 +14,7 @@ class Events:
     def __init__(self):
         self.done = {}
 
-    def queue(self, _account, _region, _function, event, *, done, age_s=0.0):
+    def queue(self, _account, _region, _function, event, *, done):
         self.done[event] = done
 
 

@@ -13,6 +13,7 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc
 
 from local.keeping import items
+from local.keeping import kept as kept_emulator
 from local.keeping.ledger import LedgerError
 from local.keeping.places import place_of
 from tests.local.gaps import series_table
@@ -178,6 +179,17 @@ def test_items_expire_by_an_index(streams):
     put(6, ends={"N": "1"})
     dynamodb._expire_items(10**10)
     assert numbers() == [3, 4, 6]
+
+
+def test_nothing_expires_soon_after_a_start(monkeypatch):
+    began_s, passes = 1e9, []
+    monkeypatch.setattr(kept_emulator.time, "time", lambda: began_s)
+    expire = kept_emulator.not_at_first(passes.append)
+    # The last one is after a clock that was ahead at the start.
+    times = [began_s, began_s + kept_emulator.FIRST_S - 1, began_s + kept_emulator.FIRST_S, began_s - 1]
+    for now_s in times:
+        expire(now_s)
+    assert passes == times[2:]
 
 
 def test_many_items_expire_a_few_at_a_time(streams, monkeypatch):

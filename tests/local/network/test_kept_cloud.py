@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import re
 import socket
 import subprocess
@@ -20,6 +21,7 @@ from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.network.listen import Listen
+from local.processes import Child
 from local.state import StateFolder
 from local.up import service
 from local.up.down import stop
@@ -181,3 +183,14 @@ def test_the_unit_starts_this_checkout_with_the_options(of_machine):
         "multi-user" if of_machine else "default"
     )
     assert Path(re.search(r'ExecStart="([^"]+)"', text)[1]).exists()
+
+
+def test_a_full_disk_shortens_a_log_all_the_same(tmp_path):
+    log = tmp_path / "log"
+    child = Child("child", ["true"], environment=os.environ, cwd=tmp_path, log=log)
+    child.wait()
+    log.write_bytes(b"x" * 100)
+    # As little as a full disk can it be written.
+    (tmp_path / "log.1").mkdir()
+    child.shorten_log(50)
+    assert log.read_bytes() == b""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import ssl
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from argon2 import PasswordHasher
 from iort_contract.cloud import IOT
 from local.certificates import ServerCertificate
 from local.network.listen import Listen
+from local.up import network_page
 from local.up.login import TRIES, Password
 from local.up.network_page import COOKIE, SOCKET, NetworkPage
 from local.up.pages import shown
@@ -120,6 +122,29 @@ def test_guesses_come_to_an_end(ask, log_in):
     answer, body = log_in()
     assert (answer.status, "Try again in" in body) == (429, True)
     assert 0 < int(answer.headers["Retry-After"]) <= 30
+
+
+def test_a_password_may_come_in_pieces_but_not_for_ever(page, embedded, monkeypatch):
+    monkeypatch.setattr(network_page, "_FORM_S", 1.0)
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    body = f"password={RIGHT.replace(' ', '+')}".encode()
+
+    def post(*parts: bytes) -> int:
+        connection = http.client.HTTPSConnection(ADDRESS.host, page.port, context=trusts, timeout=30)
+        connection.putrequest("POST", "/login")
+        connection.putheader("Origin", page.url.rstrip("/"))
+        connection.putheader("Content-Length", str(len(body)))
+        connection.endheaders()
+        for part in parts:
+            # The server has read what came before.
+            time.sleep(0.1)
+            connection.send(part)
+        status = connection.getresponse().status
+        connection.close()
+        return status
+
+    assert post(body[:15], body[15:]) == 303
+    assert post(body[:15]) == 408
 
 
 def test_a_browser_logs_in_listens_and_may_drive(page, open_page):

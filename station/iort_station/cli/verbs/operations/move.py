@@ -61,6 +61,9 @@ def move_(
     target = _target(source, to, to_profile, to_region)
     move.check(source, target)
     chosen = sorted({registry.checked(name) for name in names or ()}) or sorted(registry.presence(source))
+    for robot in names or ():
+        # A robot that was removed has samples, and no row.
+        inventory.check_recorded(source, robot)
     told: list[dict[str, Any]] = []
     registered = findings = 0
     if not dry_run:
@@ -115,6 +118,7 @@ def _as_json(robot: str, stream: str, copied: Copied | None, found: Compared) ->
         "stream": stream,
         "copied_batches": copied.batches if copied is not None else 0,
         "copied_hours": copied.hours if copied is not None else 0,
+        "left_hours": copied.left if copied is not None else 0,
         "batches": found.source.batches,
         "samples": sum(run.samples for run in audit.runs),
         "missing": audit.missing,
@@ -128,6 +132,8 @@ def _show(one: dict[str, Any]) -> None:
     copied = f"copied {one['copied_batches']:,} batches, {one['copied_hours']:,} archived hours"
     text = f"{one['robot']} {one['stream']}: {has}; {copied}; "
     problem = one["problem"]
+    if one["left_hours"]:
+        problem += f"; {one['left_hours']:,} hours are left: the target has another object of their day"
     out.print(
         text + (problem or f"the same, {one['content'][:12]}"),
         style="red" if problem else None,
