@@ -1,6 +1,6 @@
 """The broker's certificate is the operator's, and is renewed while it runs.
 
-AWS: serves a certificate of one's own for a custom domain, which the operator renews
+AWS: does not apply; its endpoint has AWS' own certificate. One for a custom domain the operator renews
   (https://docs.aws.amazon.com/iot/latest/developerguide/iot-custom-endpoints-configurable-custom.html).
 ministack: issues one by itself for loopback and one name, good for 825 days, and reads it once.
 Test: tests/local/gaps/test_listener_gap.py::test_the_broker_takes_over_a_renewed_certificate

@@ -1,6 +1,6 @@
 """The number of logs that are kept.
 
-AWS: keeps a log group's events for its retention, on disks
+AWS: does not apply; it keeps a log group's events on disks
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/logs/Working-with-log-groups-and-streams.html).
 ministack: keeps a log stream for each invocation in memory, for ever. Here a group keeps its newest ones, and
   as many of those that have a warning or an error.

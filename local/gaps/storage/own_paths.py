@@ -1,6 +1,6 @@
 """The addresses of ministack itself.
 
-AWS: has none; every request is signed
+AWS: does not apply; it has none, and every request is signed
   (https://docs.aws.amazon.com/IAM/latest/UserGuide/reference_sigv.html).
 ministack: answers unsigned requests below /_ministack/. One erases everything, others show the messages of
   queues and the code of functions, or change settings, whoever on this machine asks.

@@ -25,6 +25,9 @@ from verify.errors import VerifyError
 from verify.question import WITH_KEY, Question, Verdict, ask
 from verify.questions import ALL, live
 
+# PubNub's SDK may leave the socket of a long poll to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed <socket.socket:ResourceWarning")
+
 RULES = tuple(one for one in ALL if one.subject == "rules")
 
 
