@@ -6,6 +6,7 @@ again it writes the same.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -55,6 +56,7 @@ def row(result: DriveResult, job: str) -> AnalysedDrive:
         estimates=mined.estimates,
         missing=_in_a_row(mined.missing),
         repairs=result.repairs,
+        analysed_us=time.time_ns() // 1000,
     )
 
 

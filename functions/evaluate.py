@@ -39,8 +39,8 @@ class Drives:
         self._newest = cache(self._read)
         self._plan = cache(self._read_plan)
 
-    def of_run(self, job: str, robot: str) -> list[DriveResult]:
-        """The results that a run of the analysis has made of a robot's drives."""
+    def of_run(self, job: str, robot: str, began_us: int) -> list[DriveResult]:
+        """The results of a robot's drives in a run of the analysis that began then."""
         plan = self._plan(job, robot)
         if not plan:
             return []
@@ -48,7 +48,13 @@ class Drives:
         last_us = max(one.drive.start_us for one in plan)
         rows = self._table.drives(robot, first_us, last_us + 1)
         # A drive that failed has no row of this run, and perhaps an older result.
-        made = [one.drive for one in rows if one.job == job]
+        # Another run at the same time may have replaced the row of this one.
+        planned = {one.drive for one in plan}
+        made = [
+            one.drive
+            for one in rows
+            if one.job == job or (one.drive in planned and one.analysed_us >= began_us)
+        ]
         found = [self._kept.json(f"{drive_prefix(drive)}result.json") for drive in made]
         return [decode_result(content) for content in found if content is not None]
 
@@ -110,9 +116,11 @@ class Drives:
         return tuple(_measured(one) for one in self._table.drives(robot, end_us=self._end_us, most=_OTHERS))
 
 
-def evaluated(drives: Drives, job: str, robot: str) -> tuple[dict[DriveKey, list[Finding]], list[DriveKey]]:
+def evaluated(
+    drives: Drives, job: str, robot: str, began_us: int
+) -> tuple[dict[DriveKey, list[Finding]], list[DriveKey]]:
     """The findings about each of a robot's drives in a run, and the earlier drives that these replace."""
-    results = drives.of_run(job, robot)
+    results = drives.of_run(job, robot, began_us)
     if not results:
         return {}, []
     replaced = drives.replaced(job, robot, results)
@@ -137,7 +145,7 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     )
     job, made, gone = event["job"], [], []
     for robot in event["robots"]:
-        found, replaced = evaluated(drives, job, robot)
+        found, replaced = evaluated(drives, job, robot, event["began_us"])
         made += [
             {"drive": vars(drive), "findings": [encode_finding(one) for one in some]}
             for drive, some in chain(found.items(), drives.lost(job, robot, found.keys()))

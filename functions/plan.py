@@ -45,10 +45,10 @@ _END_US = 2**53
 _BEFORE_US = tuple(seconds * 1_000_000 for seconds in (120, 1_800, 28_800))
 
 
-def selected(request: AnalysisRequest, recordings: Recordings, job: str) -> dict[str, Any]:
+def selected(request: AnalysisRequest, recordings: Recordings, job: str, began_us: int) -> dict[str, Any]:
     """The run with the names of its robots."""
     robots = list(request.robots) or recordings.robots()
-    return {**encode_request(request), "robots": robots, "job": job}
+    return {**encode_request(request), "robots": robots, "job": job, "began_us": began_us}
 
 
 def planned(robot: str, request: AnalysisRequest, recordings: Recordings) -> list[PlannedDrive]:
@@ -127,7 +127,8 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the states Robots, with an ``input``, and Plan, with a ``robot``."""
     now_us = time.time_ns() // 1000
     if "robot" not in event:
-        return selected(decode_request(event["input"], now_us), recordings.deployed(), event["job"])
+        request = decode_request(event["input"], now_us)
+        return selected(request, recordings.deployed(), event["job"], now_us)
     given, request = variables(PlanEnvironment), decode_request(event, now_us)
     robot, table = event["robot"], FindingsTable(clients.dynamodb(), given.findings_table)
     failed = failed_plans(table, robot, request.start_us, request.end_us, again=request.again)

@@ -100,7 +100,10 @@ def states(
             },
             "Evaluate": call(
                 "Evaluate",
-                {f"{name}.$": f"$.{name}" for name in ("job", "robots", "start_us", "end_us", "again")},
+                {
+                    f"{name}.$": f"$.{name}"
+                    for name in ("job", "began_us", "robots", "start_us", "end_us", "again")
+                },
                 ResultPath=None,
                 Next="Present",
             ),

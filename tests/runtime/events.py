@@ -50,7 +50,14 @@ def events() -> dict[str, dict[str, Any]]:
         "answer": rule_event(encode_ask(ask), build_topic(ASK, ROBOT, "calibration"), now_ms),
         "archive": {TASK: DUE},
         "echo": rule_event(encode_ping(1, now_us), build_topic(PING, ROBOT, LAMBDA), now_ms),
-        "evaluate": {"job": "night", "robots": [ROBOT], "start_us": 0, "end_us": 2**53, "again": False},
+        "evaluate": {
+            "job": "night",
+            "began_us": now_us,
+            "robots": [ROBOT],
+            "start_us": 0,
+            "end_us": 2**53,
+            "again": False,
+        },
         # A batch that expired while it waited.
         "later": {"Records": [{"messageId": "1", "body": json.dumps({PUT_OFF: [[topic, "1-0-0"]]})}]},
         "live": rule_event(encode_live(live), build_topic(LIVE, ROBOT, VESC_STREAM), now_ms),

@@ -55,3 +55,4 @@ def test_a_failed_drive_counts_that_began_before_the_range_and_goes_on_in_it(mon
     done = CliRunner().invoke(app, ["analyse", "car7", *between, "--wait", "--json"])
 
     assert (done.exit_code, json.loads(done.stdout)["failed"]) == (1, 1)
+    assert done.stderr == "iort: car7: no memory is left\n"

@@ -44,8 +44,8 @@ class PlannedDrive:
 class AnalysedDrive:
     """The row of an analysed drive: what later drives are compared with.
 
-    ``job`` is the run of the analysis that made it. ``missing`` gives reasons by the names of what could not
-    be computed.
+    ``job`` is the run of the analysis that made it, at ``analysed_us`` (0: a version that did not tell).
+    ``missing`` gives reasons by the names of what could not be computed.
     """
 
     drive: DriveKey
@@ -55,6 +55,7 @@ class AnalysedDrive:
     estimates: Mapping[str, Estimate]
     missing: Mapping[str, str]
     repairs: Mapping[str, int]
+    analysed_us: int = 0
 
 
 def encode_request(request: AnalysisRequest) -> dict[str, Any]:
@@ -133,6 +134,7 @@ def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
         estimates={name: decode_estimate(one) for name, one in _object(content, "estimates").items()},
         missing={name: str(reason) for name, reason in _object(content, "missing").items()},
         repairs={name: integer(_object(content, "repairs"), name) for name in _object(content, "repairs")},
+        analysed_us=integer(content, "analysed_us") if "analysed_us" in content else 0,
     )
 
 

@@ -68,16 +68,19 @@ def analyse(
     asked: list[str | None] = list(robots) if robots else [None]
     # A drive that goes on in the range may have begun before.
     from_us = max(0, request.start_us - 2 * LONGEST_US)
-    failed = sum(
-        finding.kind == ANALYSIS_FAILED and finding.to_us >= request.start_us
+    failed = [
+        finding
         for robot in asked
         for finding in findings.findings(cloud, robot, from_us, request.end_us)
-    )
-    facts = {"run": name, "drives": done.drives or 0, "failed": failed, "findings": done.findings}
+        if finding.kind == ANALYSIS_FAILED and finding.to_us >= request.start_us
+    ]
+    facts = {"run": name, "drives": done.drives or 0, "failed": len(failed), "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
     if not done.drives:
         text += "; a drive begins when the car moves: `iort runs` lists what was recorded"
-    tell(facts, f"{text}, drives failed: {failed}" if failed else text, as_json=as_json)
+    for one in failed:
+        say(f"{one.drive.robot}: {one.text}")
+    tell(facts, f"{text}, drives failed: {len(failed)}" if failed else text, as_json=as_json)
     raise typer.Exit(1 if failed else 0)
 
 
