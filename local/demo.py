@@ -30,12 +30,12 @@ from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations import delivery
-from iort_station.page import control
-from iort_station.page.answers import actions, answers
-from iort_station.page.downloads import downloads
-from iort_station.page.listening import Listening, listening
+from iort_station.page.answers import control
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import actions, answers
+from iort_station.page.answers.socket import reaching
+from iort_station.page.live.listening import Listening, listening
 from iort_station.page.server import PageServer
-from iort_station.page.socket import reaching
 from local import demo_options
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT

@@ -20,7 +20,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.operations import audit, trace
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from iort_station.page.page import BUILT
 from iort_station.page.server import PageServer
 from local.figures import THESIS

@@ -18,7 +18,7 @@ from iort_contract.tables import STATS
 from iort_contract.topics import LIVE, RECORD, build_topic
 from iort_station import data
 from iort_station.operations import delivery
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
 from tests.local.conftest import run_agent, until

@@ -120,7 +120,7 @@ def test_a_network_fault_loses_no_sample(embedded, drives, name):
 
 
 def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
-    from iort_station.page.listener import Listener
+    from iort_station.page.live.listener import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port), live={"when": "always"})

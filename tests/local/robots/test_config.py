@@ -13,7 +13,7 @@ from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.operations import delivery
-from iort_station.page import control
+from iort_station.page.answers import control
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import driving
 
