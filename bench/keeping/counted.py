@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.operations import accounts, audit, delivery
+from iort_station.operations.delivery import accounts, audit, counts
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,6 @@ def count(cloud: Cloud, robot: str) -> Counted:
         duplicated=sum(run.duplicated for run in runs),
         lost=sum(one.missing for one in audits) + short,
         incomplete=tuple(one.stream for one in audits if not one.complete),
-        summarized=delivery.samples_summarized(cloud, robot, VESC_STREAM),
+        summarized=counts.samples_summarized(cloud, robot, VESC_STREAM),
         expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
     )

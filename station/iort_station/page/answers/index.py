@@ -13,7 +13,7 @@ from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.fleet import registry, tags
-from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
+from iort_station.operations.monitoring import alarms, cloudwatch, cloudwatch_logs
 from iort_station.page.answers import history, insights, laps, motion, notes, socket, viewing
 from iort_station.page.answers.parameters import text, whole
 
