@@ -7,9 +7,9 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from iort_contract.messages.commands import MAX_LEASE_MS
+from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
-from iort_contract.messages.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
