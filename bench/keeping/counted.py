@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.operations import accounts, audit, delivery
+from iort_station.operations.delivery import accounts, audit, counts
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,6 @@ def count(cloud: Cloud, robot: str) -> Counted:
         lost=sum(one.missing for one in audits) + short,
         incomplete=tuple(one.stream for one in known if not one.complete),
         killed_runs=len(killed),
-        summarized=delivery.samples_summarized(cloud, robot, VESC_STREAM),
+        summarized=counts.samples_summarized(cloud, robot, VESC_STREAM),
         expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
     )

@@ -21,7 +21,7 @@ from bench.report.result import Table
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
-from iort_station.operations import audit, delivery
+from iort_station.operations.delivery import audit, counts
 from local.figures import Spread
 
 CARS, RATE_HZ = 5, 50
@@ -173,7 +173,7 @@ def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[fl
     """How long before each kill of an agent the last stored sample of that run was taken."""
     found = defaultdict(list)
     for robot in dict.fromkeys(one.robot for one in agent_kills):
-        batches = delivery.batches(cloud, robot, VESC_STREAM)
+        batches = counts.batches(cloud, robot, VESC_STREAM)
         times_us = [time_us for batch in batches for time_us in batch.times_us]
         for one in agent_kills:
             of_run = [time_us for time_us in times_us if one.started_us <= time_us <= one.killed_us]

@@ -17,7 +17,7 @@ from iort_station import kept
 from iort_station.cli.main import app
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.deployment import ROOT
 from tests.local.conftest import until
 
@@ -50,7 +50,7 @@ def iort(folder: Path) -> Callable[..., Any]:
 
 def stored(cloud: Cloud) -> list[tuple[str, int]]:
     """The batches of the car: run and number."""
-    return [(one.boot, one.seq) for one in delivery.batches(cloud, "car1", VESC_STREAM)]
+    return [(one.boot, one.seq) for one in counts.batches(cloud, "car1", VESC_STREAM)]
 
 
 def findings(folder: Path, status: int) -> dict[str, Any]:
