@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_station.page import laps
+from iort_station.page.answers import laps
 from iort_station.page.server import PageServer
 from tests.browser import plain, until
 from tests.unit.station.test_data import START

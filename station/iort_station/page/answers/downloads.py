@@ -13,8 +13,8 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Result, Selection
 from iort_station.errors import StationError
-from iort_station.page.answers import MOST_VALUES
-from iort_station.page.parameters import text, whole
+from iort_station.page.answers.history import MOST_VALUES
+from iort_station.page.answers.parameters import text, whole
 from iort_station.page.server import Download
 from iort_station.recordings import export, recordings, tabular
 from iort_station.recordings.recordings import Recording, Write

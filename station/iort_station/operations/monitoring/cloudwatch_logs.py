@@ -14,8 +14,8 @@ from typing import Any
 from iort_contract.messages.page import Logs
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.operations.cloudwatch import body_of
-from iort_station.operations.log_records import readable
+from iort_station.operations.monitoring.cloudwatch import body_of
+from iort_station.operations.monitoring.log_records import readable
 
 # The most rows of a widget, and the most characters of a cell.
 MAX_ROWS, MAX_TEXT = 100, 4_000

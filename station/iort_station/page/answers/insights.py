@@ -24,7 +24,7 @@ from iort_station.cloud import Cloud
 from iort_station.data.analysis import findings as stored
 from iort_station.fleet import registry
 from iort_station.operations import analysis
-from iort_station.page.parameters import text, whole
+from iort_station.page.answers.parameters import text, whole
 
 # What is shown of a robot, and of each one of the fleet.
 _DRIVES, _FINDINGS = 60, 60

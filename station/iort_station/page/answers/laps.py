@@ -18,8 +18,8 @@ from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data.analysis.laps import laps_within
 from iort_station.errors import StationError
-from iort_station.page.insights import estimate
-from iort_station.page.parameters import text, whole
+from iort_station.page.answers.insights import estimate
+from iort_station.page.answers.parameters import text, whole
 
 # An hour of a VESC at 100 Hz and of its pose.
 _MOST_VALUES = 10_000_000

@@ -18,7 +18,7 @@ from iort_contract.topics import LIVE, check_robot, parse_topic
 from iort_station.cloud import Cloud
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page.heard import Heard, OnUpdate, heard_of
+from iort_station.page.live.heard import Heard, OnUpdate, heard_of
 
 
 class Listening(Protocol):
@@ -46,7 +46,7 @@ def listening(
         return BrokerListener(cloud, robot=robot, on_update=on_update)
     # Without PubNub nobody needs its SDK.
     from iort_station.page import keys  # noqa: PLC0415 - as above
-    from iort_station.page.listener import Listener  # noqa: PLC0415 - as above
+    from iort_station.page.live.listener import Listener  # noqa: PLC0415 - as above
 
     return Listener(
         robot=robot,

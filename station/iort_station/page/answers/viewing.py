@@ -9,7 +9,7 @@ from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import viewing
-from iort_station.page.parameters import number, text, whole
+from iort_station.page.answers.parameters import number, text, whole
 
 # The cards on a large screen, twice.
 _MOST_ROBOTS = 256

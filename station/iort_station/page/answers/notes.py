@@ -9,8 +9,8 @@ from iort_contract.messages.page import Answer
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data.analysis import notes as stored
-from iort_station.operations.alarms import user
-from iort_station.page.parameters import text, whole
+from iort_station.operations.monitoring.alarms import user
+from iort_station.page.answers.parameters import text, whole
 
 _NOTES = 200
 

@@ -1,11 +1,8 @@
-"""Answers to the live page: the cars' parameters, a car's past, alarms, and CloudWatch's dashboards.
-
-Each answer is a function of the request's parameters; its type is in `iort_contract.messages.page`.
-"""
+"""Answers to the live page about a car's past: its runs, and the samples of a range."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,19 +10,15 @@ import numpy as np
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.messages.page import Answer, HistoryAnswer, RunsAnswer
 from iort_contract.messages.page import Column as PageColumn
+from iort_contract.messages.page import HistoryAnswer, RunsAnswer
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import inventory
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
-from iort_station.fleet import registry, tags
-from iort_station.operations import alarms, cloudwatch, cloudwatch_logs
-from iort_station.page import insights, laps, motion, notes, socket, viewing
-from iort_station.page.parameters import text, whole
+from iort_station.page.answers.parameters import text, whole
 
 # No chart is wider, in points.
 MAX_ROWS = 5_000
@@ -38,47 +31,7 @@ _DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PA
 _MOST_RUNS = 200
 
 
-def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """Every answer, by its name."""
-    return {
-        "robots": lambda _asked: {"robots": registry.presence(cloud)},
-        "tags": lambda _asked: {"tags": tags.listed(cloud)},
-        "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
-        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(text(asked, "robot")))},
-        "runs": lambda asked: _runs(cloud, asked),
-        "history": lambda asked: history(cloud, asked),
-        "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
-        "dashboard": lambda asked: cloudwatch.dashboard(
-            cloud, text(asked, "name"), minutes=whole(asked, "minutes", 1, 14 * 24 * 60)
-        ),
-        "log": lambda asked: cloudwatch_logs.rows(
-            cloud,
-            text(asked, "name"),
-            whole(asked, "widget", 0, 500),
-            minutes=whole(asked, "minutes", 1, 14 * 24 * 60),
-        ),
-        "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
-        "rejected": lambda _asked: alarms.rejected(cloud),
-        "insights": lambda asked: insights.insights(cloud, asked),
-        "analysis": lambda asked: insights.progress(cloud, asked),
-        **laps.answers(cloud),
-        **socket.answers(cloud),
-        **notes.answers(cloud),
-        **motion.answers(cloud),
-    }
-
-
-def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
-    """What everybody who reaches the page may do, by its name."""
-    return {
-        "view": lambda asked: viewing.view(cloud, asked),
-        "acknowledge": lambda asked: alarms.acknowledge(
-            cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
-        ),
-    }
-
-
-def _runs(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
+def runs_of(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
     """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
     before_us = whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
     count = whole(asked, "count", 1, _MOST_RUNS)
