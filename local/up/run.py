@@ -107,6 +107,7 @@ class _Kept:
     def __init__(self, options: argparse.Namespace, stopped: threading.Event) -> None:
         self._options, self._stopped = options, stopped
         self._state = StateFolder(options.state, kept=True)
+        # Of this start, and of the first one.
         self._began, self._started_s = time.monotonic(), time.time()
 
     def run(self) -> None:
@@ -122,6 +123,7 @@ class _Kept:
                 _say(f"{ended}\nIt is started again")
 
     def _once(self) -> None:
+        self._began = time.monotonic()
         settings = self._settings()
         listen, page = (_listen(settings[name], name.upper()) for name in ("listen", "page"))
         embedded = EmbeddedCloud(
