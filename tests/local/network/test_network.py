@@ -169,6 +169,24 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
     assert f"port: {address} answers, but nothing listens on {ports['mqtt']}" in ended
 
 
+def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
+    address = laboratory.cloud.address6
+    bundle = laboratory.folder / "car6"
+    with laboratory.running("--listen", address, "--page", f"{address},cloud.lab"):
+        ports = kept.Up.load(laboratory.state).ports
+        reached = {(address, ports[name]) for name in ("mqtt", "files", "network page")}
+        assert laboratory.listeners() == reached
+        laboratory.iort("robots", "add", "car6", "--out", str(laboratory.folder))
+        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
+        assert "rules: answer a ping" in laboratory.car.run(*check)
+        upload = laboratory.folder / "drive.bag"
+        upload.write_bytes(b"samples")
+        sent = car(bundle, "upload", str(upload))
+        assert sent.wait(60.0) == 0, sent.tail()
+        assert "drive.bag" in laboratory.iort("files", "list", "car6")
+        assert f"cars connect to [{address}]:{ports['mqtt']}" in laboratory.iort("doctor")
+
+
 def test_systemd_starts_the_cloud_again_after_a_kill_and_stops_it(laboratory):
     def service(*options: str) -> None:
         machine.run(sys.executable, "-m", "local.up.service", "--state", str(laboratory.state), *options)
