@@ -15,7 +15,7 @@ from iort_contract.messages.analysis.findings import Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.operations import move
+from iort_station.moving import archived, plan, written
 from tests.unit.contract.test_findings import FINDING
 from tests.unit.contract.test_notes import OneTable, note
 
@@ -60,8 +60,8 @@ def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, account: Account, _topic: str) -> None:
             self.rows = account.rows.copy
 
-    monkeypatch.setattr(move, "Archive", Rows)
-    monkeypatch.setattr(move.findings, "table", lambda account: account.findings)
+    monkeypatch.setattr(archived, "Archive", Rows)
+    monkeypatch.setattr(written.findings, "table", lambda account: account.findings)
 
 
 def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,9 +69,9 @@ def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.Monk
     monkeypatch.setattr(Cloud, "region_name", property(lambda cloud: cloud.region))
     here, lab, other = (Cloud(profile=profile, region="eu-west-1") for profile in ("a", "b", None))
     with pytest.raises(StationError, match="the source itself"):
-        move.check(here, lab)
-    move.check(here, other)
-    move.check(here, replace(lab, region="us-east-1"))
+        plan._place(here, lab)
+    plan._place(here, other)
+    plan._place(here, replace(lab, region="us-east-1"))
 
 
 def test_a_day_of_the_targets_own_is_not_replaced() -> None:
@@ -91,9 +91,9 @@ def test_what_the_target_has_analysed_again_is_not_replaced() -> None:
     source.findings.put_finding(finding)
     source.findings.put_drive(AnalysedDrive(finding.drive, finding.drive.start_us + 1, "old", 1, {}, {}, {}))
     source.findings.put_note(note(robot=robot))
-    assert [move.copy_findings(source, target, robot) for _ in range(2)] == [3, 0]
+    assert [written.copy(source, target, robot) for _ in range(2)] == [3, 0]
     again = AnalysedDrive(finding.drive, finding.drive.start_us + 1, "again", 1, {}, {}, {})
     target.findings.put_drive(again)
     target.findings.remove(finding)
-    assert move.copy_findings(source, target, robot) == 0
+    assert written.copy(source, target, robot) == 0
     assert (list(target.findings.drives(robot)), list(target.findings.findings(robot))) == ([again], [])
