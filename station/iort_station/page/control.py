@@ -14,9 +14,10 @@ from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import commands, registry
-from iort_station.fleet import settings as fleet_settings
-from iort_station.fleet.shadow import Shadow, State
+from iort_station.fleet import registry
+from iort_station.fleet.control import commands
+from iort_station.fleet.control import settings as fleet_settings
+from iort_station.fleet.control.shadow import Shadow, State
 from iort_station.page import insights, motion, notes, socket
 from iort_station.page.parameters import text, whole
 from iort_station.page.server import Answer

@@ -12,7 +12,8 @@ from iort_contract.messages.page import Answer, MotionAnswer, MotionEntry
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import registry, stopping
+from iort_station.fleet import registry
+from iort_station.fleet.control import stopping
 from iort_station.operations.alarms import user
 from iort_station.page.parameters import text
 

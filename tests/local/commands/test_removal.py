@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from iort_contract.messages.files import FILES_PREFIX
 from iort_station.cli.main import app
-from iort_station.fleet import certificates, claims, registry, robots
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import certificates, claims
 from local.deployment import deploy
 from tests.local.conftest import until
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from iort_station.fleet import claims, registry, robots
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import claims
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from local.deployment import ROOT

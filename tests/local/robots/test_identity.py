@@ -14,7 +14,8 @@ import yaml
 
 from iort_contract.cloud import claim_name
 from iort_contract.tables import ROBOT
-from iort_station.fleet import claims, robots
+from iort_station.fleet import robots
+from iort_station.fleet.identity import claims
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import run_agent, until

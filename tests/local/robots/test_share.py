@@ -16,7 +16,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
 from iort_station.data.batches import summary_table, topic_of
-from iort_station.fleet import shadow
+from iort_station.fleet.control import shadow
 from iort_station.operations import delivery
 from tests.local.conftest import until
 from verify.tools.robot import Robot

@@ -13,7 +13,7 @@ from botocore.exceptions import ClientError
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.driving import DriveLimits, encode_limits
 from iort_station.errors import StationError
-from iort_station.fleet import stopping
+from iort_station.fleet.control import stopping
 from iort_station.operations.alarms import user
 from iort_station.page import control, motion
 

@@ -14,7 +14,7 @@ from iort_contract.tables import ONLINE
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
-from iort_station.fleet.shadow import Shadow, State, answered
+from iort_station.fleet.control.shadow import Shadow, State, answered
 
 # How long a robot may take to return to the file's value.
 _WITHDRAWN_S = 3.0

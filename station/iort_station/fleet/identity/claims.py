@@ -16,10 +16,11 @@ from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.tables import SERIAL
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import certificates, registry
-from iort_station.fleet.bundle import connection, write_private
-from iort_station.fleet.certificates import once_detached
-from iort_station.fleet.robots import F1TENTH
+from iort_station.fleet import registry
+from iort_station.fleet.identity import certificates
+from iort_station.fleet.identity.bundle import connection, write_private
+from iort_station.fleet.identity.certificates import once_detached
+from iort_station.fleet.registry import F1TENTH
 
 if TYPE_CHECKING:
     from types_boto3_iot import IoTClient

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from iort_contract.tables import CERTIFICATE_ID, ONLINE, SESSION_VERSION
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import certificates, registry
-from iort_station.fleet.certificates import Certificate
+from iort_station.fleet import registry
+from iort_station.fleet.identity import certificates
+from iort_station.fleet.identity.certificates import Certificate
 
 # `iort-agent renew` returns to the old certificate if the new one does not connect within 60 s, so a robot
 # keeps a connection that is older than that.

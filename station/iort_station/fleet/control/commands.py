@@ -13,7 +13,7 @@ from iort_contract.messages.commands import MAX_BY_CHARACTERS, Command, encode_c
 from iort_contract.topics import CMD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
-from iort_station.fleet.shadow import Shadow, outcome
+from iort_station.fleet.control.shadow import Shadow, outcome
 
 VALID_MS, ANSWER_S = 2_000, 10.0
 
