@@ -91,6 +91,6 @@ ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
 
 # The table of findings: by robot and a text that begins with the time of the drive. Beside the findings it
 # has a row of each analysed drive, for comparing with later ones, and the operators' notes. A note that was
-# deleted leaves a row without its text, so that no copy of it comes back. The keys of each begin with a prefix.
+# deleted leaves a row without its text, so that no copy of it comes back. The keys of each have a prefix.
 FINDING, CONTENT = "finding", "content"
 PARAMETERS_PREFIX, NOTE_PREFIX, REMOVED_PREFIX = "parameters#", "note#", "removed#"

@@ -31,8 +31,9 @@ from iort_contract.tables import (
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import certificates, registry, robots
-from iort_station.fleet.bundle import Bundle
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import certificates
+from iort_station.fleet.identity.bundle import Bundle
 from iort_station.moving.plan import origin
 
 # What a registry's row says of the deployment and not of the robot.

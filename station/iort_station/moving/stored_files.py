@@ -48,7 +48,7 @@ class Files:
             content = body.read()
             if problem := _problem(hashlib.sha256(content), said):
                 return problem
-            self._to.put_object(**to, **given, Body=content, ChecksumSHA256=_base64(content))
+            self._to.put_object(**to, **given, Body=content, ChecksumSHA256=base64_sha256(content))
         progress(file.size)
         return ""
 
@@ -64,7 +64,7 @@ class Files:
         whole = hashlib.sha256()
         while content := body.read(PART_BYTES):
             whole.update(content)
-            part: Any = {"PartNumber": len(parts) + 1, "ChecksumSHA256": _base64(content)}
+            part: Any = {"PartNumber": len(parts) + 1, "ChecksumSHA256": base64_sha256(content)}
             etag = there.get((part["PartNumber"], part["ChecksumSHA256"]))
             if etag is None:
                 etag = self._to.upload_part(**to, **part, Body=content)["ETag"]
@@ -117,5 +117,6 @@ def _problem(digest: Any, said: str | None) -> str:
     return f"SHA-256 must be {said}, got {found}" if said not in {None, found} else ""
 
 
-def _base64(content: bytes) -> str:
+def base64_sha256(content: bytes) -> str:
+    """The SHA-256 as S3 writes it."""
     return base64.b64encode(hashlib.sha256(content).digest()).decode()
