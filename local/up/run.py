@@ -72,7 +72,10 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="make up",
-        usage="make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1]",
+        usage=(
+            "make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1] "
+            "[PORTS=any]"
+        ),
         description="Run the stacks in a cloud of your own, which is kept.",
     )
     add_state(parser)
@@ -100,6 +103,11 @@ def add_network(parser: argparse.ArgumentParser) -> None:
         "--power-cut",
         choices=["0", "1"],
         help="let what was acknowledged survive a power cut, too; remembered",
+    )
+    parser.add_argument(
+        "--ports",
+        choices=["any"],
+        help="at the first start take any free ports and leave the usual ones to another cloud; remembered",
     )
 
 
@@ -129,6 +137,7 @@ class _Kept:
             live=IOT,
             progress=self._step,
             kept=True,
+            any_ports=settings["any_ports"],
             power_cut=settings["power_cut"],
             listen=listen,
             # systemd tells a service so that its output is the journal's.
@@ -166,7 +175,8 @@ class _Kept:
         given = {"listen": options.listen, "page": options.page}
         found = {name: known.get(name, NO) if text is None else text for name, text in given.items()}
         power_cut = known.get("power_cut", False) if options.power_cut is None else options.power_cut == "1"
-        return {**found, "power_cut": power_cut}
+        any_ports = known.get("any_ports", False) or options.ports == "any"
+        return {**found, "power_cut": power_cut, "any_ports": any_ports}
 
     def _write(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
         up = kept.Up(

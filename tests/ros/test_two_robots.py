@@ -17,7 +17,7 @@ from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process
-from tests.unit.agent.downlink_rig import POSE
+from tests.unit.agent.control.downlink_rig import POSE
 
 POSE_TYPE = "geometry_msgs/PoseStamped"
 DRIVE = {

@@ -17,7 +17,7 @@ from iort_station.cloud import Cloud
 from iort_station.data.archive import key_of
 from iort_station.data.recorded import HEADER, Recorded
 from iort_station.moving.recorded import BatchProgress
-from iort_station.operations.audit import Audit, audit
+from iort_station.operations.delivery.audit import Audit, audit
 
 
 @dataclass(frozen=True)

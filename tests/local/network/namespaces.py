@@ -27,7 +27,8 @@ class Machine:
 
     def command(self, *command: str) -> list[str]:
         """A command as it is run on this machine."""
-        return ["nsenter", f"--target={self.pid}", "--user", "--net", "--preserve-credentials", *command]
+        there = ["--user", "--net", "--mount", "--wd=.", "--preserve-credentials"]
+        return ["nsenter", f"--target={self.pid}", *there, *command]
 
     def run(self, *command: str, environment: Mapping[str, str] | None = None) -> str:
         """Run a command to its end and return its output."""
@@ -45,11 +46,12 @@ class Machine:
 
 @contextmanager
 def two_machines(folder: Path) -> Iterator[tuple[Machine, Machine]]:
-    """Two machines, 10.77.0.1 and 10.77.0.2. Skips where they cannot be made."""
+    """Two machines, 10.77.0.1 and 10.77.0.2, with file systems of their own in common. Skips where they
+    cannot be made."""
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
         pytest.skip(f"{missing[0]} is not installed: apt-get install iproute2 util-linux")
-    made = ["unshare", "--user", "--map-root-user", "--net"]
+    made = ["unshare", "--user", "--map-root-user", "--net", "--mount"]
     if subprocess.run([*made, "true"], capture_output=True, check=False).returncode:
         pytest.skip("this machine allows neither root nor users network namespaces of their own")
     with ExitStack() as stack:
@@ -70,7 +72,8 @@ def two_machines(folder: Path) -> Iterator[tuple[Machine, Machine]]:
             return child.pid
 
         one = Machine(stays("one", made), "10.77.0.1")
-        inside = ["nsenter", f"--target={one.pid}", "--user", "--preserve-credentials", "unshare", "--net"]
+        enter = ["nsenter", f"--target={one.pid}", "--user", "--mount", "--wd=.", "--preserve-credentials"]
+        inside = [*enter, "unshare", "--net"]
         other = Machine(stays("other", inside), "10.77.0.2")
         one.run(
             "ip", "link", "add", "cable", "type", "veth", "peer", "name", "cable", "netns", str(other.pid)

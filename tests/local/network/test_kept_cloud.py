@@ -22,7 +22,7 @@ from local.deployment import ROOT
 from local.errors import LocalError
 from local.network.listen import Listen
 from local.processes import Child
-from local.state import StateFolder
+from local.state import USUAL_PORTS, StateFolder
 from local.up import service
 from local.up.down import stop
 
@@ -43,9 +43,14 @@ def test_a_kept_folder_keeps_its_ports_and_a_second_cloud_is_refused(state):
         again.take(stack)
     with (
         socket.create_server(("127.0.0.1", port)),
-        pytest.raises(LocalError, match=r"is in use .*settings\.json"),
+        pytest.raises(LocalError, match=r"is in use .*stop that one .*settings\.json, .*car\.yaml"),
     ):
         again.port("mqtt", "127.0.0.1")
+
+
+def test_a_second_cloud_leaves_the_usual_ports_to_the_first(tmp_path):
+    state = StateFolder(tmp_path, kept=True, any_ports=True)
+    assert not {state.port(name, "127.0.0.1") for name in USUAL_PORTS} & set(USUAL_PORTS.values())
 
 
 @pytest.mark.parametrize("version", ["2", "beta"])

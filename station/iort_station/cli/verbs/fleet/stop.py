@@ -16,7 +16,7 @@ from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.fleet.control import stopping
 from iort_station.fleet.control.stopping import Motion
-from iort_station.operations import alarms
+from iort_station.operations.monitoring import alarms
 from iort_station.times import iso_s
 
 commands = typer.Typer()
