@@ -21,9 +21,9 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 
 # The options of the cloud that is kept.
 STATE_OPTION = $(if $(STATE),--state "$(STATE)")
-UP_OPTIONS = $(STATE_OPTION) $(if $(LISTEN),--listen "$(LISTEN)") $(if $(PAGE),--page "$(PAGE)") $(if $(POWER_CUT),--power-cut $(POWER_CUT))
+UP_OPTIONS = $(STATE_OPTION) $(if $(LISTEN),--listen "$(LISTEN)") $(if $(PAGE),--page "$(PAGE)") $(if $(POWER_CUT),--power-cut $(POWER_CUT)) $(if $(PORTS),--ports "$(PORTS)")
 
-up: setup ## run a cloud of your own that is kept, until Ctrl-C: STATE=folder LISTEN=address,name PAGE=address,name POWER_CUT=1
+up: setup ## run a cloud of your own that is kept, until Ctrl-C: STATE=folder LISTEN=address,name PAGE=address,name POWER_CUT=1 PORTS=any
 	@exec $(BIN)/python -m local.up.run $(UP_OPTIONS)
 
 down: ## stop the cloud of `make up`, which is kept: STATE=folder
@@ -57,7 +57,7 @@ wheels: setup ## build the wheels of contract, agent and station into dist/
 	@$(BIN)/python -m scripts.wheels
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
-	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/test_mixed_robot.py
+	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
 	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

@@ -2,10 +2,10 @@
 
     python -m bench.kept [--kills 50] [--soak 168] [--minutes 4] [--out docs/bench]
 
-First five cars drive at 50 Hz while the emulator, its functions, or all processes of `make up` get SIGKILL;
-the code of `iort audit` then counts what is lost. Then five cars drive in every hour of a week on a clock
-that is set forward, and the cloud's memory is measured. Exit status 1 if a sample is missing, or if the
-memory grows.
+First five cars drive at 50 Hz while the emulator, its functions, all processes of `make up`, or an agent get
+SIGKILL, or the cloud's disk is full; the code of `iort audit` then counts what is lost. Then five cars drive
+in every hour of a week on a clock that is set forward, and the cloud's memory is measured. Exit status 1 if a
+sample is missing, or if the memory grows.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rich.console import Console
 
 from bench.command import made, parser, write
 from bench.errors import BenchError
-from bench.keeping import kills, report, week
+from bench.keeping import disk, kills, report, week
 from iort_station.errors import StationError
 from local.errors import LocalError
 
@@ -35,6 +35,7 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=time.time_ns() % 2**32, help="of the random moments")
     arguments.add_argument("--out", type=Path, help="write the report, the plot and the figures here")
     given = arguments.parse_args()
+    disk.enter("bench.kept")
     console = Console()
 
     def say(step: str) -> None:

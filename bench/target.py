@@ -19,7 +19,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from local.cloud import EmbeddedCloud
 
 EMBEDDED, AWS = "embedded", "aws"

@@ -62,7 +62,8 @@ class EmbeddedCloud:
     network. With ``journal`` the emulator writes its log to our own output. ``environment`` is added to the
     emulator's and its functions'.
 
-    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub``, ``relay`` and ``files``; the others are free ports.
+    ``ports`` may set ``gateway``, ``mqtt``, ``pubnub``, ``relay`` and ``files``; the others are free ports. A
+    kept cloud takes the usual ones if they are free, unless ``any_ports`` will do, and has them again.
     ``progress`` is called with the name of each step when it begins. `__enter__` raises `LocalError` if it
     cannot start.
     """
@@ -77,6 +78,7 @@ class EmbeddedCloud:
         ports: dict[str, int] | None = None,
         progress: Progress = lambda _step: None,
         kept: bool = False,
+        any_ports: bool = False,
         power_cut: bool = False,
         listen: Listen | None = None,
         journal: bool = False,
@@ -84,7 +86,7 @@ class EmbeddedCloud:
     ) -> None:
         self.folder, self.namespace, self.host = folder, namespace, host
         self.live, self.kept, self.listen = live, kept, listen
-        self.state = StateFolder(folder, kept=kept)
+        self.state = StateFolder(folder, kept=kept, any_ports=any_ports)
         self.ports = ports or {}
         self.authority: Authority
         self.certificates: list[ServerCertificate] = []
@@ -192,8 +194,8 @@ class EmbeddedCloud:
     @property
     def files_url(self) -> str:
         """Where robots in the network store files and get answers."""
-        host = self.listen.in_url if self.listen else self.host
-        return f"https://{host}:{self.ports['files']}"
+        listen = self.listen or Listen(self.host, (self.host,))
+        return f"https://{listen.at(self.ports['files'])}"
 
     @property
     def page_ports(self) -> list[int]:

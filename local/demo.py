@@ -29,13 +29,13 @@ from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
-from iort_station.operations import delivery
-from iort_station.page import control
-from iort_station.page.answers import actions, answers
-from iort_station.page.downloads import downloads
-from iort_station.page.listening import Listening, listening
+from iort_station.operations.delivery import counts
+from iort_station.page.answers import control
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import actions, answers
+from iort_station.page.answers.socket import reaching
+from iort_station.page.live.listening import Listening, listening
 from iort_station.page.server import PageServer
-from iort_station.page.socket import reaching
 from local import demo_options
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
@@ -188,7 +188,7 @@ class _Demo:
         return agent.wait(_STATUS_S) is None
 
     def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
-        stored = sum(len(b.times_us) for b in delivery.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        stored = sum(len(b.times_us) for b in counts.batches(embedded.cloud, ROBOT, VESC_STREAM))
         heard = list(listener.heard)
         delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
         return (
@@ -201,7 +201,7 @@ class _Demo:
         sent = sum(report["streams"][name]["samples"] for name in streams)
         deadline = time.monotonic() + _CATCH_UP_S
         while True:
-            found = [delivery.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            found = [counts.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
             summarized = sum(one.samples_summarized for one in found)
             stored = sum(one.samples_stored for one in found)
             if summarized >= sent or time.monotonic() > deadline:
@@ -214,7 +214,7 @@ class _Demo:
             samples_summarized=summarized,
             live_published=report["live_published"],
             live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
-            rtt_ms=round_trips(delivery.batches(embedded.cloud, ROBOT, RTT_STREAM)),
+            rtt_ms=round_trips(counts.batches(embedded.cloud, ROBOT, RTT_STREAM)),
             car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),
         )
 

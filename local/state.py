@@ -22,14 +22,14 @@ from local.errors import LocalError
 VERSION = 1
 _LEAST_FREE_BYTES = 500 * 1024 * 1024
 # The ports that a new kept cloud takes if they are free; the others are any free ones.
-_USUAL = {"mqtt": 8883, "files": 8443, "page": 8080, "network page": 8444}
+USUAL_PORTS = {"mqtt": 8883, "files": 8443, "page": 8080, "network page": 8444}
 
 
 class StateFolder:
     """The folder, once `take` has locked it."""
 
-    def __init__(self, path: Path, *, kept: bool) -> None:
-        self.path, self.kept = path, kept
+    def __init__(self, path: Path, *, kept: bool, any_ports: bool = False) -> None:
+        self.path, self.kept, self._any_ports = path, kept, any_ports
         self._settings_path = path / "settings.json"
 
     def take(self, stack: ExitStack) -> None:
@@ -100,20 +100,25 @@ class StateFolder:
             write_private(self._settings_path, f"{text}\n".encode())
 
     def port(self, name: str, *hosts: str, wanted: int = 0) -> int:
-        """The port ``wanted``, or the one of the last start, or a free one, on every host. Raises
-        `LocalError` if it is in use."""
+        """The port ``wanted``, or the one of the last start, or the usual one if it is free, unless any will
+        do, or a free one, on every host. Raises `LocalError` if it is in use."""
         known = self.settings().get("ports", {})
         asked = wanted or known.get(name, 0)
-        usual = _USUAL.get(name, 0) if self.kept and not asked else 0
+        usual = USUAL_PORTS.get(name, 0) if self.kept and not asked and not self._any_ports else 0
         found = _free(hosts, usual) if usual else None
         if found is None:
             found = _free(hosts, asked)
         if found is None:
-            # A kept port is in the cars' bundles.
-            advice = "give another, or none"
+            advice = "free it, give another, or none"
             if asked == known.get(name):
-                advice = f"or choose another in {self._settings_path}"
-            raise LocalError(f"port {asked} ({name}) is in use on {' or '.join(hosts)}: free it, {advice}")
+                advice = (
+                    "if another cloud of this machine has it, stop that one (`make down STATE=its folder`) "
+                    f"or choose another port for this one in {self._settings_path}"
+                )
+                if name == "mqtt":
+                    # It is in the bundles.
+                    advice += ", and write it into the car.yaml of its cars"
+            raise LocalError(f"port {asked} ({name}) is in use on {' or '.join(hosts)}: {advice}")
         self.remember(ports={**known, name: found})
         return found
 

@@ -14,7 +14,8 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.tables import ROBOT
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import claims, files, robots
+from iort_station.fleet import files, robots
+from iort_station.fleet.identity import claims
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run

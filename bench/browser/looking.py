@@ -35,8 +35,8 @@ from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page import socket
-from iort_station.page.answers import actions, answers
+from iort_station.page.answers import socket
+from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.proxy import Proxy

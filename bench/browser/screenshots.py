@@ -40,9 +40,9 @@ from iort_station.cloud import Cloud
 from iort_station.data.analysis import findings
 from iort_station.data.runs import runs
 from iort_station.fleet import robots
-from iort_station.page import control
-from iort_station.page.answers import actions, answers
-from iort_station.page.downloads import downloads
+from iort_station.page.answers import control
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 

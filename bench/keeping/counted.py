@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.operations import accounts, audit, delivery
+from iort_station.operations.delivery import accounts, audit, counts
 
 
 @dataclass(frozen=True)
 class Counted:
     """The counts of a robot's streams together; ``lost`` are samples and batches that are not stored.
 
-    ``summarized`` and ``expected`` are samples of the motor controller's stream alone.
+    ``killed_runs`` is how many runs of the agent did not end properly: what was in their open batches is no
+    part of ``lost``, nor of ``incomplete``. ``summarized`` and ``expected`` are samples of the motor
+    controller's stream alone.
     """
 
     samples: int
@@ -23,6 +25,7 @@ class Counted:
     duplicated: int
     lost: int
     incomplete: tuple[str, ...]
+    killed_runs: int
     summarized: int
     expected: int
 
@@ -39,13 +42,19 @@ def count(cloud: Cloud, robot: str) -> Counted:
     # A known stream of which the agent took nothing has no audit.
     audits = [one for one in audits if one.runs or one.refused or one.taken is not None]
     runs = [run for one in audits for run in one.runs]
-    short = sum(abs(each.samples or 1) for one in audits for each in one.shortfalls)
+    killed = {each.boot for one in audits for each in one.shortfalls if each.samples is None}
+    known = [
+        replace(one, shortfalls=tuple(each for each in one.shortfalls if each.samples is not None))
+        for one in audits
+    ]
+    short = sum(abs(each.samples or 0) for one in known for each in one.shortfalls)
     return Counted(
         samples=sum(run.samples for run in runs),
         batches=sum(run.batches for run in runs),
         duplicated=sum(run.duplicated for run in runs),
         lost=sum(one.missing for one in audits) + short,
-        incomplete=tuple(one.stream for one in audits if not one.complete),
-        summarized=delivery.samples_summarized(cloud, robot, VESC_STREAM),
+        incomplete=tuple(one.stream for one in known if not one.complete),
+        killed_runs=len(killed),
+        summarized=counts.samples_summarized(cloud, robot, VESC_STREAM),
         expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
     )

@@ -1,45 +1,73 @@
-"""A drive of five cars on a kept cloud whose processes are killed at random moments."""
+"""A drive of five cars on a kept cloud: at random moments processes are killed, or its disk is full."""
 
 from __future__ import annotations
 
 import random
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from bench.errors import BenchError
+from bench.keeping import disk
 from bench.keeping.counted import Counted, count
 from bench.keeping.up import Up
 from bench.load.agent_process import AgentProcess
 from bench.report.result import Table
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station.cloud import Cloud
 from iort_station.fleet import robots
+from iort_station.operations.delivery import audit, counts
 from local.figures import Spread
 
 CARS, RATE_HZ = 5, 50
-# Between the moment at which the emulator answers again and the next kill.
+# What a killed agent may take with it: the open batch of a second, and the time until that is on its disk.
+OPEN_MOST_S = 2.5
+# Between the moment at which the emulator answers again and the next kill; and how long the disk is full.
 _LEAST_S, _MOST_S = 0.3, 6.0
+_FULL_LEAST_S, _FULL_MOST_S = 3.0, 10.0
 _SUMMARY_S = 120.0
 
 
 @dataclass(frozen=True)
+class AgentKill:
+    """When the agent of a robot was started and killed, in microseconds since the epoch."""
+
+    robot: str
+    started_us: int
+    killed_us: int
+
+
+@dataclass(frozen=True)
 class Kills:
-    """What was killed how often, and what the audit found of each car afterwards."""
+    """What was killed how often, and what the audit found of each car afterwards.
+
+    ``open_s`` has, by car, how far before each kill of its agent the last stored sample was taken. Runs that
+    were killed before their first batch are not among them.
+    """
 
     killed: dict[str, int]
     seed: int
     seconds: float
     restart_s: Spread | None
     cars: dict[str, Counted]
+    agent_kills: dict[str, int]
+    open_s: dict[str, list[float]]
 
     @property
     def good(self) -> bool:
-        """Whether nothing is lost and everything is summarised."""
-        cars = self.cars.values()
-        return all(not one.incomplete and one.summarized == one.expected for one in cars)
+        """Whether nothing is lost but open batches of killed agents, and everything is summarised."""
+        there = all(
+            not one.incomplete
+            and one.summarized == one.expected
+            and one.killed_runs <= self.agent_kills.get(name, 0)
+            for name, one in self.cars.items()
+        )
+        return there and all(one <= OPEN_MOST_S for each in self.open_s.values() for one in each)
 
     def as_json(self) -> dict[str, Any]:
         """All figures."""
@@ -47,47 +75,62 @@ class Kills:
 
     def table(self) -> Table:
         """A row for each car."""
-        head = ("car", "batches", "samples", "lost", "sent twice", "summarised")
+        head = ("car", "batches", "samples", "lost", "open s", "sent twice", "summarised")
         rows = [
             (
                 name,
                 f"{one.batches:,}",
                 f"{one.samples:,}",
                 f"**{one.lost:,}**" if one.lost else "0",
+                ", ".join(f"{open_s:.2f}" for open_s in self.open_s.get(name, ())) or "-",
                 f"{one.duplicated:,}",
                 f"{one.summarized:,} of {one.expected:,}",
             )
             for name, one in self.cars.items()
         ]
-        told = ", ".join(f"{name} {times} times" for name, times in sorted(self.killed.items()))
-        return Table(f"Five cars at 50 Hz for {self.seconds:.0f} s, killed: {told}", head, rows)
+        told = ", ".join(f"{name} ({times})" for name, times in sorted(self.killed.items()))
+        return Table(f"Five cars at 50 Hz for {self.seconds:.0f} s through: {told}", head, rows)
 
 
 def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Kills:
     """Kill so often, and count."""
     chance = random.Random(seed)  # noqa: S311 - moments, no secrets
-    killed, restarts = Counter[str](), []
+    killed, restarts, agent_kills = Counter[str](), list[float](), list[AgentKill]()
     say("starting the cloud")
     folder.mkdir(parents=True)
-    with Up(folder / "state") as up, ExitStack() as driving:
+    with ExitStack() as stack, ExitStack() as driving:
+        small = stack.enter_context(disk.Disk(folder / "state")) if disk.possible() else None
+        up = stack.enter_context(Up(folder / "state"))
         settings: dict[str, Any] = {
             "sources": [{"type": "sim", "rate_hz": RATE_HZ, "pose": {"rate_hz": 0}}],
             "queue": {"path": "queue.db"},
         }
         cloud = up.cloud
         cars = [robots.add(cloud, f"car{i + 1}", out=folder / "cars", settings=settings) for i in range(CARS)]
-        ways = {
-            "the emulator": up.kill_emulator,
-            "all processes": up.kill_all,
-            "the functions": up.kill_function,
+        agents = [driving.enter_context(AgentProcess(car, drain_s=_SUMMARY_S)) for car in cars]
+
+        def kill_agent() -> float:
+            agent = chance.choice(agents)
+            agent_kills.append(AgentKill(agent.robot, agent.started_us, agent.kill()))
+            return 0.0
+
+        ways: dict[str, Callable[[], float]] = {
+            "killed emulator": up.kill_emulator,
+            "all killed": up.kill_all,
+            "killed functions": up.kill_function,
+            "killed agent": kill_agent,
         }
-        for car in cars:
-            driving.enter_context(AgentProcess(car, drain_s=_SUMMARY_S))
+        if small:
+            ways["full disk"] = lambda: _full(small, up, chance.uniform(_FULL_LEAST_S, _FULL_MOST_S))
+        else:
+            say("the disk is never full: this machine allows nobody a mount namespace of his own")
         began = time.monotonic()
-        for number in range(kills):
+        # Each way comes, whatever the dice say.
+        order = [*ways, *chance.choices(sorted(ways), k=max(0, kills - len(ways)))][:kills]
+        chance.shuffle(order)
+        for number, what in enumerate(order):
             threading.Event().wait(chance.uniform(_LEAST_S, _MOST_S))
-            what = chance.choice(sorted(ways))
-            say(f"kill {number + 1} of {kills}: {what}")
+            say(f"{number + 1} of {kills}: {what}")
             restarts.append(ways[what]())
             killed[what] += 1
         seconds = time.monotonic() - began
@@ -95,7 +138,48 @@ def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Ki
         driving.close()
         say("counting")
         found = {car.robot: _summarized(up, car.robot) for car in cars}
-    return Kills(dict(killed), seed, seconds, Spread.of([one for one in restarts if one]), found)
+        open_s = _open_s(cloud, agent_kills)
+    return Kills(
+        killed=dict(killed),
+        seed=seed,
+        seconds=seconds,
+        restart_s=Spread.of([one for one in restarts if one]),
+        cars=found,
+        agent_kills=dict(Counter(one.robot for one in agent_kills)),
+        open_s=open_s,
+    )
+
+
+def _full(small: disk.Disk, up: Up, seconds: float) -> float:
+    """Let the disk be full. Raises `BenchError` if a batch is stored all the same."""
+    # It starts with free space only.
+    up.wait_until_whole()
+    with small.full():
+        # A batch that was written before may still have to be acknowledged.
+        threading.Event().wait(1.0)
+        before = _stored(up.cloud)
+        threading.Event().wait(seconds)
+        after = _stored(up.cloud)
+    if after != before:
+        raise BenchError(f"{after - before} batches were stored on a full disk")
+    return 0.0
+
+
+def _stored(cloud: Cloud) -> int:
+    return sum(1 for i in range(CARS) for _ in audit.headers(cloud, f"car{i + 1}", VESC_STREAM))
+
+
+def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[float]]:
+    """How long before each kill of an agent the last stored sample of that run was taken."""
+    found = defaultdict(list)
+    for robot in dict.fromkeys(one.robot for one in agent_kills):
+        batches = counts.batches(cloud, robot, VESC_STREAM)
+        times_us = [time_us for batch in batches for time_us in batch.times_us]
+        for one in agent_kills:
+            of_run = [time_us for time_us in times_us if one.started_us <= time_us <= one.killed_us]
+            if one.robot == robot and of_run:
+                found[robot].append(round((one.killed_us - max(of_run)) / 1e6, 3))
+    return dict(found)
 
 
 def _summarized(up: Up, robot: str) -> Counted:

@@ -28,6 +28,11 @@ def write(folder: Path, killed: Kills | None, soaked: Soak | None, figures: dict
         parts += [f"## Killed\n\n{table.title}.", table.as_markdown()]
         if killed.restart_s and killed.restart_s.p50 is not None:
             parts.append(f"The emulator answered again after {killed.restart_s.p50:.1f} s (median).")
+        if killed.open_s:
+            parts.append(
+                "`open s`: how long before each kill of an agent its last stored sample was taken. What came "
+                "after that was in the batch of a second that was still open."
+            )
     if soaked:
         table = soaked.table()
         title = "Memory of five cars' cloud"

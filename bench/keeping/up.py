@@ -19,7 +19,9 @@ from typing_extensions import Self
 from bench import ROOT
 from bench.errors import BenchError
 from bench.meters import usage
+from iort_station import kept
 from iort_station.cloud import EMBEDDED, Cloud
+from iort_station.errors import StationError
 from local.processes import Child
 
 _FIRST_S, _AGAIN_S = 600.0, 120.0
@@ -75,10 +77,21 @@ class Up:
             _kill(usage.descendants(pid))
         return 0.0
 
+    def wait_until_whole(self) -> None:
+        """Wait until `make up` has done everything that belongs to a start."""
+
+        def whole() -> bool:
+            with suppress(StationError, OSError):
+                return kept.Up.load(self.state).pids["up"] == self._child.pid
+            return False
+
+        self._wait_for(whole, _AGAIN_S)
+
     def _start(self) -> None:
         self._child = Child(
             "make up",
-            [sys.executable, "-m", "local.up.run", "--state", str(self.state)],
+            # The machine may have a cloud of its user, too.
+            [sys.executable, "-m", "local.up.run", "--state", str(self.state), "--ports", "any"],
             environment=dict(os.environ),
             cwd=ROOT,
             log=self.state.parent / "up.log",

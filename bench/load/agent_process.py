@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -24,21 +25,34 @@ class AgentProcess:
     """The agent of a bundle; it runs from `__enter__` to `__exit__`, which stops it in good order."""
 
     def __init__(self, bundle: Bundle, *, drain_s: float = 60.0) -> None:
+        self.robot = bundle.robot
         self._bundle = bundle
         self._report = bundle.folder / "report.json"
         self._drain_s = drain_s
         self.process: subprocess.Popen[bytes]
 
     def __enter__(self) -> Self:
-        config = ["--config", str(self._bundle.config), "--report", str(self._report)]
         self._log = tempfile.TemporaryFile()
+        self._start()
+        return self
+
+    def kill(self) -> int:
+        """SIGKILL, and a new start in the same folder; returns the time of the kill in us since the epoch."""
+        killed_us = time.time_ns() // 1000
+        self.process.kill()
+        self.process.wait()
+        self._start()
+        return killed_us
+
+    def _start(self) -> None:
+        self.started_us = time.time_ns() // 1000
+        config = ["--config", str(self._bundle.config), "--report", str(self._report)]
         self.process = subprocess.Popen(
             [_COMMAND, "run", *config, "--drain-s", str(self._drain_s)],
             cwd=ROOT,
             stdout=subprocess.DEVNULL,
             stderr=self._log,
         )
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -20,8 +20,8 @@ from bench.errors import BenchError
 from bench.load.tries import Heard
 from bench.ros.graph import RosGraph
 from iort_station.fleet import robots
-from iort_station.page import control, socket
-from iort_station.page.answers import actions, answers
+from iort_station.page.answers import control, socket
+from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.proxy import Proxy

@@ -19,7 +19,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.topics import LIVE, PING, PONG, build_topic, record_topic
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 
 WAIT_S = 30.0
 _WHO = """
@@ -106,7 +106,7 @@ class ProbeFixture:
 
     def stored(self) -> list[Batch]:
         """Return the first robot's batches in the telemetry table."""
-        return list(delivery.batches(self.cloud, self.a, VESC_STREAM))
+        return list(counts.batches(self.cloud, self.a, VESC_STREAM))
 
     def live_until(self, client: RawClient, true: Callable[[], object], what: str) -> None:
         """Publish live samples until ``true``; the first may be stale before a cold function starts."""

@@ -18,9 +18,9 @@ from bench.report.spread import spread, text
 from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_station.operations import audit, trace
+from iort_station.operations.delivery import audit, trace
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from iort_station.page.page import BUILT
 from iort_station.page.server import PageServer
 from local.figures import THESIS

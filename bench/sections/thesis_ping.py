@@ -23,7 +23,7 @@ from iort_contract.tables import T_US
 from iort_contract.topics import BROKER, PING_PATHS
 from iort_station.fleet.robots import Bundle
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from local.figures import THESIS, THESIS_MS
 from local.proxy import Proxy
 

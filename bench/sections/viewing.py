@@ -26,7 +26,7 @@ from iort_station.fleet import viewing
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.page import keys
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 
 ROBOT = "bench-viewing"
 IDLE_S, WATCHED_S, WAKES = 60, 20, 20

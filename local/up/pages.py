@@ -13,11 +13,11 @@ from typing_extensions import Self
 from iort_contract.cloud import IOT
 from iort_station.cloud import Cloud
 from iort_station.fleet import registry
-from iort_station.page import control
-from iort_station.page.answers import actions, answers
-from iort_station.page.downloads import downloads
+from iort_station.page.answers import control
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import actions, answers
+from iort_station.page.answers.socket import reaching
 from iort_station.page.server import PageServer
-from iort_station.page.socket import reaching
 from local.cloud import EmbeddedCloud
 from local.network.listen import Listen
 from local.up.login import Password
@@ -44,7 +44,7 @@ class Pages:
                 password = Password(embedded.folder)
                 self.new_password = password.make()
                 # The broker is at the page's own address, behind the same login.
-                socket = f"wss://{listen.in_url}:{port}{SOCKET}"
+                socket = f"wss://{listen.at(port)}{SOCKET}"
                 self.network = stack.enter_context(
                     NetworkPage(
                         listen,

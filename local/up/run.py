@@ -27,13 +27,14 @@ from iort_station.errors import StationError
 from local.certificates import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
-from local.network.listen import Listen
+from local.network.listen import Listen, is_ipv6
 from local.state import VERSION, StateFolder
 from local.up import notify
 from local.up.pages import Pages
 
 # Closes again what an earlier start has opened.
 NO = "no"
+_PAGE = "PAGE"
 _LOOK_S = 1.0
 _RENEW_S = 3600.0
 # An emulator that ends by itself is started again, unless that happens so often in this time.
@@ -72,7 +73,10 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="make up",
-        usage="make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1]",
+        usage=(
+            "make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1] "
+            "[PORTS=any]"
+        ),
         description="Run the stacks in a cloud of your own, which is kept.",
     )
     add_state(parser)
@@ -101,12 +105,18 @@ def add_network(parser: argparse.ArgumentParser) -> None:
         choices=["0", "1"],
         help="let what was acknowledged survive a power cut, too; remembered",
     )
+    parser.add_argument(
+        "--ports",
+        choices=["any"],
+        help="at the first start take any free ports and leave the usual ones to another cloud; remembered",
+    )
 
 
 class _Kept:
     def __init__(self, options: argparse.Namespace, stopped: threading.Event) -> None:
         self._options, self._stopped = options, stopped
         self._state = StateFolder(options.state, kept=True)
+        # Of this start, and of the first one.
         self._began, self._started_s = time.monotonic(), time.time()
 
     def run(self) -> None:
@@ -122,13 +132,15 @@ class _Kept:
                 _say(f"{ended}\nIt is started again")
 
     def _once(self) -> None:
+        self._began = time.monotonic()
         settings = self._settings()
-        listen, page = (_listen(settings[name], name.upper()) for name in ("listen", "page"))
+        listen, page = (_listen(settings[name.lower()], name) for name in ("LISTEN", _PAGE))
         embedded = EmbeddedCloud(
             self._state.path,
             live=IOT,
             progress=self._step,
             kept=True,
+            any_ports=settings["any_ports"],
             power_cut=settings["power_cut"],
             listen=listen,
             # systemd tells a service so that its output is the journal's.
@@ -166,7 +178,8 @@ class _Kept:
         given = {"listen": options.listen, "page": options.page}
         found = {name: known.get(name, NO) if text is None else text for name, text in given.items()}
         power_cut = known.get("power_cut", False) if options.power_cut is None else options.power_cut == "1"
-        return {**found, "power_cut": power_cut}
+        any_ports = known.get("any_ports", False) or options.ports == "any"
+        return {**found, "power_cut": power_cut, "any_ports": any_ports}
 
     def _write(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
         up = kept.Up(
@@ -209,7 +222,7 @@ class _Kept:
                 how = f"password {pages.new_password} (shown once; `make up-password{state}` sets another)"
             told.append(("page, network", f"{pages.network.url}, {how}"))
         if embedded.listen:
-            where = f"{embedded.listen.host}:{embedded.ports['mqtt']}"
+            where = embedded.listen.at(embedded.ports["mqtt"])
             told.append(
                 ("cars", f"connect to {where} on {embedded.listen.address}; files go to {embedded.files_url}")
             )
@@ -226,6 +239,9 @@ def _listen(text: str, what: str) -> Listen | None:
     if text == NO:
         return None
     listen = Listen.parse(text, what)
+    if what == _PAGE and is_ipv6(listen.host):
+        # A Content-Security-Policy cannot name such an address, so the browser would refuse the broker.
+        raise LocalError(f"{what} must have a name after an IPv6 address, such as {what}={text},iort.lab")
     listen.check(what)
     return listen
 

@@ -28,6 +28,8 @@ Wants=network-online.target
 Type=notify
 WorkingDirectory=$root
 ExecStart=$command
+# Its name in the journal.
+SyslogIdentifier=iort-cloud
 Restart=on-failure
 RestartSec=5
 # The first start deploys everything.
@@ -47,7 +49,7 @@ def main() -> None:
     """Write the unit, and start it: a service of the machine for root, and of the user for others."""
     parser = argparse.ArgumentParser(
         prog="make up-service",
-        usage="make up-service [STATE=folder] [LISTEN=...] [PAGE=...] [POWER_CUT=1] [REMOVE=1]",
+        usage="make up-service [STATE=folder] [LISTEN=...] [PAGE=...] [POWER_CUT=1] [PORTS=any] [REMOVE=1]",
         description="Run `make up` as a service of systemd.",
     )
     add_state(parser)
@@ -58,7 +60,7 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="print the unit, and change nothing")
     options = parser.parse_args()
     given = ["--state", str(options.state)]
-    for name in ("listen", "page", "power_cut"):
+    for name in ("listen", "page", "power_cut", "ports"):
         if getattr(options, name) is not None:
             given += [f"--{name.replace('_', '-')}", getattr(options, name)]
     of_machine = os.geteuid() == 0

@@ -11,11 +11,11 @@ import pytest
 from iort_agent.errors import AgentError
 from iort_agent.status.server import SOCKET, fetch
 from iort_station.fleet import robots
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import embedded, until  # noqa: F401 - a fixture
 from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
-from tests.ros.mixed_robot import TOPICS
+from tests.ros.mixed.robot import TOPICS
 
 SECONDS = 10
 NAMES = ("/beacons", "/joint_states")
@@ -29,7 +29,7 @@ def stored(
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
-) -> dict[str, delivery.Delivery]:
+) -> dict[str, counts.Delivery]:
     """Return the stored batches of either stream."""
     folder = tmp_path_factory.mktemp("two")
     topics = {name: {"stream": TOPICS[name].stream, "time": "header"} for name in NAMES}
@@ -58,7 +58,7 @@ def stored(
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()
-    return {name: delivery.delivery(embedded.cloud, car.robot, name) for name in SENT}
+    return {name: counts.delivery(embedded.cloud, car.robot, name) for name in SENT}
 
 
 def _publisher(graph: Graph, node: str, folder: Path):
@@ -69,12 +69,12 @@ def _publisher(graph: Graph, node: str, folder: Path):
 
 
 @pytest.mark.parametrize("stream", SENT)
-def test_every_message_is_stored(stored: dict[str, delivery.Delivery], stream: str) -> None:
+def test_every_message_is_stored(stored: dict[str, counts.Delivery], stream: str) -> None:
     assert stored[stream].samples_stored == SENT[stream]
 
 
 @pytest.mark.parametrize("stream", SENT)
 def test_batches_per_second_stay_within_the_number_of_clocks(
-    stored: dict[str, delivery.Delivery], stream: str
+    stored: dict[str, counts.Delivery], stream: str
 ) -> None:
     assert stored[stream].batches_stored <= MOST_PER_S[stream] * (SECONDS + 2)

@@ -9,7 +9,8 @@ import time
 from bench.target import Target
 from iort_agent.errors import IdentityError
 from iort_agent.verbs import provision
-from iort_station.fleet import certificates, claims, robots, rotation
+from iort_station.fleet import robots
+from iort_station.fleet.identity import certificates, claims, rotation
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal, soon_refused
@@ -34,7 +35,7 @@ POLICY = "verify-policy"
     source=f"{_GUIDE}/provision-wo-cert.html and {_GUIDE}/life-cycle-events.html",
     relied_on_by=(
         "device/iort_agent/verbs/provision.py",
-        "station/iort_station/fleet/rotation.py",
+        "station/iort_station/fleet/identity/rotation.py",
         "functions/presence.py",
     ),
 )
@@ -104,7 +105,10 @@ def policy_deleted_after_detach(target: Target) -> Seen:
     "removal.robot_removed",
     expected={"session_ended": True, "connects_again": False},
     source=f"{_MQTT} and {_API}/API_DeleteCertificate.html",
-    relied_on_by=("station/iort_station/fleet/robots.py", "station/iort_station/fleet/certificates.py"),
+    relied_on_by=(
+        "station/iort_station/fleet/robots.py",
+        "station/iort_station/fleet/identity/certificates.py",
+    ),
 )
 def robot_removed(target: Target) -> Seen:
     """`iort robots remove` ends the robot's session and deletes its certificate, its thing and its row in a
@@ -123,7 +127,7 @@ def robot_removed(target: Target) -> Seen:
     "removal.certificate_deactivated",
     expected={"connects_before": True, "connects_after": False},
     source=f"{_API}/API_UpdateCertificate.html",
-    relied_on_by=("station/iort_station/fleet/rotation.py", "device/iort_agent/mqtt/failures.py"),
+    relied_on_by=("station/iort_station/fleet/identity/rotation.py", "device/iort_agent/mqtt/failures.py"),
 )
 def certificate_deactivated(target: Target) -> Seen:
     """A certificate that is not active does not connect."""

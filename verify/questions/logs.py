@@ -88,7 +88,7 @@ def metric(target: Target) -> Seen:
     relied_on_by=(
         "stacks/monitoring/dashboards.py",
         "functions/shared/metrics.py",
-        "station/iort_station/operations/log_records.py",
+        "station/iort_station/operations/monitoring/log_records.py",
         "local/patches/log_records.patch",
     ),
 )

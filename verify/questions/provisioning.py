@@ -24,7 +24,8 @@ from iort_contract.tables import (
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
 )
-from iort_station.fleet import certificates, claims, registry
+from iort_station.fleet import registry
+from iort_station.fleet.identity import certificates, claims
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.robot import refusal
@@ -100,7 +101,7 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
     expected=_MADE,
     source=f"{_PROVISION} and {_HOOK}",
     relied_on_by=(
-        "station/iort_station/fleet/claims.py",
+        "station/iort_station/fleet/identity/claims.py",
         "functions/admit.py",
         "device/iort_agent/verbs/provision.py",
         "stacks/fleet.py",
@@ -118,7 +119,11 @@ def claim_for_minutes(target: Target) -> Seen:
     "provisioning.claim_that_lasts",
     expected=_MADE,
     source=f"{_PROVISION} and {_HOOK}",
-    relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/parts/documents.py"),
+    relied_on_by=(
+        "station/iort_station/fleet/identity/claims.py",
+        "functions/admit.py",
+        "stacks/parts/documents.py",
+    ),
 )
 def claim_that_lasts(target: Target) -> Seen:
     """A claim certificate with the fleet's claim policy is exchanged in the same way."""

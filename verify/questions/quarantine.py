@@ -10,7 +10,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_contract.topics import rule_name
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from iort_station.operations.replay import replay
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, listed, only_entry, send, topic
@@ -18,7 +18,7 @@ from verify.tools.waiting import until
 
 
 def _summarized(target: Target, robot: str) -> int:
-    return delivery.samples_summarized(target.cloud, robot, VESC_STREAM)
+    return counts.samples_summarized(target.cloud, robot, VESC_STREAM)
 
 
 @question(

@@ -189,7 +189,7 @@ class SettingsAnswer(TypedDict):
 
 
 class DriveLimitsEntry(TypedDict):
-    """What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`."""
+    """What a stick drives, and how far: `iort_contract.messages.control.driving.DriveLimits`."""
 
     command: str
     speed: str

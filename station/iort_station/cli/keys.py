@@ -6,7 +6,7 @@ last. So a key counts as held until its repetitions fail to come. The car then s
 
 from __future__ import annotations
 
-from iort_station.fleet.driving import Stick
+from iort_station.fleet.control.driving import Stick
 
 # The longest usual time from a press to its first repetition, and several times the time between two.
 FIRST_US, NEXT_US = 700_000, 200_000

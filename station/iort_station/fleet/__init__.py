@@ -1,2 +1,1 @@
-"""Robots and what belongs to them: registry rows, claims, certificates, shadows, files. It uses the contract
-and `iort_station.cloud`."""
+"""Robots and what belongs to them. It uses the contract and `iort_station.cloud`."""

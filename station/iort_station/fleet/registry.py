@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from decimal import Decimal
 from typing import Any, NamedTuple
 
+from iort_contract.catalog import derived
 from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
@@ -25,6 +27,9 @@ from iort_contract.tables import (
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
+
+# The vehicle parameters of a row whose owner gives none.
+F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
 
 
 def checked(robot: str) -> str:

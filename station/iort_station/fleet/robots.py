@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract.catalog import derived
 from iort_contract.catalog.analysis.car import KNOWN
 from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import certificates, registry
-from iort_station.fleet.bundle import Bundle, configure, write_bundle
-from iort_station.fleet.registry import listed
+from iort_station.fleet import registry
+from iort_station.fleet.identity import certificates
+from iort_station.fleet.identity.bundle import Bundle, configure, write_bundle
+from iort_station.fleet.registry import F1TENTH, listed
 
 __all__ = ["F1TENTH", "Bundle", "add", "checked_vehicle", "configure", "listed", "remove"]
 
 GAIN = "speed_to_erpm_gain"
-F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
-
-
 # Values beyond these are typing errors.
 _MOST, _LEAST = 1e9, 1e-9
 

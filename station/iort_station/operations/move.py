@@ -42,7 +42,7 @@ from iort_station.data.batches import ahead, telemetry_table, topic_of
 from iort_station.data.recorded import Recorded
 from iort_station.errors import StationError
 from iort_station.fleet import registry, robots, tags
-from iort_station.operations.audit import Audit, audit, headers
+from iort_station.operations.delivery.audit import Audit, audit, headers
 from iort_station.recordings.adopt import UNITS_PER_S, write
 
 # What a registry's row says of the deployment and not of the robot.

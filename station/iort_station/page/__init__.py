@@ -1,1 +1,1 @@
-"""The live page: its server, answers, configuration and listener. It uses every room but the commands."""
+"""The live page: its server, files and configuration. It uses every room but the commands."""

@@ -13,7 +13,7 @@ from iort_contract.tables import ONLINE
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
-from iort_station.operations import alarms
+from iort_station.operations.monitoring import alarms
 from iort_station.upkeep.finding import FAIL, OK, Finding, graded
 
 _MINUTES = 5

@@ -13,7 +13,8 @@ from bench import run, spending
 from bench.load.events import live_event
 from bench.sections import SECTIONS, utilisation
 from bench.target import AWS, open_target
-from iort_station.fleet import certificates, robots
+from iort_station.fleet import robots
+from iort_station.fleet.identity import certificates
 
 
 def memory_mb(cloud) -> int:

@@ -17,7 +17,7 @@ import pytest
 from iort_agent.sources import OK, Finding
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until
 from tests.local.faults.test_uplink import self_signed, set_status
@@ -151,5 +151,5 @@ def _state(config: Path) -> Any:
 
 
 def _own_samples(embedded: Any, robot: str) -> dict[str, Any] | None:
-    found = list(delivery.batches(embedded.cloud, robot, AGENT_STREAM))
+    found = list(counts.batches(embedded.cloud, robot, AGENT_STREAM))
     return dict(found[-1].columns) if found else None

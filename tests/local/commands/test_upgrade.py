@@ -14,7 +14,8 @@ from iort_contract.messages.batch import Batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station import data
-from iort_station.operations import delivery, quarantine
+from iort_station.operations import quarantine
+from iort_station.operations.delivery import counts
 from tests.local.conftest import until
 from tests.unit.station.old_messages import old_envelope, old_message
 from verify.tools.robot import Robot
@@ -70,21 +71,21 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
         done = iort("adopt", "telemetry-of-before", "--robot", car.robot, "--json", *options)
         said = json.loads(done.stdout)
         assert done.exit_code == 1, done.output
-        counts = {"robot": car.robot, "stream": "vesc", "batches": BATCHES, "samples": BATCHES * EACH}
-        assert said["adopted"] == [counts]
+        expected = {"robot": car.robot, "stream": "vesc", "batches": BATCHES, "samples": BATCHES * EACH}
+        assert said["adopted"] == [expected]
         (left,) = said["left"]
         assert (left["key"], left["cause"]) == ("-7", "time must be from 1970 on, got -7 us")
 
     def there():
-        items = sorted(delivery.items(cloud, car.robot, "vesc"), key=lambda item: item["batch"])
+        items = sorted(counts.items(cloud, car.robot, "vesc"), key=lambda item: item["batch"])
         found = data.query(cloud, car.robot, "vesc", fields=["speed"])
         summary = data.query(cloud, car.robot, "vesc", summary=True, fields=["speed"])
         return items, found.columns["speed"].tolist(), summary.columns["speed_max"].tolist()
 
     adopted("--dry-run")
-    assert list(delivery.items(cloud, car.robot, "vesc")) == []
+    assert list(counts.items(cloud, car.robot, "vesc")) == []
     adopted()
-    until(lambda: delivery.samples_summarized(cloud, car.robot, "vesc") == BATCHES * EACH)
+    until(lambda: counts.samples_summarized(cloud, car.robot, "vesc") == BATCHES * EACH)
     items, speeds, fastest = there()
     assert speeds == list(range(BATCHES * EACH))
     assert fastest == [i * EACH + EACH - 1 for i in range(BATCHES)]
@@ -121,12 +122,12 @@ def test_a_message_of_an_old_agent_waits_in_quarantine_and_is_put_back_once(embe
     assert {entry.source for entry in entries} == {"rule iort_record"}
     payloads = {quarantine.load(cloud, entry).payload for entry in entries}
     assert payloads == {old_message(batch) for batch in batches}
-    assert list(delivery.items(cloud, car.robot, "vesc")) == []
+    assert list(counts.items(cloud, car.robot, "vesc")) == []
     done = iort("replay-errors", "--robot", car.robot)
     assert (done.exit_code, "3 replayed" in done.stdout) == (0, True), done.output
-    stored = list(delivery.batches(cloud, car.robot, "vesc"))
+    stored = list(counts.batches(cloud, car.robot, "vesc"))
     assert [(batch.id, list(batch.times_us)) for batch in stored] == [(b.id, b.times_us) for b in batches]
     assert [batch.columns for batch in stored] == [batch.columns for batch in batches]
-    until(lambda: delivery.samples_summarized(cloud, car.robot, "vesc") == 3 * EACH)
+    until(lambda: counts.samples_summarized(cloud, car.robot, "vesc") == 3 * EACH)
     assert list(quarantine.entries(cloud, robot=car.robot)) == []
     assert iort("audit", car.robot, "--stream", "vesc", "--from-start").exit_code == 0

@@ -15,7 +15,8 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
-from iort_station.operations import archive, audit
+from iort_station.operations import archive
+from iort_station.operations.delivery import audit
 from iort_station.recordings import export, recordings
 from local.cloud import EmbeddedCloud
 

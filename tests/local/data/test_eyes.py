@@ -10,7 +10,7 @@ import pytest
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
-from iort_station.operations import cloudwatch, cloudwatch_logs
+from iort_station.operations.monitoring import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
 from verify.tools.robot import Robot
 

@@ -11,8 +11,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ, Value
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE, build_topic
-from iort_station.page import socket
-from iort_station.page.answers import actions, answers
+from iort_station.page.answers import socket
+from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.proxy import Proxy
 from tests.browser import plain, show, shown, until

@@ -17,8 +17,8 @@ from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import STATS
 from iort_contract.topics import LIVE, RECORD, build_topic
 from iort_station import data
-from iort_station.operations import delivery
-from iort_station.page.listener import Listener
+from iort_station.operations.delivery import counts
+from iort_station.page.live.listener import Listener
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
 from tests.local.conftest import run_agent, until
@@ -47,11 +47,11 @@ def test_a_simulated_drive_arrives_completely_on_both_lanes(embedded, bundle):
         until(lambda: listener.heard and agent.status().get("streams", {}).get("vesc", {}).get("samples"))
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == driven)
-    found = delivery.delivery(embedded.cloud, car.robot, "vesc")
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc") == driven)
+    found = counts.delivery(embedded.cloud, car.robot, "vesc")
     assert (found.samples_stored, found.batches_missing) == (driven, 0)
     assert {heard.robot for heard in listener.heard} == {car.robot}
-    trips = round_trips(delivery.batches(embedded.cloud, car.robot, RTT_STREAM))
+    trips = round_trips(counts.batches(embedded.cloud, car.robot, RTT_STREAM))
     assert all(spread.n >= 1 and spread.p50 is not None for spread in trips.values()), trips
 
 
@@ -64,7 +64,7 @@ def test_a_recorded_drive_arrives_completely_and_exactly(embedded, bundle):
         live={"enabled": False},
     )
     run_agent(car)
-    stored = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    stored = list(counts.batches(embedded.cloud, car.robot, "vesc"))
     assert sum(len(batch.times_us) for batch in stored) == 2244
     with AnyReader([path]) as reader:
         connections = [c for c in reader.connections if c.topic == "/sensors/core"]
@@ -72,13 +72,13 @@ def test_a_recorded_drive_arrives_completely_and_exactly(embedded, bundle):
     for field in (name for name, f in VESC_FIELDS.items() if 1 in f.ros):
         kept = [value for batch in stored for value in batch.columns[field]]
         assert kept == [getattr(state, field) for state in sent], field
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
 
 
 def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20, "duration_s": 2}])
     run_agent(car)
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
     topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
     items = embedded.cloud.client("dynamodb").query(
         TableName=embedded.cloud.output("storage", "SummaryTable"),

@@ -12,12 +12,12 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from iort_station.fleet import robots
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import run_agent
 from tests.local.data.drives import Agent
-from tests.ros.mixed_compare import compare, read
-from tests.ros.mixed_robot import TOPICS, Maker, Topic
+from tests.ros.mixed.compare import compare, read
+from tests.ros.mixed.robot import TOPICS, Maker, Topic
 from tests.ros1_types import Message, header
 from tests.unit.station.test_round_trip import KNOWN
 
@@ -59,7 +59,7 @@ def test_a_recording_played_twice_is_stored_twice(
     for _ in range(2):
         assert run_agent(car)["streams"]["count"]["samples"] == COUNT
     runs: Counter[str] = Counter()
-    for batch in delivery.batches(embedded.cloud, car.robot, "count"):
+    for batch in counts.batches(embedded.cloud, car.robot, "count"):
         runs[batch.boot] += len(batch.times_us)
     assert sorted(runs.values()) == [COUNT, COUNT]
 

@@ -20,7 +20,7 @@ import pytest
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.fleet import robots
-from iort_station.operations import accounts, audit, delivery
+from iort_station.operations.delivery import accounts, audit, counts
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
@@ -114,13 +114,13 @@ def test_a_network_fault_loses_no_sample(embedded, drives, name):
     assert counted(embedded, robot) == list(range(DRIVE_S * RATE_HZ))
     assert report["spool"]["dropped_samples"] == 0
     assert report["streams"]["vesc"]["samples"] == DRIVE_S * RATE_HZ
-    until(lambda: delivery.samples_summarized(embedded.cloud, robot, "vesc") == DRIVE_S * RATE_HZ)
+    until(lambda: counts.samples_summarized(embedded.cloud, robot, "vesc") == DRIVE_S * RATE_HZ)
     if name != "slow":
         assert agent.said("connected to")
 
 
 def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
-    from iort_station.page.listener import Listener
+    from iort_station.page.live.listener import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port), live={"when": "always"})
@@ -186,11 +186,11 @@ def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
     threading.Event().wait(3)
     clock.write_text("-1h")
     report = agent.report()
-    batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    batches = list(counts.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(10 * RATE_HZ))
     # The clock was really set, and the car measured the change.
-    own = delivery.batches(embedded.cloud, car.robot, AGENT_STREAM)
+    own = counts.batches(embedded.cloud, car.robot, AGENT_STREAM)
     offsets_ms = [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
     assert max(offsets_ms) > 3_590_000, offsets_ms
     assert report["spool"]["left_samples"] == 0
@@ -263,7 +263,7 @@ def test_a_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage)
     assert report["spool"]["dropped_samples"] == sum(samples for _, samples, _ in lost[:known])
 
     # The table has everything else in order, and each missing number was lost.
-    batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    batches = list(counts.batches(embedded.cloud, car.robot, "vesc"))
     stored = [(batch.seq, len(batch.times_us)) for batch in batches]
     assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
     found = counted(embedded, car.robot)[sum(samples for _, samples, _ in kept) :]
@@ -281,7 +281,7 @@ def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
     agent = Agent(car)
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc"))
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc"))
     # The revocation also ends the session; on AWS, within minutes.
     set_status(embedded, car.robot, "REVOKED")
     until(lambda: agent.said("inactive or revoked"), seconds=120)

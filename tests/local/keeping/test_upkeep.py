@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,16 @@ from iort_station import kept
 from iort_station.cli.main import app
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.deployment import ROOT
-from local.state import StateFolder
 from tests.local.conftest import until
-from tests.ports import free_port
 
 
 @contextmanager
 def up(folder: Path) -> Iterator[Cloud]:
     """The cloud of `make up`, from its start to its stop."""
-    command = [sys.executable, "-m", "local.up.run", "--state", folder]
+    # The usual ports may be those of a cloud of this machine.
+    command = [sys.executable, "-m", "local.up.run", "--state", folder, "--ports", "any"]
     log = folder.with_suffix(".txt")
     with (
         log.open("w") as output,
@@ -51,7 +50,7 @@ def iort(folder: Path) -> Callable[..., Any]:
 
 def stored(cloud: Cloud) -> list[tuple[str, int]]:
     """The batches of the car: run and number."""
-    return [(one.boot, one.seq) for one in delivery.batches(cloud, "car1", VESC_STREAM)]
+    return [(one.boot, one.seq) for one in counts.batches(cloud, "car1", VESC_STREAM)]
 
 
 def findings(folder: Path, status: int) -> dict[str, Any]:
@@ -62,11 +61,6 @@ def findings(folder: Path, status: int) -> dict[str, Any]:
 
 def test_a_backup_of_a_cloud_that_a_car_writes_to_has_everything_so_far(tmp_path):
     folder, archive, restored = tmp_path / "cloud", tmp_path / "cloud.tar", tmp_path / "restored"
-    with ExitStack() as stack:
-        state = StateFolder(folder, kept=True)
-        state.take(stack)
-        # The usual ports may be those of a cloud of this machine.
-        state.remember(ports={name: free_port() for name in ("gateway", "mqtt", "pubnub", "relay", "page")})
     with up(folder) as cloud:
         source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}
         car = robots.add(cloud, "car1", out=tmp_path, settings={"sources": [source]})

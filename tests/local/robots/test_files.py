@@ -27,7 +27,7 @@ from rosbags.rosbag1 import Reader
 from iort_agent.clock import SystemClock
 from iort_agent.files.file import read
 from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
-from iort_contract.messages.files import (
+from iort_contract.messages.requests.files import (
     FILES_PREFIX,
     PART_BYTES,
     Address,
@@ -40,7 +40,7 @@ from iort_contract.messages.files import (
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
 from iort_station.fleet import files, robots
-from iort_station.operations import delivery
+from iort_station.operations.delivery import counts
 from local.deployment import ROOT
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
@@ -153,7 +153,7 @@ def test_pictures_of_a_recording_are_uploaded_as_attachments(embedded, bundle, b
     agent = Agent(car)
     report = agent.report()
     columns: dict[str, list[Any]] = {}
-    for batch in delivery.batches(embedded.cloud, car.robot, "camera"):
+    for batch in counts.batches(embedded.cloud, car.robot, "camera"):
         for name, values in batch.columns.items():
             columns.setdefault(name, []).extend(values)
     assert columns["format"] == ["jpeg"] * 4

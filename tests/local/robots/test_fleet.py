@@ -25,7 +25,8 @@ from iort_contract.tables import (
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.errors import StationError
-from iort_station.fleet import certificates, claims, registry, robots, rotation
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import certificates, claims, rotation
 from local.cloud import ROOT
 from tests.local.conftest import until
 from verify.tools.robot import STALE, Robot

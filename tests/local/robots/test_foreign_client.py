@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from iort_station.fleet import claims, registry, robots
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import claims
 from iort_station.operations import quarantine
-from iort_station.page.listener import Listener
+from iort_station.page.live.listener import Listener
 from local.deployment import ROOT
 from tests.local.conftest import recorded, until
 

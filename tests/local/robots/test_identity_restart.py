@@ -18,7 +18,8 @@ import pytest
 from functions.admit import SETTLED_MS
 from iort_agent.identity.certificate import parse_certificate
 from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
-from iort_station.fleet import claims, registry
+from iort_station.fleet import registry
+from iort_station.fleet.identity import claims
 from local.cloud import ROOT
 from tests.local.robots.test_identity import certificates, command
 from verify.tools.robot import Robot

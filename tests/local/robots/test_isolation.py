@@ -17,7 +17,8 @@ from ministack.services import iot
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import CMD, FLEET, PING, PONG, RULE, build_topic
-from iort_station.fleet import claims, robots
+from iort_station.fleet import robots
+from iort_station.fleet.identity import claims
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
 from verify.tools.robot import Robot, payload_for

@@ -19,7 +19,7 @@ from iort_contract.topics import LIVE, build_topic
 from iort_station.errors import StationError
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role, signed_url
-from iort_station.page import socket
+from iort_station.page.answers import socket
 from tests.isolation import (
     CONNECT,
     DRIVER,

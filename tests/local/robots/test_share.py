@@ -16,8 +16,8 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
 from iort_station.data.batches import summary_table, topic_of
-from iort_station.fleet import shadow
-from iort_station.operations import delivery
+from iort_station.fleet.control import shadow
+from iort_station.operations.delivery import counts
 from tests.local.conftest import until
 from verify.tools.robot import Robot
 
@@ -57,7 +57,7 @@ def test_expensive_batches_of_one_robot_do_not_delay_other_robots(embedded, bund
     assert shadow.over_share(embedded.cloud, good.robot) is None
     shown = json.loads(iort("robots", "show", bad.robot, "--json").stdout)
     assert shown[OVER_SHARE]["batches"] >= over.batches
-    stored = list(delivery.batches(embedded.cloud, bad.robot, VESC_STREAM))
+    stored = list(counts.batches(embedded.cloud, bad.robot, VESC_STREAM))
     assert [batch.seq for batch in stored] == list(range(count))
     # After the robot has stopped, the waiting batches are summarised automatically.
     until(lambda: len(seconds_of(embedded, bad.robot)) >= count, seconds=600)

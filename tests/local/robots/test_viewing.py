@@ -9,8 +9,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
 from iort_contract.messages.viewing import VIEW_LEASE_MS
 from iort_station.fleet.viewing import Viewer
-from iort_station.page.answers import actions
-from iort_station.page.listener import Listener
+from iort_station.page.answers.index import actions
+from iort_station.page.live.listener import Listener
 from iort_station.page.server import PageServer
 from tests.local.conftest import until
 from tests.local.data.drives import Agent

@@ -19,7 +19,7 @@ from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
 from iort_contract.tables import RECEIVED_MS
-from iort_station.page.answers import history
+from iort_station.page.answers.history import history
 from tests.fakes import TELEMETRY, item_of_message, record_of
 from tests.ros1_types import Message, header
 from tests.unit.functions.summary.summarizing import Stream

@@ -10,7 +10,7 @@ import pytest
 
 from iort_contract.catalog.metrics import METRICS
 from iort_station.errors import StationError
-from iort_station.operations import alarms
+from iort_station.operations.monitoring import alarms
 from tests.fakes import ROBOTS, serialize
 from tests.unit.station.test_data import FakeCloud, cloud_of
 

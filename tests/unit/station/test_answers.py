@@ -10,7 +10,8 @@ import pytest
 from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
-from iort_station.page.answers import MAX_ROWS, answers, history
+from iort_station.page.answers.history import MAX_ROWS, history
+from iort_station.page.answers.index import answers
 from tests.unit.station.test_data import START, cloud_of, ride
 
 ASKED = {

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from iort_station.errors import StationError
-from iort_station.operations import cloudwatch_logs
-from iort_station.operations.log_records import readable
+from iort_station.operations.monitoring import cloudwatch_logs
+from iort_station.operations.monitoring.log_records import readable
 
 NOW_S = 1_700_000_000
 NAME = "iort-platform"

@@ -10,7 +10,7 @@ from iort_contract.catalog.analysis.parameters import GROUPS
 from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.errors import StationError
-from iort_station.page import insights, laps
+from iort_station.page.answers import insights, laps
 from tests.unit.station.test_data import START
 from tests.unit.station.test_laps import driven_cloud
 

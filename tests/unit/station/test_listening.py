@@ -8,8 +8,8 @@ import pytest
 
 from iort_contract.limits import ContractError
 from iort_contract.messages.live import LiveSample, decode_live_update, encode_live
-from iort_station.page.heard import heard_of
-from iort_station.page.listening import update_of
+from iort_station.page.live.heard import heard_of
+from iort_station.page.live.listening import update_of
 
 LIVE = LiveSample("0badcafe", 7, 1_000_000, 2_000_000, {"speed": 1.5, "temp_motor": -1e9}, 0, 5, 100)
 

@@ -7,7 +7,7 @@ import pytest
 from iort_contract.findings_table import FindingsTable
 from iort_station.data.analysis import notes as stored
 from iort_station.errors import StationError, UsageError
-from iort_station.page import notes
+from iort_station.page.answers import notes
 from tests.unit.contract.test_notes import FIRST_US, OneTable
 
 

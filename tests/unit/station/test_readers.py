@@ -12,7 +12,7 @@ from iort_analysis.samples.batches import RefusedItems, blocks
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
-from iort_contract.messages.commands import (
+from iort_contract.messages.control.commands import (
     Command,
     FleetMessage,
     decode_command,
@@ -21,7 +21,7 @@ from iort_contract.messages.commands import (
     encode_fleet,
 )
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
-from iort_station.operations.audit import audit
+from iort_station.operations.delivery.audit import audit
 from tests.fakes import item_of, serialize
 
 T_US = 1_700_000_000_000_000

@@ -28,9 +28,9 @@ from iort_station.data.overview import overview
 from iort_station.data.recorded import Origin
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
-from iort_station.operations import accounts, audit
-from iort_station.page.answers import answers
-from iort_station.page.downloads import downloads
+from iort_station.operations.delivery import accounts, audit
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import answers
 from iort_station.recordings import tabular
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire

@@ -15,8 +15,8 @@ from iort_contract.cloud import DRIVER, PUBNUB, VIEWER
 from iort_station.errors import StationError
 from iort_station.fleet import registry, roles
 from iort_station.fleet.roles import Role, has_drivers, signed_url, transport
+from iort_station.page.answers.socket import actions, everybody, reaching
 from iort_station.page.page import config
-from iort_station.page.socket import actions, everybody, reaching
 
 BROKER = "wss://abc-ats.iot.eu-west-1.amazonaws.com/mqtt"
 KEY = ReadOnlyCredentials("AKIA", "secret", "a/token+")

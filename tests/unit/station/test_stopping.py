@@ -11,11 +11,11 @@ import pytest
 from botocore.exceptions import ClientError
 
 from iort_agent.control.shadow import _merged
-from iort_contract.messages.driving import DriveLimits, encode_limits
+from iort_contract.messages.control.driving import DriveLimits, encode_limits
 from iort_station.errors import StationError
-from iort_station.fleet import stopping
-from iort_station.operations.alarms import user
-from iort_station.page import control, motion
+from iort_station.fleet.control import stopping
+from iort_station.operations.monitoring.alarms import user
+from iort_station.page.answers import control, motion
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 

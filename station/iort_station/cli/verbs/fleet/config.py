@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from iort_contract.messages.shadow import Rejection
+from iort_contract.messages.control.shadow import Rejection
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import settings
-from iort_station.fleet.shadow import Shadow, State
+from iort_station.fleet.control import settings
+from iort_station.fleet.control.shadow import Shadow, State
 
 commands = typer.Typer()
 

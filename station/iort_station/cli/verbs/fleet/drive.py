@@ -21,8 +21,13 @@ from rich.text import Text
 
 from iort_contract.cloud import DRIVER
 from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
-from iort_contract.messages.commands import encode_command
-from iort_contract.messages.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, DriveLimits
+from iort_contract.messages.control.commands import encode_command
+from iort_contract.messages.control.driving import (
+    DRIVE_MAX_AGE_MS,
+    DRIVE_MAX_RTT_MS,
+    DRIVE_RATE_HZ,
+    DriveLimits,
+)
 from iort_contract.messages.live import decode_live
 from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
 from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
@@ -32,10 +37,11 @@ from iort_station.cli.options import Robot
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry, stopping
+from iort_station.fleet import registry
 from iort_station.fleet.broker import Broker
-from iort_station.fleet.commands import operator
-from iort_station.fleet.driving import Driver, Phase
+from iort_station.fleet.control import stopping
+from iort_station.fleet.control.commands import operator
+from iort_station.fleet.control.driving import Driver, Phase
 from iort_station.fleet.roles import Role
 
 commands = typer.Typer()

@@ -12,7 +12,8 @@ from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, Force, Robot, Yes, agreed, to_file
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
-from iort_station.fleet import claims, registry, robots, rotation
+from iort_station.fleet import registry, robots
+from iort_station.fleet.identity import claims, rotation
 from iort_station.output import check_free
 
 commands = typer.Typer()

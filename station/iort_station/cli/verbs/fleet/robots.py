@@ -37,7 +37,9 @@ from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import examples, say
 from iort_station.errors import UsageError
-from iort_station.fleet import certificates, claims, registry, robots, shadow
+from iort_station.fleet import registry, robots
+from iort_station.fleet.control import shadow
+from iort_station.fleet.identity import certificates, claims
 from iort_station.times import iso_s, stamped, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")

@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS
+from iort_contract.messages.control.commands import MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.topics import ACCEPTED
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import commands as fleet_commands
+from iort_station.fleet.control import commands as fleet_commands
 
 commands = typer.Typer()
 

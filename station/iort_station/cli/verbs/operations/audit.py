@@ -23,7 +23,7 @@ from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
     from iort_station.cloud import Cloud
-    from iort_station.operations.audit import Audit
+    from iort_station.operations.delivery.audit import Audit
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -116,7 +116,7 @@ def _audit(
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
     from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
-    from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
+    from iort_station.operations.delivery import accounts, audit  # noqa: PLC0415 - as above
 
     try:
         check_robot(robot)

@@ -23,9 +23,9 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.roles import transport
 from iort_station.fleet.viewing import Viewer
-from iort_station.operations import audit, trace
+from iort_station.operations.delivery import audit, trace
 from iort_station.page import keys
-from iort_station.page.listening import listening
+from iort_station.page.live.listening import listening
 
 commands = typer.Typer()
 # Characters of the other columns, and of the longest and shortest whole bar.

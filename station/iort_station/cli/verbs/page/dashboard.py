@@ -38,12 +38,12 @@ def dashboard(
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
-    from iort_station.page import control  # noqa: PLC0415 - as above
-    from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
-    from iort_station.page.downloads import downloads  # noqa: PLC0415 - as above
+    from iort_station.page.answers import control  # noqa: PLC0415 - as above
+    from iort_station.page.answers.downloads import downloads  # noqa: PLC0415 - as above
+    from iort_station.page.answers.index import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.answers.socket import reaching  # noqa: PLC0415 - as above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
-    from iort_station.page.socket import reaching  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
     with PageServer(

@@ -1,0 +1,276 @@
+"""A driver's hold of the stick, without terminal and network: when the car may move, which commands go out,
+and why it is over.
+
+A hold begins at a standstill. It may move the car once the car has answered a command, within the limits of
+the round trip and of the newest sample's age. Whatever ends it, the driver must let go before the next one: a
+car must not move because an obstacle to driving has gone away. The page does the same in
+station/web/src/drive/driver.ts.
+
+Times are microseconds of this computer's monotonic clock. The cloud's time is learned from the car's
+messages, so this computer's own clock may be wrong.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections import deque
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+from iort_contract.catalog.streams import DRIVE_STREAM
+from iort_contract.limits import LIVE_MAX_RATE_HZ
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import (
+    CLOCK_UNKNOWN,
+    DRIVE_LEASE_MS,
+    DRIVE_MAX_AGE_MS,
+    DRIVE_MAX_RTT_MS,
+    DRIVEN_BY_ANOTHER,
+    EARLY,
+    LEASE_OVER,
+    REFUSALS,
+    STALE,
+    STOPPED,
+    DriveLimits,
+)
+from iort_contract.messages.live import LiveSample
+from iort_contract.topics import ACCEPTED
+
+# A car that has not answered by then does not hear us.
+_ANSWER_US = 2_000_000
+# After a pause of this program as long as this, the car has stopped.
+_STILL_US = DRIVE_LEASE_MS * 1000
+# A stop is sent this often: a message may be lost.
+_STOPS = 3
+# A wrong time is known after one answer, and corrected with a new session.
+_CORRECTIONS = 2
+_TOO_LATE = (STALE, LEASE_OVER, EARLY)
+# Between two samples of the stream `drive`, at most.
+_SAMPLE_US = round(1e6 / LIVE_MAX_RATE_HZ)
+# Messages that tell the cloud's time.
+_KEPT = 100
+
+
+class Phase(Enum):
+    """Nobody holds; the car has not answered yet; the stick drives; over until the driver lets go."""
+
+    FREE = "free"
+    STARTING = "starting"
+    DRIVING = "driving"
+    OVER = "over"
+
+
+class Stick(NamedTuple):
+    """Where the stick is, from -1 to 1: forwards and to the left are positive."""
+
+    speed: float = 0.0
+    steering: float = 0.0
+
+
+class CloudClock:
+    """The cloud's time minus this clock's, between what two kinds of messages tell: one that the car sent,
+    which was later heard here, and one that was sent here, which the car later took."""
+
+    def __init__(self) -> None:
+        self._least: deque[int] = deque(maxlen=_KEPT)
+        self._most: deque[int] = deque(maxlen=_KEPT)
+
+    def heard(self, sent_us: int, now_us: int) -> None:
+        """Take the cloud's time at which a message was sent that is heard now."""
+        self._least.append(sent_us - now_us)
+
+    def answered(self, left_us: int, taken_us: int) -> None:
+        """Take the cloud's time at which the car took a command that left here."""
+        self._most.append(taken_us - left_us)
+
+    def forget(self) -> None:
+        """Forget all: it was wrong."""
+        self._least.clear()
+        self._most.clear()
+
+    def offset_us(self) -> int | None:
+        """The cloud's time minus this clock's; None before the first message."""
+        if not self._least:
+            return None
+        least = max(self._least)
+        most = min(self._most, default=least)
+        return (least + most) // 2 if most > least else least
+
+
+class Driver:
+    """One driver at one stick. ``top_mps`` is the driver's own top speed, within the car's limit."""
+
+    def __init__(self, limits: DriveLimits, by: str, top_mps: float) -> None:
+        self.limits, self.top_mps = limits, top_mps
+        self.phase, self.reason, self.stick = Phase.FREE, "", Stick()
+        self.rtt_us: int | None = None
+        # Who drives, by the car's own word.
+        self.driver = ""
+        self.mine = False
+        self.takeover = False
+        self.by = by
+        self._clock = CloudClock()
+        self._clockless = False
+        self._held = False
+        self._session, self._started_us, self._seq = "", 0, 0
+        self._began_us = self._driver_until_us = 0
+        self._ticked_us: int | None = None
+        self._corrections = self._stops = 0
+        self._taken_us: int | None = None
+        # When each command left that the car has not answered.
+        self._waiting: dict[int, int] = {}
+
+    def age_us(self, now_us: int) -> int | None:
+        """The age of the car's newest sample; None before the first one."""
+        offset_us = self._clock.offset_us()
+        if offset_us is None or self._taken_us is None:
+            return None
+        return max(0, now_us + offset_us - self._taken_us)
+
+    def hold(self, *, held: bool, now_us: int) -> None:
+        """The driver holds the stick, or lets go."""
+        if held == self._held:
+            return
+        self._held = held
+        if not held:
+            self._finish()
+            self.phase, self.reason = Phase.FREE, ""
+            return
+        self._corrections = 0
+        against = self._against(now_us)
+        if against:
+            self.phase, self.reason = Phase.OVER, against
+        else:
+            self._began_us = now_us
+            self._begin(now_us)
+
+    def hear(self, stream: str, live: LiveSample, now_us: int) -> None:
+        """Take a live message of the car."""
+        self._clockless = live.offset_us is None
+        if live.offset_us is not None:
+            self._clock.heard(live.sent_us + live.offset_us, now_us)
+            self._taken_us = max(self._taken_us or 0, live.t_us + live.offset_us)
+        if stream == DRIVE_STREAM:
+            self._answer(live.sample, live, now_us)
+
+    def tick(self, now_us: int) -> Command | None:
+        """The command to send now, if any; called `DRIVE_RATE_HZ` times a second."""
+        still_us = now_us - (now_us if self._ticked_us is None else self._ticked_us)
+        self._ticked_us = now_us
+        if now_us > self._driver_until_us:
+            self.driver, self.mine = "", False
+        if self.phase in (Phase.STARTING, Phase.DRIVING):
+            # The keys of that time may have been let go since.
+            frozen = f"this program stood still for {still_us // 1000} ms" if still_us > _STILL_US else ""
+            against = frozen or self._against(now_us) or self._unanswered(now_us)
+            if against:
+                self._end(against)
+        if self.phase is Phase.DRIVING:
+            return self._command(self.stick, now_us)
+        if self.phase is Phase.STARTING:
+            return self._command(Stick(), now_us)
+        if not self._stops:
+            return None
+        self._stops -= 1
+        return self._command(Stick(), now_us, ends=True)
+
+    def _begin(self, now_us: int) -> None:
+        self._session, self._started_us = secrets.token_hex(8), self._cloud_us(now_us)
+        self._seq, self._waiting, self._stops, self.rtt_us = 0, {}, 0, None
+        self.phase, self.reason = Phase.STARTING, ""
+
+    def _end(self, reason: str) -> None:
+        """End the hold; the driver must let go."""
+        if self.phase in (Phase.STARTING, Phase.DRIVING):
+            self._finish()
+            self.phase, self.reason = Phase.OVER, reason
+
+    def _finish(self) -> None:
+        """Have the car stop, if this hold may have moved it."""
+        if self.phase in (Phase.STARTING, Phase.DRIVING):
+            self._stops = _STOPS
+        self.takeover = False
+
+    def _against(self, now_us: int) -> str:
+        """Why the car must not be driven now."""
+        if self._clockless:
+            return REFUSALS[CLOCK_UNKNOWN]
+        age_us = self.age_us(now_us)
+        if age_us is None:
+            return "nothing has been heard of the car yet"
+        if age_us > DRIVE_MAX_AGE_MS * 1000:
+            return f"the newest sample is {age_us // 1000} ms old, {DRIVE_MAX_AGE_MS} ms are allowed"
+        return ""
+
+    def _unanswered(self, now_us: int) -> str:
+        if self.phase is Phase.STARTING:
+            return "the car does not answer" if now_us - self._began_us > _ANSWER_US else ""
+        waited_us = now_us - min(self._waiting.values(), default=now_us)
+        return _slow(waited_us) if waited_us > DRIVE_MAX_RTT_MS * 1000 + _SAMPLE_US else ""
+
+    def _answer(self, told: Mapping[str, Any], live: LiveSample, now_us: int) -> None:
+        driver = told.get("driver")
+        self.driver = str(told.get("driver_by") or "somebody") if driver else ""
+        self.mine = driver == self._session
+        self._driver_until_us = now_us + _whole(told.get("lease_left_ms")) * 1000
+        if told.get("session") != self._session:
+            # Another's command has passed, so ours no longer do.
+            if self.phase is Phase.DRIVING and driver and not self.mine:
+                self._end(f"{self.driver} has taken over")
+            return
+        seq, outcome = _whole(told.get("seq")), told.get("outcome")
+        left_us = self._waiting.get(seq)
+        self._waiting = {one: at_us for one, at_us in self._waiting.items() if one > seq}
+        if left_us is not None:
+            self.rtt_us = now_us - left_us
+            if live.offset_us is not None:
+                self._clock.answered(left_us, live.t_us + live.offset_us)
+        if self.phase not in (Phase.STARTING, Phase.DRIVING):
+            return
+        if outcome == STOPPED:
+            self._end("the car was stopped")
+        elif outcome != ACCEPTED:
+            self._refused(str(outcome), now_us)
+        elif self.rtt_us is not None and self.rtt_us > DRIVE_MAX_RTT_MS * 1000:
+            self._end(_slow(self.rtt_us))
+        elif self.phase is Phase.STARTING:
+            self.phase, self.takeover = Phase.DRIVING, False
+
+    def _refused(self, outcome: str, now_us: int) -> None:
+        if outcome == DRIVEN_BY_ANOTHER:
+            self._end(f"{self.driver or 'somebody'} drives this car")
+        elif self.phase is Phase.STARTING and outcome in _TOO_LATE and self._corrections < _CORRECTIONS:
+            self._corrections += 1
+            self._begin(now_us)
+        else:
+            self._end(REFUSALS.get(outcome, outcome))
+
+    def _command(self, stick: Stick, now_us: int, *, ends: bool = False) -> Command:
+        seq, limits = self._seq, self.limits
+        self._seq += 1
+        self._waiting[seq] = now_us
+        top_mps = min(self.top_mps, limits.max_speed_mps)
+        return Command(
+            session=self._session,
+            started_us=self._started_us,
+            seq=seq,
+            sent_us=max(self._started_us, self._cloud_us(now_us)),
+            valid_ms=DRIVE_LEASE_MS,
+            message=limits.message(stick.speed * top_mps, stick.steering * limits.max_steering_rad),
+            lease_ms=DRIVE_LEASE_MS,
+            by=self.by,
+            takeover=self.takeover,
+            ends=ends,
+        )
+
+    def _cloud_us(self, now_us: int) -> int:
+        return now_us + (self._clock.offset_us() or 0)
+
+
+def _slow(rtt_us: int) -> str:
+    return f"the round trip takes {rtt_us // 1000} ms, {DRIVE_MAX_RTT_MS} ms are allowed"
+
+
+def _whole(value: Any) -> int:
+    return value if type(value) is int else 0

@@ -1,0 +1,143 @@
+"""The emergency stop: a robot's setting `MOTION_STOPPED`, which it keeps until somebody releases it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.messages.control.driving import DriveLimits
+from iort_contract.messages.control.settings import MOTION_STOPPED
+from iort_contract.messages.control.shadow import (
+    Pressed,
+    encode_fleet_released,
+    encode_release,
+    encode_stop,
+    nested,
+)
+from iort_contract.topics import SHADOW
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from iort_station.fleet.control.shadow import read
+
+_T = TypeVar("_T")
+# A fleet is stopped at once, not robot by robot.
+_AT_ONCE = 32
+
+
+class Motion(NamedTuple):
+    """Whether a robot may move: the stop as it is asked for, as the robot has confirmed it (None before it
+    does), and why the robot rejected it. ``drive`` is None if a stick cannot drive it. ``alone`` is a stop
+    that the release of the fleet does not end. ``by`` is who stopped it, or else released it last."""
+
+    asked: bool
+    stopped: bool | None
+    reason: str
+    drive: DriveLimits | None
+    alone: bool = False
+    by: Pressed | None = None
+
+
+def motion(cloud: Cloud, robots: Iterable[str]) -> dict[str, Motion]:
+    """Each robot's, by its name."""
+    return dict(_each(cloud, robots, lambda robot: _motion(cloud, robot)))
+
+
+def stop(cloud: Cloud, robots: Iterable[str], *, by: str, fleet: bool = False) -> dict[str, str]:
+    """Stop robots without waiting for them; `motion` tells what they have confirmed.
+
+    Robots that are not connected stop before they take a command. Every robot is tried. Returns why, for
+    each one for which it failed. ``by`` is who stops them; ``fleet`` is a stop that `release_fleet` ends.
+    Raises `StationError` for a robot that is not registered, before any is tried.
+    """
+    change = encode_stop(_pressed(by), fleet=fleet)
+    return _changed(cloud, robots, lambda robot: _change(cloud, robot, change))
+
+
+def release(cloud: Cloud, robots: Iterable[str], *, by: str) -> dict[str, str]:
+    """Release robots, however they were stopped; as `stop`."""
+    change = encode_release(_pressed(by))
+    return _changed(cloud, robots, lambda robot: _change(cloud, robot, change))
+
+
+def release_fleet(cloud: Cloud, robots: Iterable[str], *, by: str) -> dict[str, str]:
+    """Release the robots that a stop of the fleet has stopped, and leave those that were stopped alone; as
+    `stop`."""
+    released = encode_release(_pressed(by))
+
+    def change(robot: str) -> None:
+        state = read(cloud.client("iot-data"), robot)
+        if state.desired.stops.fleet is not None:
+            # With the version, so that a stop which somebody asks for at this moment is not lost.
+            alone = state.desired.stopped_alone
+            _change(cloud, robot, encode_fleet_released() if alone else released, version=state.version)
+
+    return _changed(cloud, robots, change)
+
+
+def repeat(cloud: Cloud, robots: Iterable[str]) -> None:
+    """Change nothing: a robot that has missed a change learns from the next one that it has."""
+
+    def change(robot: str) -> None:
+        state = read(cloud.client("iot-data"), robot)
+        stopped = state.desired.settings.get(MOTION_STOPPED)
+        # With the version, so that no other change is undone.
+        _change(cloud, robot, nested({MOTION_STOPPED: stopped}), version=state.version)
+
+    _changed(cloud, robots, change)
+
+
+def _pressed(by: str) -> Pressed:
+    return Pressed(by, time.time_ns() // 1_000_000)
+
+
+def _change(cloud: Cloud, robot: str, desired: Mapping[str, Any], version: int | None = None) -> None:
+    document = {"state": {"desired": desired}, **({} if version is None else {"version": version})}
+    data = cloud.client("iot-data")
+    data.update_thing_shadow(thingName=robot, shadowName=SHADOW, payload=json.dumps(document))
+
+
+def _changed(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None]) -> dict[str, str]:
+    wanted = list(robots)
+    known = {str(row["robot"]) for row in registry.listed(cloud)}
+    if strangers := sorted(set(wanted) - known):
+        raise StationError(f"not registered: {', '.join(strangers)}; nothing is changed")
+
+    def tried(robot: str) -> str:
+        try:
+            change(robot)
+        except (BotoCoreError, ClientError) as error:
+            return str(error)
+        return ""
+
+    return {robot: error for robot, error in _each(cloud, wanted, tried).items() if error}
+
+
+def _motion(cloud: Cloud, robot: str) -> Motion:
+    state = read(cloud.client("iot-data"), robot)
+    rejected = state.rejected().get(MOTION_STOPPED)
+    stopped = state.reported.settings.get(MOTION_STOPPED)
+    # A robot may also stand by its car.yaml, or since the shadow that asked for it was deleted.
+    asked = state.desired.settings.get(MOTION_STOPPED, stopped) is True
+    notes = state.desired.stops
+    return Motion(
+        asked=asked,
+        stopped=stopped,
+        reason=rejected.reason if rejected is not None else "",
+        drive=state.reported.drive,
+        alone=asked and state.desired.stopped_alone,
+        by=(notes.robot or notes.fleet) if asked else notes.released,
+    )
+
+
+def _each(cloud: Cloud, robots: Iterable[str], work: Callable[[str], _T]) -> Mapping[str, _T]:
+    # Threads share a client, and must not make it at the same time.
+    cloud.client("iot-data")
+    names = sorted(set(robots))
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return dict(zip(names, pool.map(work, names), strict=True))

@@ -1,0 +1,95 @@
+"""The accounts that an agent's runs publish, compared with the stored batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
+from iort_contract.messages.batch import Batch, decode_batch
+from iort_contract.tables import RECEIVED_MS
+from iort_station.cloud import Cloud
+from iort_station.data.reports import last_reports
+from iort_station.operations.delivery.audit import Audit, RunAudit, Shortfall
+
+# A run that has been silent for this long has ended.
+_SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
+
+
+@dataclass
+class Account:
+    """The last account of a run's streams and sources, and the time at which the cloud received it."""
+
+    streams: dict[str, StreamAccount] = field(default_factory=dict)
+    sources: dict[str, SourceAccount] = field(default_factory=dict)
+    received_us: int = 0
+
+    def not_recorded(self) -> dict[str, dict[str, int]]:
+        """What each source did not record, as counts by cause."""
+        found = {name: lost(source.counts) for name, source in self.sources.items()}
+        return {name: counts for name, counts in found.items() if counts}
+
+
+def accounts(cloud: Cloud, robot: str) -> dict[str, Account]:
+    """The last account of each run, by the run's name."""
+    return last_of(map(plain, last_reports(cloud, robot)))
+
+
+def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
+    """The last account of each run among stored items. The batch numbers decide which one is last, since the
+    car's clock may be set back."""
+    batches: list[tuple[Batch, int]] = []
+    for item in stored:
+        with suppress(ContractError):  # the stream's own audit counts these
+            batches.append((decode_batch(item), int(item.get(RECEIVED_MS, 0)) * 1000))
+    found: dict[str, Account] = {}
+    for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
+        run = found.setdefault(batch.boot, Account())
+        run.received_us = max(run.received_us, received_us)
+        for i in range(len(batch.times_us)):
+            with suppress(ContractError):
+                one = account({name: column[i] for name, column in batch.columns.items()})
+                if isinstance(one, StreamAccount):
+                    run.streams[one.stream] = one
+                else:
+                    run.sources[one.source] = one
+    return found
+
+
+def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit:
+    """The audit of a stream with its shortfalls against the runs' accounts."""
+    stored = {run.boot: run for run in one.runs}
+    accounted = {boot: run for boot, run in found.items() if one.stream in run.streams}
+    newest_us = max((run.received_us for run in found.values()), default=0)
+    shortfalls: list[Shortfall] = []
+    for boot, run in accounted.items():
+        stream = run.streams[one.stream]
+        is_last = run.received_us == newest_us and now_us - run.received_us < _SILENT_US
+        running = is_last and not stream.ended
+        shortfalls += _shortfalls(boot, stream, stored.get(boot), running=running)
+    taken = sum(run.streams[one.stream].taken for run in accounted.values()) if accounted else None
+    return replace(one, taken=taken, shortfalls=tuple(shortfalls))
+
+
+def _shortfalls(
+    boot: str, stream: StreamAccount, stored: RunAudit | None, *, running: bool
+) -> Iterator[Shortfall]:
+    if stream.refused:
+        yield Shortfall(boot, stream.refused, "refused by the agent: no message can hold them")
+    if not stream.ended and not running:
+        yield Shortfall(boot, None, "were in open batches, at most one second: the run did not end properly")
+    if stored is None:
+        if stream.stored:
+            yield Shortfall(boot, stream.stored, "in batches that are not stored")
+        return
+    # `Audit.before_first` reports numbers before the first stored one, which may have expired. The last
+    # batches of a running agent may be on their way.
+    if stored.first_seq > stream.first_seq or (running and stored.last_seq < stream.next_seq - 1):
+        return
+    there = sum(samples for seq, samples in stored.samples_of.items() if seq < stream.next_seq)
+    if there != stream.stored:
+        yield Shortfall(boot, stream.stored - there, "put into the queue, but not in the table")

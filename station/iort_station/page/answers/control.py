@@ -1,0 +1,109 @@
+"""What the page's server does with a robot: one command, as `iort send`, and settings, as `iort config`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
+from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
+from iort_contract.tables import ONLINE
+from iort_contract.topics import ACCEPTED
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from iort_station.fleet.control import commands
+from iort_station.fleet.control import settings as fleet_settings
+from iort_station.fleet.control.shadow import Shadow, State
+from iort_station.page.answers import insights, motion, notes, socket
+from iort_station.page.answers.parameters import text, whole
+from iort_station.page.server import Answer
+
+# A viewer waits for it.
+_ANSWER_S = 10.0
+
+
+def actions(cloud: Cloud) -> dict[str, Answer]:
+    """What moves or changes a robot, or costs something, by its name; only for a server on loopback."""
+    return {
+        "send": lambda asked: send(cloud, asked),
+        "settings": lambda asked: settings(cloud, asked),
+        "set": lambda asked: change(cloud, asked),
+        "analyse": lambda asked: insights.analyse(cloud, asked),
+        **socket.actions(cloud),
+        **notes.actions(cloud),
+        **motion.actions(cloud),
+    }
+
+
+def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
+    """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves."""
+    try:
+        message = json.loads(text(asked, "message"))
+    except (ValueError, RecursionError) as error:
+        raise StationError(f"the message must be JSON: {error}") from error
+    if not isinstance(message, dict):
+        raise StationError("the message must be a JSON object with the fields of the ROS message")
+    lease_ms = whole(asked, "lease_ms", 1, MAX_LEASE_MS) if asked.get("lease_ms") else None
+    began = time.monotonic()
+    sent = commands.send(cloud, text(asked, "robot"), text(asked, "command"), message, lease_ms=lease_ms)
+    after_ms = round((time.monotonic() - began) * 1000)
+    if sent.outcome is None:
+        return {"accepted": None, "reason": "", "after_ms": after_ms}
+    accepted = sent.outcome == ACCEPTED
+    return {"accepted": accepted, "reason": "" if accepted else sent.outcome, "after_ms": after_ms}
+
+
+def settings(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+    """The settings of ``robot``: those in force, and what is pending."""
+    robot = text(asked, "robot")
+    state = Shadow(cloud, robot).read()
+    return {"settings": _entries(state, {}), "online": bool(registry.get(cloud, robot).get(ONLINE))}
+
+
+def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+    """Change the setting ``name`` of ``robot`` to ``value``; without a value, car.yaml's applies again."""
+    robot, name = text(asked, "robot"), text(asked, "name")
+    if name == MOTION_STOPPED:
+        raise StationError("the emergency stop has a button of its own")
+    value = fleet_settings.parsed(name, asked["value"]) if "value" in asked else None
+    changed = fleet_settings.change(cloud, robot, {name: value}, _ANSWER_S)
+    reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
+    return {"settings": _entries(changed.state, reasons), "online": changed.online}
+
+
+def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
+    in_force, desired, pending = state.reported.settings, state.desired.settings, state.pending()
+    selections = sorted(name for name in {*in_force, *desired} if name.startswith(f"{FIELDS}."))
+    rejected = {name: one.reason for name, one in state.rejected().items()}
+    return [
+        {
+            **_kind(SETTINGS.get(name)),
+            "name": name,
+            "value": _written(in_force.get(name)),
+            # A rejected change is withdrawn.
+            "desired": name in desired and name not in reasons,
+            "pending": _written(pending[name]) if name in pending else None,
+            "reason": reasons.get(name) or rejected.get(name, ""),
+        }
+        for name in (*SETTINGS, *selections)
+        # It has a button of its own, which asks before it releases and tells who did.
+        if name != MOTION_STOPPED
+    ]
+
+
+def _kind(setting: Flag | Number | Choice | None) -> SettingKind:
+    """The part of an entry that the contract knows; None is a selection of fields."""
+    plain: SettingKind = {"kind": "fields", "low": 0.0, "high": 0.0, "unit": "", "names": []}
+    if isinstance(setting, Number):
+        return {**plain, "kind": "number", "low": setting.low, "high": setting.high, "unit": setting.unit}
+    if isinstance(setting, Choice):
+        return {**plain, "kind": "choice", "names": list(setting.names)}
+    return {**plain, "kind": "flag"} if isinstance(setting, Flag) else plain
+
+
+def _written(value: Any) -> str:
+    return "" if value is None else fleet_settings.written(value)

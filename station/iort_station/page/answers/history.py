@@ -1,0 +1,148 @@
+"""Answers to the live page about a car's past: its runs, and the samples of a range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from iort_analysis.samples.blocks import Column, values
+from iort_contract.catalog.derived import PARAMETERS, SOURCES
+from iort_contract.messages.page import Column as PageColumn
+from iort_contract.messages.page import HistoryAnswer, RunsAnswer
+from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
+from iort_contract.topics import check_robot
+from iort_station import data
+from iort_station.cloud import Cloud
+from iort_station.data.conditions import derive
+from iort_station.data.runs import runs
+from iort_station.errors import StationError
+from iort_station.page.answers.parameters import text, whole
+
+# No chart is wider, in points.
+MAX_ROWS = 5_000
+# Half an hour of thirty fields at 500 Hz; their table takes 240 MB of memory.
+MOST_VALUES = 30_000_000
+# Longer ranges are read from the summary of each second, not from samples.
+_SAMPLES_US = 3_600_000_000
+# The fields that a derived field needs, where it needs nothing else. The page makes the speed itself.
+_DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PARAMETERS[name]]
+_MOST_RUNS = 200
+
+
+def runs_of(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
+    """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
+    before_us = whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
+    count = whole(asked, "count", 1, _MOST_RUNS)
+    return runs(cloud, check_robot(text(asked, "robot")), end_us=before_us, count=count)
+
+
+def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
+    """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
+
+    A row of several samples has the minimum, the mean and the maximum of every number, the last complete
+    attachment, and the last value that is not null of everything else. Raises `StationError` for a request
+    that cannot be answered.
+    """
+    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    rows = whole(asked, "rows", 2, MAX_ROWS)
+    if start_us >= end_us:
+        raise StationError("the range must end after its start")
+    summary = end_us - start_us > _SAMPLES_US
+    robot, stream = text(asked, "robot"), text(asked, "stream")
+    found = data.query(cloud, robot, stream, start_us, end_us, summary=summary, most=MOST_VALUES)
+    columns = (
+        _by_statistic(found.columns)
+        if summary
+        else {name: (c, c, c) for name, c in _with_derived(found.columns).items()}
+    )
+    claims = _claims(columns)
+    n = len(found)
+    row_us = 0
+    starts = np.arange(n)
+    if n > rows:
+        row_us = -(-(int(found.times_us[-1] - found.times_us[0]) + 1) // rows)
+        bins = (found.times_us - found.times_us[0]) // row_us
+        starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
+    several = summary or row_us > 0
+    fields: dict[str, PageColumn] = {
+        name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
+    }
+    for name, key in claims.items():
+        # The fields of an attachment belong together, so they come from one sample.
+        told, ends = values(found.columns[name]), _last_known(found.columns[key], starts)
+        fields[name] = {"mean": [told[end] for end in ends]}
+    return {
+        "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
+        "fields": fields,
+        "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
+        "ros2": found.ros2,
+        "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
+        "archive": found.origin.told(),
+    }
+
+
+def _with_derived(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns and those derived of them alone, which the summary has too."""
+    if not any(columns.keys() >= sources for sources in _DERIVED_OF):
+        return dict(columns)
+    return {**columns, **derive(columns, None)}
+
+
+def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
+    """The summary's columns for each field: mean, minimum, maximum."""
+    names = [name.removesuffix("_mean") for name in columns if name.endswith("_mean")]
+    return {
+        name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
+        for name in names
+        if f"{name}_min" in columns and f"{name}_max" in columns
+    }
+
+
+def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
+    """The fields of attachments (docs/how-to/files.md), each with the field of its attachment's key."""
+    fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
+    return {
+        f"{field}.{part}": f"{field}.key"
+        for field in fields
+        if all(f"{field}.{part}" in columns for part in ATTACHMENT_FIELDS)
+        for part in ATTACHMENT_FIELDS
+    }
+
+
+def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> PageColumn:
+    mean, least, most = of
+    if mean.dtype.kind != "f":
+        ends = _last_known(mean, starts)
+        return {"mean": mean[ends].tolist()}
+    if not several or n == 0:
+        return {"mean": values(mean)}
+    known = ~np.isnan(mean)
+    number = np.add.reduceat(known.astype(float), starts)
+    number[number == 0] = np.nan
+    valued = np.where(known, mean, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        average = np.add.reduceat(valued, starts) / number
+        # The sum of large numbers may overflow where their mean does not.
+        parts = valued / np.repeat(number, np.diff(np.append(starts, n)))
+        average = np.where(np.isinf(average), np.add.reduceat(parts, starts), average)
+    return {
+        "mean": values(average),
+        "least": values(np.fmin.reduceat(least, starts)),
+        "most": values(np.fmax.reduceat(most, starts)),
+    }
+
+
+def _last_known(column: Column, starts: Any) -> Any:
+    """For each row the index of its last value that is not null, or of its last value if all are null.
+
+    Most attachments of a camera are null, because the car keeps few of its pictures.
+    """
+    n = len(column)
+    if not n:
+        return starts
+    known = np.array([value is not None for value in column.tolist()])
+    ranked = np.where(known, np.arange(n), -1)
+    last = np.maximum.reduceat(ranked, starts)
+    return np.where(last >= starts, last, np.append(starts[1:], n) - 1)

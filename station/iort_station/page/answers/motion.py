@@ -1,0 +1,99 @@
+"""Answers to the live page about motion: who may be driven, and the emergency stop of one robot or all."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+from iort_contract.messages.page import Answer, MotionAnswer, MotionEntry
+from iort_contract.topics import check_robot
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from iort_station.fleet.control import stopping
+from iort_station.operations.monitoring.alarms import user
+from iort_station.page.answers.parameters import text
+
+# Every open page asks for the fleet, and each robot costs a read of its shadow.
+_KEPT_S = 3.0
+
+
+class _Fleet:
+    """The motion of every robot, read at most every few seconds however many pages ask."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self._cloud = cloud
+        self._lock = threading.Lock()
+        self._read_s = -_KEPT_S
+        self._found: dict[str, stopping.Motion] = {}
+
+    def motion(self) -> dict[str, stopping.Motion]:
+        with self._lock:
+            if time.monotonic() - self._read_s >= _KEPT_S:
+                self._found = stopping.motion(self._cloud, registry.presence(self._cloud))
+                self._read_s = time.monotonic()
+            return self._found
+
+    def forget(self) -> None:
+        """Read again when asked next: a stop must not seem to be gone."""
+        with self._lock:
+            self._read_s = -_KEPT_S
+
+
+@functools.cache
+def _fleet(cloud: Cloud) -> _Fleet:
+    """One for what asks and for what stops."""
+    return _Fleet(cloud)
+
+
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """The answer ``motion``: of ``robot``, as it is now; without one, of the fleet."""
+    fleet = _fleet(cloud)
+
+    def listed(asked: Mapping[str, str]) -> MotionAnswer:
+        robot = asked.get("robot")
+        return _told(stopping.motion(cloud, [check_robot(robot)]) if robot else fleet.motion(), {})
+
+    return {"motion": listed}
+
+
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """The action ``stop``."""
+    fleet = _fleet(cloud)
+
+    def stop(asked: Mapping[str, str]) -> MotionAnswer:
+        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped."""
+        wanted = {"true": True, "false": False}.get(text(asked, "stopped"))
+        if wanted is None:
+            raise StationError("stopped must be true or false")
+        one = [check_robot(asked["robot"])] if asked.get("robot") else None
+        robots = one or list(registry.presence(cloud))
+        if wanted:
+            failed = stopping.stop(cloud, robots, by=user(), fleet=one is None)
+        elif one is not None:
+            failed = stopping.release(cloud, one, by=user())
+        else:
+            failed = stopping.release_fleet(cloud, robots, by=user())
+        fleet.forget()
+        return _told(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
+
+    return {"stop": stop}
+
+
+def _told(found: Mapping[str, stopping.Motion], failed: dict[str, str]) -> MotionAnswer:
+    return {"robots": {robot: _entry(one) for robot, one in found.items()}, "user": user(), "failed": failed}
+
+
+def _entry(one: stopping.Motion) -> MotionEntry:
+    return {
+        "asked": one.asked,
+        "stopped": one.stopped,
+        "reason": one.reason,
+        "alone": one.alone,
+        "by": one.by.by if one.by is not None else "",
+        "at_ms": one.by.t_ms if one.by is not None else 0,
+        "drive": None if one.drive is None else {**asdict(one.drive)},  # type: ignore[typeddict-item]  # its fields
+    }

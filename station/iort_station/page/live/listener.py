@@ -1,0 +1,95 @@
+"""Listens to the fleet's PubNub channels, as the page does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+from pubnub.callbacks import SubscribeCallback
+from pubnub.enums import PNReconnectionPolicy, PNStatusCategory
+from pubnub.pnconfiguration import PNConfiguration
+from pubnub.pubnub import PubNub
+from typing_extensions import Self
+
+from iort_contract.cloud import channel
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import check_namespace
+from iort_station.errors import StationError
+from iort_station.page.live.heard import Heard, OnUpdate, heard_of
+
+_CONNECT_S = 15.0
+
+
+class Listener:
+    """Subscribes within a ``with`` block, and appends to `heard` or calls ``on_update``.
+
+    ``robot=None`` listens to the whole fleet; ``token`` is PubNub's access token, if Access Manager is on.
+    The delay compares the car's clock with this machine's, so it is only as good as they agree. Raises
+    `StationError` if PubNub does not answer.
+    """
+
+    def __init__(
+        self,
+        *,
+        subscribe_key: str,
+        robot: str | None,
+        namespace: str = DEFAULT_NAMESPACE,
+        origin: str = "",
+        tls: bool = True,
+        on_update: OnUpdate | None = None,
+        token: str = "",
+    ) -> None:
+        config = PNConfiguration()
+        config.subscribe_key, config.user_id = subscribe_key, "iort-station"
+        if origin:
+            config.origin = origin
+        config.ssl, config.daemon = tls, True
+        config.disable_config_locking = False
+        config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
+        self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
+        self._callback = _Callback(on_update)
+        self._client = PubNub(config)
+        if token:
+            self._client.set_token(token)
+        self._client.add_listener(self._callback)
+
+    @property
+    def heard(self) -> list[Heard]:
+        """The updates so far, in the order of arrival."""
+        return self._callback.heard
+
+    def __enter__(self) -> Self:
+        self._client.subscribe().channels(self._channel).execute()
+        if not self._callback.connected.wait(_CONNECT_S):
+            self._client.stop()
+            raise StationError(f"PubNub did not accept the subscription within {_CONNECT_S:.0f} s")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.stop()
+
+
+class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
+    def __init__(self, on_update: OnUpdate | None) -> None:
+        self._on_update = on_update
+        self.connected = threading.Event()
+        self.heard: list[Heard] = []
+
+    def status(self, _pubnub: Any, status: Any) -> None:
+        if status.category == PNStatusCategory.PNConnectedCategory:
+            self.connected.set()
+
+    def presence(self, _pubnub: Any, _presence: Any) -> None:
+        pass
+
+    def message(self, _pubnub: Any, message: Any) -> None:
+        now_us = time.time_ns() // 1000
+        update = message.message
+        if self._on_update is not None:
+            self._on_update(update, int(message.timetoken) // 10, now_us)
+            return
+        self.heard.append(heard_of(update, now_us))

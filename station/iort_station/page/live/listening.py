@@ -1,0 +1,101 @@
+"""Listens to the fleet's live messages: at PubNub, or at AWS IoT's broker."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Protocol
+
+from typing_extensions import Self
+
+from iort_contract.catalog.vesc import absent
+from iort_contract.cloud import PUBNUB
+from iort_contract.limits import ContractError
+from iort_contract.messages.live import decode_live, live_update
+from iort_contract.topics import LIVE, check_robot, parse_topic
+from iort_station.cloud import Cloud
+from iort_station.fleet.broker import Broker
+from iort_station.fleet.roles import Role
+from iort_station.page.live.heard import Heard, OnUpdate, heard_of
+
+
+class Listening(Protocol):
+    """What `listening` returns, within its ``with`` block."""
+
+    @property
+    def heard(self) -> list[Heard]:
+        """The updates so far, in the order of arrival; none if ``on_update`` takes them."""
+        ...
+
+
+def listening(
+    cloud: Cloud,
+    live: str,
+    *,
+    robot: str | None = None,
+    on_update: OnUpdate | None = None,
+    token: str = "",
+) -> AbstractContextManager[Listening]:
+    """Listen to a robot, or to the whole fleet, by the way ``live``.
+
+    Raises `StationError` if that way cannot be used.
+    """
+    if live != PUBNUB:
+        return BrokerListener(cloud, robot=robot, on_update=on_update)
+    # Without PubNub nobody needs its SDK.
+    from iort_station.page import keys  # noqa: PLC0415 - as above
+    from iort_station.page.live.listener import Listener  # noqa: PLC0415 - as above
+
+    return Listener(
+        robot=robot,
+        namespace=cloud.namespace,
+        on_update=on_update,
+        token=token,
+        **keys.load(cloud).reading(),
+    )
+
+
+class BrokerListener:
+    """Subscribes as a viewer within a ``with`` block, and appends to `heard` or calls ``on_update``.
+
+    An update has the form of Lambda 1's without its times, and with all fields. A malformed message becomes
+    an empty update, which `decode_live_update` refuses.
+    """
+
+    def __init__(self, cloud: Cloud, *, robot: str | None = None, on_update: OnUpdate | None = None) -> None:
+        name = "+" if robot is None else check_robot(robot)
+        self.heard: list[Heard] = []
+        self._on_update = on_update
+        self._broker = Broker(
+            cloud, Role(cloud), filters=[f"{LIVE}/{cloud.namespace}/{name}/+"], on_message=self._take
+        )
+
+    def __enter__(self) -> Self:
+        self._broker.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._broker.__exit__(kind, error, trace)
+
+    def _take(self, topic: str, message: bytes) -> None:
+        now_us = time.time_ns() // 1000
+        update = update_of(topic, message)
+        if self._on_update is not None:
+            self._on_update(update, 0, now_us)
+        elif update:
+            self.heard.append(heard_of(update, now_us))
+
+
+def update_of(topic: str, message: bytes) -> dict[str, Any]:
+    """The update of a car's own live message; empty for one that is malformed."""
+    try:
+        named, live = parse_topic(topic), decode_live(message)
+    except ContractError:
+        return {}
+    # As Lambda 1 does: a sensor that is not there has no value.
+    sample = {name: None if absent(name, value) else value for name, value in live.sample.items()}
+    return live_update(named.robot, named.name, replace(live, sample=sample))
