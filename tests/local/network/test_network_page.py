@@ -22,20 +22,22 @@ from tests.browser import until
 from tests.ports import free_port
 
 ADDRESS = Listen("127.0.0.3", ("127.0.0.3",))
+NAMED = Listen("::1", ("::1", "localhost"))
 RIGHT = "correct horse battery"
 UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Protocol": "mqtt"}
 
 
 @pytest.fixture
-def page(embedded, tmp_path) -> Iterator[NetworkPage]:
+def page(embedded, tmp_path, request) -> Iterator[NetworkPage]:
+    listen: Listen = getattr(request, "param", ADDRESS)
     password = Password(tmp_path, PasswordHasher(time_cost=1, memory_cost=8, parallelism=1))
     password.set(RIGHT)
-    certificate = ServerCertificate(embedded.authority, tmp_path / "page.pem", ADDRESS.hosts)
+    certificate = ServerCertificate(embedded.authority, tmp_path / "page.pem", listen.hosts)
     certificate.renew()
     port = free_port()
-    cloud = replace(embedded.cloud, websocket=f"wss://{ADDRESS.in_url}:{port}{SOCKET}")
+    cloud = replace(embedded.cloud, websocket=f"wss://{listen.at(port)}{SOCKET}")
     with NetworkPage(
-        ADDRESS,
+        listen,
         port,
         password=password,
         gateway=cloud.endpoint_url or "",
@@ -147,6 +149,7 @@ def test_a_password_may_come_in_pieces_but_not_for_ever(page, embedded, monkeypa
     assert post(body[:15]) == 408
 
 
+@pytest.mark.parametrize("page", [ADDRESS, NAMED], indirect=True, ids=str)
 def test_a_browser_logs_in_listens_and_may_drive(page, open_page):
     tab = open_page(page.url, listening=False, ignore_https_errors=True)
     tab.fill("input[type=password]", "not the password")
