@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from functions.shared.bucket import Bucket, metadata
 from iort_contract.cloud import IOT
 from iort_contract.messages.batch import BatchId
-from iort_contract.messages.files import PART_BYTES, File, file_key
+from iort_contract.messages.requests.files import PART_BYTES, File, file_key
 from iort_contract.tables import BATCH, CONNECTED_MS, ENTRY, LAST_MS, PAYLOAD, TOPIC
 from iort_contract.tables import ROBOT as ROBOT_KEY
 from iort_station import data
