@@ -15,7 +15,7 @@ from pathlib import Path
 from aiohttp import ClientError, ClientSession, TCPConnector, web
 from yarl import URL
 
-from iort_contract.messages.files import PART_BYTES, UPLOAD_URL_S
+from iort_contract.messages.requests.files import PART_BYTES, UPLOAD_URL_S
 from iort_station.page.background import BackgroundServer
 from local.certificates import ServerCertificate
 from local.network.addresses import client_of

@@ -146,6 +146,8 @@ def test_a_file_system_without_links_gets_copies(
 
 def test_a_damaged_backup_changes_nothing(state: Path, tmp_path: Path) -> None:
     archive = tmp_path / "cloud.tar"
+    with pytest.raises(StationError, match="must be in a folder that exists"):
+        back_up(state, tmp_path / "nowhere" / "cloud.tar")
     (state / "s3" / "drive.bag").write_bytes(b"drive" * 1000)
     back_up(state, archive)
     good = archive.read_bytes()

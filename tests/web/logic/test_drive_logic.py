@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import check_by, decode_command
-from iort_contract.messages.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS
+from iort_contract.messages.control.commands import check_by, decode_command
+from iort_contract.messages.control.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS
 from tests.web.logic.node import call, run
 
 LIMITS = {

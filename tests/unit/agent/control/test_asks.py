@@ -22,7 +22,7 @@ from iort_agent.control.questions import Questions
 from iort_agent.errors import ConfigError, UploadError
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_contract.messages.ask import (
+from iort_contract.messages.requests.ask import (
     MAX_INLINE_BYTES,
     OVER_QUOTA,
     Answer,
@@ -32,7 +32,7 @@ from iort_contract.messages.ask import (
     decode_ask,
     encode_answer,
 )
-from iort_contract.messages.files import file_key
+from iort_contract.messages.requests.files import file_key
 from tests.agent_fakes import Loopback, link_of
 from tests.unit.agent.control.downlink_rig import FakeGraph
 

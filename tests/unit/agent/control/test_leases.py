@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from iort_agent.control.motion.leases import Leases, Limits
 from iort_agent.control.motion.stops import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import (
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import (
     BEGIN_AGAIN,
     CLOSED,
     DRIVEN_BY_ANOTHER,

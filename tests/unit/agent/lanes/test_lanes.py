@@ -27,7 +27,7 @@ from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.text import render
 from iort_contract.messages.batch import decode_batch
-from iort_contract.messages.settings import ALWAYS
+from iort_contract.messages.control.settings import ALWAYS
 from iort_contract.topics import BROKER, LIVE
 from tests.agent_fakes import Loopback, ManualClock, Published
 

@@ -9,8 +9,8 @@ from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import LIVE_MIN_RATE_HZ
+from iort_contract.messages.control.settings import ALWAYS, WATCHED
 from iort_contract.messages.live import LiveSample, decode_live
-from iort_contract.messages.settings import ALWAYS, WATCHED
 from iort_contract.messages.viewing import MAX_VIEWERS, Lease, encode_lease, lease_topic
 from tests.agent_fakes import Loopback, ManualClock, link_of
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Iterator, Mapping, NamedTuple
 
-from iort_contract.messages.driving import DriveLimits, decode_limits, encode_limits
-from iort_contract.messages.settings import FIELDS, MOTION_STOPPED, SETTINGS
+from iort_contract.messages.control.driving import DriveLimits, decode_limits, encode_limits
+from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
 from iort_contract.topics import COMMANDS
 

@@ -8,7 +8,7 @@ import json
 import time
 
 from bench.target import Target, temporary_function
-from iort_contract.messages.files import FILES_PREFIX, PART_BYTES, File, part_range
+from iort_contract.messages.requests.files import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.question import Seen, question
 from verify.tools.uploading import asking, sent, trust
 from verify.tools.waiting import until

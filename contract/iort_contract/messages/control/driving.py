@@ -12,7 +12,7 @@ from typing import Any, Mapping
 
 from iort_contract.checks import FIELD_NAME, checked, shown
 from iort_contract.limits import ContractError
-from iort_contract.messages.commands import MAX_LEASE_MS
+from iort_contract.messages.control.commands import MAX_LEASE_MS
 from iort_contract.topics import check_stream
 
 DRIVE_RATE_HZ = 20.0

@@ -18,7 +18,7 @@ from iort_contract.checks import (
     text,
 )
 from iort_contract.limits import SCHEMA_VERSION, ContractError
-from iort_contract.messages.files import check_sha256, parse_file_key
+from iort_contract.messages.requests.files import check_sha256, parse_file_key
 
 # A larger question or answer travels as a file in the bucket, and the message names the file.
 MAX_INLINE_BYTES = 100 * 1024
