@@ -29,7 +29,9 @@ class Robot:
         self.online = True
         rate = {"name": "live.rate_hz", "kind": "number", "low": 0.1, "high": 10.0, "unit": "Hz", "names": []}
         self.told: dict[str, dict[str, Any]] = {
-            "live.rate_hz": {**rate, "value": "10", "desired": False, "pending": "", "reason": ""}
+            "live.rate_hz": {**rate, "value": "10", "desired": False, "pending": None, "reason": ""},
+            "fields.vesc": {**rate, "name": "fields.vesc", "kind": "fields", "unit": "", "value": "speed"}
+            | {"desired": True, "pending": None, "reason": ""},
         }
         self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
 
@@ -132,6 +134,11 @@ def test_a_setting_is_checked_changed_and_reset(
     rate.fill("3")
     row.get_by_role("button", name="Set").click()
     until(lambda: "pending; in force is 10" in row.inner_text(), "the pending value")
+    fields = page.locator(".setting", has=page.locator("[name='fields.vesc']"))
+    fields.locator("input").fill("")
+    fields.locator("[type=submit]").click()
+    until(lambda: "all fields are pending; in force is speed" in fields.inner_text(), "the pending selection")
+    assert fields.locator("input").input_value() == ""
 
 
 def test_a_note_is_written_marked_in_the_history_and_deleted(

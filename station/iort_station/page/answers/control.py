@@ -86,7 +86,7 @@ def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
             "value": _written(in_force.get(name)),
             # A rejected change is withdrawn.
             "desired": name in desired and name not in reasons,
-            "pending": _written(pending.get(name)),
+            "pending": _written(pending[name]) if name in pending else None,
             "reason": reasons.get(name) or rejected.get(name, ""),
         }
         for name in (*SETTINGS, *selections)

@@ -67,7 +67,7 @@ def drive(
     when round trip or newest sample are too old. It needs the right to drive (docs/how-to/drive.md).
     """
     if not (sys.stdin.isatty() and out.is_terminal):
-        raise UsageError("it needs a terminal with a keyboard")
+        raise UsageError("iort drive needs a terminal with a keyboard")
     cloud = context.obj.cloud()
     limits = _limits(cloud, robot)
     top_mps = min(max_speed or _USUAL_MPS, limits.max_speed_mps)
