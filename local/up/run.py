@@ -27,7 +27,8 @@ from iort_station.errors import StationError
 from local.certificates import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
-from local.network.listen import Listen, is_ipv6
+from local.network.addresses import is_ipv6
+from local.network.listen import Listen
 from local.state import VERSION, StateFolder
 from local.up import notify
 from local.up.pages import Pages
