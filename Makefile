@@ -57,7 +57,7 @@ wheels: setup ## build the wheels of contract, agent and station into dist/
 	@$(BIN)/python -m scripts.wheels
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
-	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/test_mixed_robot.py
+	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
 	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

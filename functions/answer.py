@@ -17,7 +17,8 @@ from functions.shared.quota import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
 from iort_contract.limits import ContractError
-from iort_contract.messages.ask import (
+from iort_contract.messages.event import event_message
+from iort_contract.messages.requests.ask import (
     FAILED,
     INVALID,
     MALFORMED,
@@ -35,7 +36,6 @@ from iort_contract.messages.ask import (
     encode_answer,
     to_json,
 )
-from iort_contract.messages.event import event_message
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import ANSWER, Topic, build_topic, check_robot, parse_topic
 

@@ -17,7 +17,7 @@ from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.event import event_message
-from iort_contract.messages.files import (
+from iort_contract.messages.requests.files import (
     FileAnswer,
     FileRequest,
     decode_file_request,

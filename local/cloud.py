@@ -194,8 +194,8 @@ class EmbeddedCloud:
     @property
     def files_url(self) -> str:
         """Where robots in the network store files and get answers."""
-        host = self.listen.in_url if self.listen else self.host
-        return f"https://{host}:{self.ports['files']}"
+        listen = self.listen or Listen(self.host, (self.host,))
+        return f"https://{listen.at(self.ports['files'])}"
 
     @property
     def page_ports(self) -> list[int]:

@@ -30,8 +30,8 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
-from iort_contract.messages.ask import REASONS
-from iort_contract.messages.driving import REFUSALS
+from iort_contract.messages.control.driving import REFUSALS
+from iort_contract.messages.requests.ask import REASONS
 from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION

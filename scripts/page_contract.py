@@ -18,9 +18,10 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import commands, driving, page, viewing
+from iort_contract.messages import page, viewing
 from iort_contract.messages.analysis import insights, notes
-from iort_contract.messages.files import ATTACHMENT_FIELDS
+from iort_contract.messages.control import commands, driving
+from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3

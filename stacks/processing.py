@@ -27,8 +27,8 @@ from iort_contract.catalog.environments import (
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.rules import Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
-from iort_contract.messages.ask import ASK_FOLDER
-from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.messages.requests.ask import ASK_FOLDER
+from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS, TOPIC
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack

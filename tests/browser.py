@@ -33,7 +33,10 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Open an address in a new window and wait until the page is connected; a script error fails the test."""
+    """Open an address in a new window and wait until the page is connected.
+
+    A script's error fails the test, and so does what the page's policy forbids.
+    """
     contexts, errors = [], []
 
     def open_(url: str, *, listening: bool = True, **options: Any) -> Page:
@@ -41,6 +44,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: "Content Security Policy" in line.text and errors.append(line.text))
         page.goto(url)
         if listening:
             until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")

@@ -31,7 +31,7 @@ GROUPS = {
     "tests/local/data/": "cloud of the data",
     "tests/ros/test_two_robots.py": "cloud of the data",
     "tests/local/faults/": "cloud of the faults",
-    "tests/ros/test_mixed_robot.py": "cloud of the faults",
+    "tests/ros/mixed/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
     "tests/local/gaps/": "cloud of the robots",
     "tests/local/network/test_network.py": "kept cloud",

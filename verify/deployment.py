@@ -23,7 +23,7 @@ from stacks.settings import DEV
 from verify.errors import VerifyError
 from verify.preflight.deployed import STACKS, stack
 from verify.preflight.finding import listed
-from verify.questions.certificates import POLICY
+from verify.questions.identity.certificates import POLICY
 from verify.tools.waiting import until
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.

@@ -39,7 +39,7 @@ from verify.errors import VerifyError
 from verify.preflight import command as preflight
 from verify.question import FIRST, WITH_KEY, Answer, Question, Verdict, ask
 from verify.questions import ALL
-from verify.questions.live import keys_lent
+from verify.questions.messages.live import keys_lent
 
 OUT = ROOT / "build" / "verify"
 _STYLES = {

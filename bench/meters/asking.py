@@ -15,7 +15,7 @@ from iort_agent.control.questions import Questions
 from iort_agent.errors import AskError
 from iort_agent.files.http import downloader
 from iort_agent.files.upload import make_uploader
-from iort_contract.messages.ask import NO_DATA
+from iort_contract.messages.requests.ask import NO_DATA
 from iort_station.fleet.robots import Bundle
 
 _WAIT_S = 60.0

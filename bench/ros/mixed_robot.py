@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.ros import vesc_message
-from tests.ros.mixed_robot import MESSAGES
+from tests.ros.mixed.robot import MESSAGES
 
 _RANGES, _MAP_CELLS = 720, 200
 _ARM, _GRIPPER = tuple(f"joint_{i}" for i in range(1, 7)), ("finger_left", "finger_right")

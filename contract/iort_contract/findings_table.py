@@ -15,7 +15,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding, encode_finding
 from iort_contract.messages.analysis.notes import Note, decode_note, encode_note
 from iort_contract.messages.analysis.run import AnalysedDrive, decode_analysed, encode_analysed
-from iort_contract.tables import CONTENT, FINDING, NOTE_PREFIX, PARAMETERS_PREFIX, ROBOT
+from iort_contract.tables import CONTENT, FINDING, NOTE_PREFIX, PARAMETERS_PREFIX, REMOVED_PREFIX, ROBOT
 
 T = TypeVar("T")
 _FIRST, _LAST = "0", "9~"
@@ -86,8 +86,18 @@ class FindingsTable:
         self._delete(drive.robot, f"{PARAMETERS_PREFIX}{drive}")
 
     def remove_note(self, robot: str, note_id: str) -> bool:
-        """Remove a note; False if there is none of this id."""
-        return self._delete(robot, f"{NOTE_PREFIX}{note_id}")
+        """Remove a note, and keep its id; False if there is none of this id."""
+        key = f"{NOTE_PREFIX}{note_id}"
+        if next(self._content(robot, key, key), None) is None:
+            return False
+        # Before the note goes: a call that ends between them can be repeated.
+        self._put(robot, f"{REMOVED_PREFIX}{note_id}", {})
+        return self._delete(robot, key)
+
+    def removed_notes(self, robot: str) -> set[str]:
+        """The ids of a robot's notes that were removed."""
+        rows = self._content(robot, REMOVED_PREFIX, f"{REMOVED_PREFIX}~")
+        return {str(row[FINDING]["S"])[len(REMOVED_PREFIX) :] for row in rows}
 
     def _delete(self, robot: str, key: str) -> bool:
         answer = self._client.delete_item(

@@ -84,11 +84,13 @@ SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM = "serial", "admit_until_s", "admit_claim"
 ADMIT_FINGERPRINT = "admit_fingerprint"
 ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
 ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMITTED_CERTIFICATE, ADMITTED_MS)
+# Registry: the deployment from which `iort move` brought the robot.
+MOVED_FROM = "moved_from"
 # The provisioning template's parameters.
 ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
 
 # The table of findings: by robot and a text that begins with the time of the drive. Beside the findings it
-# has a row of each analysed drive, for comparing with later ones, and the operators' notes: the keys of each
-# begin with a prefix.
+# has a row of each analysed drive, for comparing with later ones, and the operators' notes. A note that was
+# deleted leaves a row without its text, so that no copy of it comes back. The keys of each have a prefix.
 FINDING, CONTENT = "finding", "content"
-PARAMETERS_PREFIX, NOTE_PREFIX = "parameters#", "note#"
+PARAMETERS_PREFIX, NOTE_PREFIX, REMOVED_PREFIX = "parameters#", "note#", "removed#"

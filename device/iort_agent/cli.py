@@ -27,7 +27,7 @@ from iort_agent.runtime import Runtime
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
 from iort_agent.status.text import render as render_status
-from iort_contract.messages.settings import LOG_LEVELS
+from iort_contract.messages.control.settings import LOG_LEVELS
 
 _log = logging.getLogger("iort-agent")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from iort_contract.messages.files import UPLOAD_URL_S, Address, File, part_range
+from iort_contract.messages.requests.files import UPLOAD_URL_S, Address, File, part_range
 
 if TYPE_CHECKING:
     from types_boto3_s3 import S3Client

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 from local.certificates import is_address, spelled
 from local.errors import LocalError
+from local.network.addresses import is_ipv6
 
+HTTPS_PORT = 443
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
 
 
@@ -31,6 +33,13 @@ class Listen:
                 f"{what} must begin with an address of this machine, such as {what}=192.168.1.10 or "
                 f"{what}=192.168.1.10,iort.lab, got {got}"
             )
+        for name in parts:
+            if "%" in name:
+                # Such an address means another machine on each interface: no certificate can name it.
+                raise LocalError(
+                    f"{what} must have addresses that are the same for every car, got {name}: "
+                    "take one that does not begin with fe80, such as fd00::10"
+                )
         for name in parts[1:]:
             if not is_address(name) and not _NAME.fullmatch(name):
                 raise LocalError(f"{what} must have names such as iort.lab after the address, got {name}")
@@ -41,14 +50,14 @@ class Listen:
         """The host that others are told: the first name, or else the address."""
         return next((one for one in self.hosts if not is_address(one)), self.address)
 
-    @property
-    def in_url(self) -> str:
-        """`host`, as a URL has it."""
-        return f"[{self.host}]" if ":" in self.host else self.host
+    def at(self, port: int) -> str:
+        """`host` and a port of an HTTPS server, as a URL and a browser's Host have them."""
+        host = f"[{self.host}]" if is_ipv6(self.host) else self.host
+        return host if port == HTTPS_PORT else f"{host}:{port}"
 
     def check(self, what: str) -> None:
         """Raise `LocalError` if this machine does not have the address (yet)."""
-        family = socket.AF_INET6 if ":" in self.address else socket.AF_INET
+        family = socket.AF_INET6 if is_ipv6(self.address) else socket.AF_INET
         with socket.socket(family) as probe:
             try:
                 probe.bind((self.address, 0))

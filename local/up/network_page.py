@@ -50,7 +50,7 @@ class NetworkPage(PageServer):
     ) -> None:
         super().__init__(host=listen.address, port=port, names=listen.hosts, **page)
         self._password, self._gateway, self._trusts = password, gateway, trusts
-        self._authority = f"{listen.in_url}:{port}"
+        self._authority = listen.at(port)
         self._sessions, self._tries = Sessions(), Tries()
         self._version = password.version()
         # One at a time: each takes 64 MB.

@@ -44,7 +44,7 @@ class Pages:
                 password = Password(embedded.folder)
                 self.new_password = password.make()
                 # The broker is at the page's own address, behind the same login.
-                socket = f"wss://{listen.in_url}:{port}{SOCKET}"
+                socket = f"wss://{listen.at(port)}{SOCKET}"
                 self.network = stack.enter_context(
                     NetworkPage(
                         listen,

@@ -27,6 +27,7 @@ from iort_station.errors import StationError
 from local.certificates import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
+from local.network.addresses import is_ipv6
 from local.network.listen import Listen
 from local.state import VERSION, StateFolder
 from local.up import notify
@@ -34,6 +35,7 @@ from local.up.pages import Pages
 
 # Closes again what an earlier start has opened.
 NO = "no"
+_PAGE = "PAGE"
 _LOOK_S = 1.0
 _RENEW_S = 3600.0
 # An emulator that ends by itself is started again, unless that happens so often in this time.
@@ -115,6 +117,7 @@ class _Kept:
     def __init__(self, options: argparse.Namespace, stopped: threading.Event) -> None:
         self._options, self._stopped = options, stopped
         self._state = StateFolder(options.state, kept=True)
+        # Of this start, and of the first one.
         self._began, self._started_s = time.monotonic(), time.time()
 
     def run(self) -> None:
@@ -130,8 +133,9 @@ class _Kept:
                 _say(f"{ended}\nIt is started again")
 
     def _once(self) -> None:
+        self._began = time.monotonic()
         settings = self._settings()
-        listen, page = (_listen(settings[name], name.upper()) for name in ("listen", "page"))
+        listen, page = (_listen(settings[name.lower()], name) for name in ("LISTEN", _PAGE))
         embedded = EmbeddedCloud(
             self._state.path,
             live=IOT,
@@ -219,7 +223,7 @@ class _Kept:
                 how = f"password {pages.new_password} (shown once; `make up-password{state}` sets another)"
             told.append(("page, network", f"{pages.network.url}, {how}"))
         if embedded.listen:
-            where = f"{embedded.listen.host}:{embedded.ports['mqtt']}"
+            where = embedded.listen.at(embedded.ports["mqtt"])
             told.append(
                 ("cars", f"connect to {where} on {embedded.listen.address}; files go to {embedded.files_url}")
             )
@@ -236,6 +240,9 @@ def _listen(text: str, what: str) -> Listen | None:
     if text == NO:
         return None
     listen = Listen.parse(text, what)
+    if what == _PAGE and is_ipv6(listen.host):
+        # A Content-Security-Policy cannot name such an address, so the browser would refuse the broker.
+        raise LocalError(f"{what} must have a name after an IPv6 address, such as {what}={text},iort.lab")
     listen.check(what)
     return listen
 

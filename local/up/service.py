@@ -28,6 +28,8 @@ Wants=network-online.target
 Type=notify
 WorkingDirectory=$root
 ExecStart=$command
+# Its name in the journal.
+SyslogIdentifier=iort-cloud
 Restart=on-failure
 RestartSec=5
 # The first start deploys everything.

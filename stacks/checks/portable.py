@@ -2,7 +2,7 @@
 
 The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a
 defect that nobody would see. The lists are what the pinned ministack and local/gaps/ implement;
-tests/stacks/test_portable.py holds them against both.
+tests/stacks/checks/test_portable.py holds them against both.
 """
 
 from __future__ import annotations

@@ -29,6 +29,8 @@ def whole(path: Path, *, force: bool = False) -> Iterator[Path]:
     Raises `StationError` if ``path`` exists, unless ``force``.
     """
     check_free(path, force=force)
+    if not path.parent.is_dir():
+        raise StationError(f"{path} must be in a folder that exists")
     if path.exists() and not path.is_file():
         # A device or a pipe.
         yield path

@@ -23,7 +23,7 @@ from bench import ROOT
 from bench.ros.graph import PYTHONPATH, SYSTEM_PYTHON, python_with_rospy
 from tests.ports import free_port
 
-HERE = Path(__file__).resolve().parent
+SCRIPTS = Path(__file__).resolve().parent / "nodes"
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs"
 WAIT_S = 120.0
 
@@ -173,7 +173,7 @@ class Graph:
         return True
 
     def run(self, script: str, *arguments: object) -> Process:
-        return self.start([self.python, str(HERE / script), *map(str, arguments)])
+        return self.start([self.python, str(SCRIPTS / script), *map(str, arguments)])
 
     def module(self, module: str, *arguments: object) -> Process:
         return self.start([self.python, "-m", module, *map(str, arguments)])

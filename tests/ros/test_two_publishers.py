@@ -15,7 +15,7 @@ from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import embedded, until  # noqa: F401 - a fixture
 from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
-from tests.ros.mixed_robot import TOPICS
+from tests.ros.mixed.robot import TOPICS
 
 SECONDS = 10
 NAMES = ("/beacons", "/joint_states")

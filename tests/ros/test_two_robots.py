@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import Command, encode_command
+from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process
-from tests.unit.agent.downlink_rig import POSE
+from tests.unit.agent.control.downlink_rig import POSE
 
 POSE_TYPE = "geometry_msgs/PoseStamped"
 DRIVE = {

@@ -38,8 +38,8 @@ from iort_contract.topics import (
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
+from tests.stacks.monitoring.test_dashboards import FUNCTIONS
 from tests.stacks.templates import layers, name
-from tests.stacks.test_dashboards import FUNCTIONS
 
 HANDLERS = (
     "Live",

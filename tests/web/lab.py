@@ -70,7 +70,7 @@ def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
     }  # type: ignore[typeddict-item]  # of any state
 
 
-_PLAIN = {"low": 0.0, "high": 10.0, "unit": "", "names": [], "desired": False, "pending": "", "reason": ""}
+_PLAIN = {"low": 0.0, "high": 10.0, "unit": "", "names": [], "desired": False, "pending": None, "reason": ""}
 SETTINGS: list[dict[str, Any]] = [
     {**_PLAIN, "name": "live.enabled", "kind": "flag", "value": "true"},
     {**_PLAIN, "name": "live.rate_hz", "kind": "number", "unit": "Hz", "value": "10", "pending": "5"},

@@ -1,24 +1,12 @@
-"""The questions: a file a subject, a decorated function a question. They may use every package."""
+"""The questions: a room a subject, a decorated function a question. They may use every package."""
 
 from __future__ import annotations
 
 from verify.question import Question
-from verify.questions import (
-    alarms,
-    broker,
-    certificates,
-    dynamodb,
-    files,
-    functions,
-    live,
-    logs,
-    payloads,
-    provisioning,
-    quarantine,
-    rule_errors,
-    rules,
-    stream,
-)
+from verify.questions.identity import certificates, provisioning
+from verify.questions.messages import broker, live, payloads, rule_errors, rules
+from verify.questions.operations import alarms, functions, logs
+from verify.questions.storage import dynamodb, files, quarantine, stream
 
 # In the order in which they are asked.
 _FILES = (

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from bench.target import Target
 from iort_agent.files.http import trusting
-from iort_contract.messages.files import (
+from iort_contract.messages.requests.files import (
     Address,
     File,
     FileAnswer,

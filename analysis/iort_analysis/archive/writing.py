@@ -26,6 +26,7 @@ from iort_analysis.archive.columns import (
 from iort_analysis.archive.pieces import pieces
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
 from iort_contract.archive import Hour, content_hash, item_hash
+from iort_contract.catalog.streams import CATALOG
 from iort_contract.dynamodb import Item
 from iort_contract.tables import BATCH, EXPIRES_S
 
@@ -43,6 +44,13 @@ class Written(NamedTuple):
     refused: Mapping[str, int]
     content: str
     first_expires_s: int
+
+
+def described(stream: str) -> Describe:
+    """What the catalogue knows of a stream's fields."""
+    known = CATALOG[stream].fields if stream in CATALOG else ()
+    fields = {field.name: (field.unit, field.meaning) for field in known}
+    return lambda name: fields.get(name, ("", ""))
 
 
 def write_hour(

@@ -65,8 +65,8 @@ CATALOG = {
             (
                 Field("session", "", "the operator's session that sent the command"),
                 Field("by", "", "who sent it, as they say; null if they do not"),
-                Field("seq", "", "the command's number in its session"),
-                Field("sent_us", "us", "when it was sent, by the cloud's clock"),
+                Field("seq", "", "the command's number in its session", label="Command"),
+                Field("sent_us", "us", "when it was sent, by the cloud's clock", label="Sent at"),
                 Field(
                     "outcome",
                     "",
@@ -74,7 +74,7 @@ CATALOG = {
                 ),
                 Field("driver", "", "the session that drives now; null if none does"),
                 Field("driver_by", "", "who drives now"),
-                Field("lease_left_ms", "ms", "how long the driver's lease still holds"),
+                Field("lease_left_ms", "ms", "how long the driver's lease still holds", label="Lease left"),
                 Field(
                     "speed",
                     "m/s",

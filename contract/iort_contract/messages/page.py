@@ -171,12 +171,13 @@ class SettingEntry(SettingKind):
     """A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's.
     ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it
     was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has
-    not taken yet; ``reason`` says why it rejected the last one."""
+    not taken yet: null if it took the last one, and empty if it shall send all fields. ``reason`` says why it
+    rejected the last one."""
 
     name: str
     value: str
     desired: bool
-    pending: str
+    pending: str | None
     reason: str
 
 
@@ -188,7 +189,7 @@ class SettingsAnswer(TypedDict):
 
 
 class DriveLimitsEntry(TypedDict):
-    """What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`."""
+    """What a stick drives, and how far: `iort_contract.messages.control.driving.DriveLimits`."""
 
     command: str
     speed: str

@@ -16,7 +16,7 @@ from iort_agent.errors import AskError
 from iort_agent.ros1.json_message import decode, encode
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.messages.ask import INVALID
+from iort_contract.messages.requests.ask import INVALID
 
 STRING = "std_msgs/String"
 # Questions by the topic that wait for their turn.

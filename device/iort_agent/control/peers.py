@@ -7,7 +7,7 @@ from iort_agent.control.config import ROBOT_IN_TOPIC, DownlinkConfig, FleetConfi
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.messages.commands import FleetMessage, decode_fleet
+from iort_contract.messages.control.commands import FleetMessage, decode_fleet
 from iort_contract.ros1.definition import Definition
 from iort_contract.topics import FLEET, parse_topic
 

@@ -20,7 +20,7 @@ from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.ask import (
+from iort_contract.messages.requests.ask import (
     ASK_FOLDER,
     INVALID,
     MAX_INLINE_BYTES,

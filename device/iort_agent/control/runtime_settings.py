@@ -10,8 +10,8 @@ from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_contract.checks import check_field
-from iort_contract.messages.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS
-from iort_contract.messages.shadow import Rejection
+from iort_contract.messages.control.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS
+from iort_contract.messages.control.shadow import Rejection
 from iort_contract.topics import check_stream
 
 _PLACE = Place(Path("shadow agent"))

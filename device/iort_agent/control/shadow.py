@@ -16,9 +16,9 @@ from iort_agent.control.runtime_settings import overlay
 from iort_agent.errors import UplinkError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import DriveLimits
-from iort_contract.messages.shadow import (
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import DriveLimits
+from iort_contract.messages.control.shadow import (
     Outcome,
     OverShare,
     Rejection,

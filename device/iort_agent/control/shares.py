@@ -11,7 +11,7 @@ from iort_agent.control.config import ShareConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.ros1.json_message import decode
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.messages.commands import FLEET_MAX_AGE_MS, FleetMessage, encode_fleet
+from iort_contract.messages.control.commands import FLEET_MAX_AGE_MS, FleetMessage, encode_fleet
 from iort_contract.ros1.definition import Definition, parse
 from iort_contract.topics import FLEET
 

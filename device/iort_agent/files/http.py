@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from iort_agent.clock import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, unreadable
-from iort_contract.messages.files import Address
+from iort_contract.messages.requests.files import Address
 
 _CHUNK_BYTES = 64 * 1024
 _TIMEOUT_S = 30.0

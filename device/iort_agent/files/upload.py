@@ -17,7 +17,7 @@ from iort_agent.files.file import LocalFile, changed, look_at
 from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import ContractError
-from iort_contract.messages.files import (
+from iort_contract.messages.requests.files import (
     MAX_ADDRESSES,
     FileAnswer,
     FileRequest,

@@ -38,6 +38,8 @@ TODO = (
     "agent with a robot name of its own"
 )
 _MIN_RETRY_S, _MAX_RETRY_S = 0.5, 30.0
+# Enough for the longest pause. A power of any number of failures would be too large for a float.
+_MAX_DOUBLINGS = 6
 
 
 def too_many(sources: Sequence[SourceConfig], record: RecordConfig) -> str | None:
@@ -187,7 +189,7 @@ class RecordLane:
 
     def _hold(self, entry: Entry, error: UplinkError) -> None:
         """Wait longer after each failure in a row, with full jitter above a floor."""
-        ceiling = min(_MAX_RETRY_S, _MIN_RETRY_S * 2**self._failures)
+        ceiling = min(_MAX_RETRY_S, _MIN_RETRY_S * 2 ** min(self._failures, _MAX_DOUBLINGS))
         self._failures += 1
         self._refusal = str(error)
         delay = _MIN_RETRY_S + self._chance.random() * (ceiling - _MIN_RETRY_S)

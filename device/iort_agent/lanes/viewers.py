@@ -18,7 +18,7 @@ from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.tempo import Demand
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import LIVE_BROKER_EVERY_S, ContractError
-from iort_contract.messages.settings import ALWAYS
+from iort_contract.messages.control.settings import ALWAYS
 from iort_contract.messages.viewing import MAX_VIEWERS, decode_lease, lease_topic
 
 _log = logging.getLogger(__name__)

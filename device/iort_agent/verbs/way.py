@@ -25,8 +25,8 @@ from iort_agent.mqtt.by_hand import ForeignError, RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, no_tls, refused_ours, secured, utc
 from iort_contract.limits import ContractError
-from iort_contract.messages.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.messages.live import decode_pong, encode_ping
+from iort_contract.messages.requests.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.topics import FILE, PING, PONG, RULE, build_topic
 
 # A certificate that ends sooner should have been replaced by now.

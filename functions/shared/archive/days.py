@@ -13,10 +13,9 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from functions.shared.archive.archive import Archive
-from functions.shared.archive.hours import describe_of
 from functions.shared.metrics import emit
 from iort_analysis.archive.reading import ArchiveFile
-from iort_analysis.archive.writing import write_day
+from iort_analysis.archive.writing import described, write_day
 from iort_contract.archive import Hour, Pending, archived_hour, day_key, hour_key, hours_between, parse_hour
 from iort_contract.topics import parse_topic
 
@@ -52,7 +51,7 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
             write_day(
                 {parse_hour(row.hour): opened[row.key] for row in rows},
                 into,
-                describe=describe_of(topic.name),
+                describe=described(topic.name),
             )
             stored = archive.objects.write(key, into, etag)
         changes: list[Any] = []

@@ -20,9 +20,8 @@ from functions.shared.archive.archive import Archive
 from functions.shared.metrics import emit
 from iort_analysis.archive.items import items as archived_items
 from iort_analysis.archive.reading import ArchiveFile
-from iort_analysis.archive.writing import Describe, write_hour
+from iort_analysis.archive.writing import described, write_hour
 from iort_contract.archive import ArchivedHour, Pending, hour_key, parse_hour, refused_key
-from iort_contract.catalog.streams import CATALOG
 from iort_contract.dynamodb import Item, starting_between
 from iort_contract.tables import BATCH
 from iort_contract.topics import parse_topic
@@ -112,7 +111,7 @@ def _write(
             hour=hour,
             refused=refused,
             scratch=scratch,
-            describe=describe_of(parse_topic(topic).name),
+            describe=described(parse_topic(topic).name),
         )
         if row is None or with_archived or written.content == row.content:
             count = sum(written.refused.values())
@@ -153,10 +152,3 @@ def _keep(archive: Archive, row: ArchivedHour, before: ArchivedHour | None) -> N
             "ExpressionAttributeValues": {":content": {"S": before.content}},
         }
     archive.client.put_item(TableName=archive.manifest.name, Item=row.item(), **unchanged)
-
-
-def describe_of(stream: str) -> Describe:
-    """What the catalogue knows of a stream's fields."""
-    known = CATALOG[stream].fields if stream in CATALOG else ()
-    described = {field.name: (field.unit, field.meaning) for field in known}
-    return lambda name: described.get(name, ("", ""))

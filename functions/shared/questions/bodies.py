@@ -11,8 +11,8 @@ from iort_contract.catalog.questions import Question
 from iort_contract.checks import json_object
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.limits import ContractError
-from iort_contract.messages.ask import ANSWER_URL_S, ASK_FOLDER, INVALID, TOO_LARGE, Content
-from iort_contract.messages.files import parse_file_key
+from iort_contract.messages.requests.ask import ANSWER_URL_S, ASK_FOLDER, INVALID, TOO_LARGE, Content
+from iort_contract.messages.requests.files import parse_file_key
 
 if TYPE_CHECKING:
     from types_boto3_s3 import S3Client

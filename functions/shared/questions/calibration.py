@@ -8,7 +8,7 @@ from typing import Any
 from functions.shared.questions import parameters
 from functions.shared.questions.work import RefusedError
 from iort_contract.messages.analysis.findings import encode_estimate
-from iort_contract.messages.ask import NO_DATA
+from iort_contract.messages.requests.ask import NO_DATA
 
 
 def work(robot: str, _body: Mapping[str, Any]) -> dict[str, Any]:

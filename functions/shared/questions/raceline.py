@@ -14,7 +14,7 @@ from iort_analysis.raceline.speed import Limits, profile
 from iort_contract.catalog.questions import CAR_LIMITS, SAG, CarLimit
 from iort_contract.checks import shown
 from iort_contract.limits import ContractError
-from iort_contract.messages.ask import INVALID
+from iort_contract.messages.requests.ask import INVALID
 from iort_contract.track import Track, parse_track, track_of
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from iort_contract.catalog.questions import Question
-from iort_contract.messages.ask import Refusal
+from iort_contract.messages.requests.ask import Refusal
 
 # Makes the answer's body of a robot's name and the question's body. May raise `RefusedError`.
 Work = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]

@@ -55,7 +55,7 @@ class CloudOptions:
             if said:
                 raise
             raise StationError(
-                f"{error}. No embedded cloud runs here either; `make demo` starts one"
+                f"{error}. No embedded cloud runs here either; `make up` or `make demo` starts one"
             ) from error
 
     def means_kept(self, folder: Path) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from iort_contract.messages.settings import ALWAYS, WATCHED
+from iort_contract.messages.control.settings import ALWAYS, WATCHED
 from iort_station.cost.usage import TRANSPORTS, Usage
 from iort_station.errors import StationError
 

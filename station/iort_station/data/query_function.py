@@ -14,7 +14,7 @@ import numpy as np
 from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, join, ordered
 from iort_contract.limits import ContractError
-from iort_contract.messages.query import (
+from iort_contract.messages.requests.query import (
     FIRST_US,
     LAST_US,
     QueryAnswer,

@@ -21,6 +21,7 @@ from iort_contract.tables import (
     ADMITTED_MS,
     CONNECTED_MS,
     DISCONNECTED_MS,
+    MOVED_FROM,
     ONLINE,
     ROBOT,
 )
@@ -143,6 +144,17 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
     except dynamodb.exceptions.ConditionalCheckFailedException as error:
         raise not_registered(cloud, robot) from error
     return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
+
+
+def set_moved(cloud: Cloud, robot: str, origin: str) -> None:
+    """Note the deployment that a registered robot has come from."""
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=f"SET {MOVED_FROM} = :origin",
+        ConditionExpression=f"attribute_exists({ROBOT})",
+        ExpressionAttributeValues={":origin": {"S": origin}},
+    )
 
 
 class ClaimId(NamedTuple):

@@ -69,25 +69,48 @@ def add(
     folder = out / robot
     if folder.exists() and any(folder.iterdir()):
         raise StationError(f"{folder} is not empty; its keys would be lost")
-    # Create it before anything is registered, since it will hold the only copy of the private key.
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     registry.enter(cloud, robot, vehicle)
-    iot, fleet = cloud.client("iot"), fleet_name(cloud.namespace)
+    bundle = Bundle(robot, folder)
+    equip(cloud, bundle, settings)
+    return bundle
+
+
+def equip(cloud: Cloud, bundle: Bundle, settings: Mapping[str, Any] | None = None) -> None:
+    """Make a certificate for a registered robot, and write its bundle. Interrupted, it can be repeated."""
+    # Create it before anything is registered, since it will hold the only copy of the private key.
+    bundle.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    iot, robot = cloud.client("iot"), bundle.robot
     try:
-        iot.create_thing(
-            thingName=robot, thingTypeName=fleet, attributePayload={"attributes": {"vehicle": "vesc"}}
-        )
-        iot.add_thing_to_thing_group(thingGroupName=fleet, thingName=robot)
+        make_thing(cloud, robot, attributes(cloud, robot) or {"vehicle": "vesc"})
         made = certificates.make(iot, robot)
-        iot.attach_policy(policyName=fleet, target=made.arn)
+        iot.attach_policy(policyName=fleet_name(cloud.namespace), target=made.arn)
         iot.attach_thing_principal(thingName=robot, principal=made.arn)
     except ClientError as error:
         raise StationError(
             f"robot {robot} is only partly registered; remove it and try again: {error}"
         ) from error
-    bundle = Bundle(robot, folder)
     write_bundle(cloud, bundle, made.pem, made.private_key_pem, settings or {})
-    return bundle
+
+
+def attributes(cloud: Cloud, robot: str) -> dict[str, str] | None:
+    """The attributes of a robot's thing: its tags, and its serial number; None if it has no thing."""
+    iot = cloud.client("iot")
+    try:
+        return dict(iot.describe_thing(thingName=robot).get("attributes", {}))
+    except iot.exceptions.ResourceNotFoundException:
+        return None
+
+
+def make_thing(cloud: Cloud, robot: str, attributes: Mapping[str, str]) -> None:
+    """Make a robot's thing with these attributes, or give them to the one that it has."""
+    iot, fleet = cloud.client("iot"), fleet_name(cloud.namespace)
+    given = dict(attributes)
+    try:
+        iot.create_thing(thingName=robot, thingTypeName=fleet, attributePayload={"attributes": given})
+    except iot.exceptions.ResourceAlreadyExistsException:
+        iot.update_thing(thingName=robot, attributePayload={"attributes": given, "merge": False})
+    iot.add_thing_to_thing_group(thingGroupName=fleet, thingName=robot)
 
 
 def remove(cloud: Cloud, robot: str) -> None:

@@ -10,8 +10,8 @@ from iort_analysis.samples.batches import RefusedItems
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
-from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
+from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
 from iort_station.data.batches import PageProgress

@@ -106,18 +106,22 @@ def _addresses(up: Up) -> Iterator[Finding]:
             try:
                 socket.create_connection((host, up.ports[name]), _CONNECT_S).close()
             except OSError as error:
-                silent.append(f"{name} at {host}:{up.ports[name]} ({error.strerror or error})")
+                silent.append(f"{name} at {_at(host, up.ports[name])} ({error.strerror or error})")
     if silent:
         todo = "`make down`, then `make up`; does this machine still have the address of LISTEN or PAGE?"
         yield Finding("servers", FAIL, f"no answer from {', '.join(silent)}", todo)
         return
-    where = f"cars connect to {cars}:{up.ports['mqtt']}" if up.listen else "cars of this machine only"
+    where = f"cars connect to {_at(cars, up.ports['mqtt'])}" if up.listen else "cars of this machine only"
     yield Finding("servers", OK, f"all answer; {where}")
     shown_s = _shown_end_s(cars, up.ports["mqtt"])
     written_s = next((one.ends_s for one in up.certificates if one.name == "broker"), None)
     if shown_s is not None and written_s is not None and abs(shown_s - written_s) > 1:
         text = f"the broker shows a certificate that ends on {_day(shown_s)}, not the one in its file"
         yield Finding("broker", WARN, text, "`make down`, then `make up`, before that day")
+
+
+def _at(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _shown_end_s(host: str, port: int) -> float | None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract.messages.files import File, file_key
+from iort_contract.messages.requests.files import File, file_key
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud
 from iort_station.cost.usage import Usage
@@ -23,6 +23,8 @@ from tests.ports import free_port
 def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     added = iort("robots", "add", "cli-car", "--out", str(tmp_path), "--speed-to-erpm-gain", "3000")
     assert added.exit_code == 0, added.output
+    # The cloud listens on loopback alone.
+    assert "run here" in added.output
     key = tmp_path / "cli-car" / "private.key"
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
     listed = json.loads(iort("robots", "list", "--json").output)

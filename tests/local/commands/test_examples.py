@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from iort_agent.sources.sim.circuit import HALL
-from iort_contract.messages.files import File, file_key
+from iort_contract.messages.requests.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
 from local.demo import DOWNLINK

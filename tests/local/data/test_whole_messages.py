@@ -16,8 +16,8 @@ from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import run_agent
 from tests.local.data.drives import Agent
-from tests.ros.mixed_compare import compare, read
-from tests.ros.mixed_robot import TOPICS, Maker, Topic
+from tests.ros.mixed.compare import compare, read
+from tests.ros.mixed.robot import TOPICS, Maker, Topic
 from tests.ros1_types import Message, header
 from tests.unit.station.test_round_trip import KNOWN
 

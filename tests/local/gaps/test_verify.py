@@ -23,7 +23,8 @@ from iort_station.page import keys
 from verify import price, report, run
 from verify.errors import VerifyError
 from verify.question import WITH_KEY, Question, Verdict, ask
-from verify.questions import ALL, live
+from verify.questions import ALL
+from verify.questions.messages import live
 
 # PubNub's SDK may leave the socket of a long poll to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <socket.socket:ResourceWarning")

@@ -20,10 +20,11 @@ TOOLS = ("ip", "nsenter", "unshare")
 
 @dataclass(frozen=True)
 class Machine:
-    """A namespace with an address."""
+    """A namespace with an address of each kind."""
 
     pid: int
     address: str
+    address6: str
 
     def command(self, *command: str) -> list[str]:
         """A command as it is run on this machine."""
@@ -46,8 +47,8 @@ class Machine:
 
 @contextmanager
 def two_machines(folder: Path) -> Iterator[tuple[Machine, Machine]]:
-    """Two machines, 10.77.0.1 and 10.77.0.2, with file systems of their own in common. Skips where they
-    cannot be made."""
+    """Two machines, 10.77.0.1 and 10.77.0.2, fd77::1 and fd77::2, with file systems of their own in common.
+    Skips where they cannot be made."""
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
         pytest.skip(f"{missing[0]} is not installed: apt-get install iproute2 util-linux")
@@ -71,15 +72,17 @@ def two_machines(folder: Path) -> Iterator[tuple[Machine, Machine]]:
                 child.check()
             return child.pid
 
-        one = Machine(stays("one", made), "10.77.0.1")
+        one = Machine(stays("one", made), "10.77.0.1", "fd77::1")
         enter = ["nsenter", f"--target={one.pid}", "--user", "--mount", "--wd=.", "--preserve-credentials"]
         inside = [*enter, "unshare", "--net"]
-        other = Machine(stays("other", inside), "10.77.0.2")
+        other = Machine(stays("other", inside), "10.77.0.2", "fd77::2")
         one.run(
             "ip", "link", "add", "cable", "type", "veth", "peer", "name", "cable", "netns", str(other.pid)
         )
         for machine in (one, other):
             machine.run("ip", "address", "add", f"{machine.address}/24", "dev", "cable")
+            # At once: nobody else can have it.
+            machine.run("ip", "address", "add", f"{machine.address6}/64", "dev", "cable", "nodad")
             machine.run("ip", "link", "set", "cable", "up")
             machine.run("ip", "link", "set", "lo", "up")
         yield one, other

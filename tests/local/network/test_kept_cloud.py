@@ -43,7 +43,7 @@ def test_a_kept_folder_keeps_its_ports_and_a_second_cloud_is_refused(state):
         again.take(stack)
     with (
         socket.create_server(("127.0.0.1", port)),
-        pytest.raises(LocalError, match=r"is in use .*stop that one .*settings\.json, .*car\.yaml"),
+        pytest.raises(LocalError, match=r"is in use .*'sport = :.*`make down .*settings\.json, .*car\.yaml"),
     ):
         again.port("mqtt", "127.0.0.1")
 
@@ -121,7 +121,19 @@ def test_a_port_is_free_on_each_of_its_addresses(state):
             state.port("mqtt", "127.0.0.1", "127.0.0.2", wanted=port)
 
 
-@pytest.mark.parametrize("text", ["", "iort.lab", "0.0.0.0", "::", "192.0.2.1/24", "192.0.2.1,no name"])
+@pytest.mark.parametrize(
+    ("given", "least", "most"),
+    [("32768\t60999", 20_000, 32_767), ("1024 60999", 61_000, 65_535), ("1024 65535", 1024, 65_535)],
+)
+def test_a_kept_port_is_none_that_the_system_gives_to_others(state, monkeypatch, given, least, most):
+    (state.path / "range").write_text(given)
+    monkeypatch.setattr("local.state._EPHEMERAL", state.path / "range")
+    assert least <= state.port("gateway", "127.0.0.1") <= most
+
+
+@pytest.mark.parametrize(
+    "text", ["", "iort.lab", "0.0.0.0", "::", "192.0.2.1/24", "192.0.2.1,no name", "fe80::1%eth0"]
+)
 def test_listen_needs_an_address_to_name_in_a_bundle(text):
     with pytest.raises(LocalError, match=r"^LISTEN must .*got "):
         Listen.parse(text, "LISTEN")
@@ -132,6 +144,8 @@ def test_cars_are_told_a_name_if_there_is_one():
     found = Listen.parse("192.0.2.1, 10.0.0.1,IoRT.lab,other", "LISTEN")
     assert (found.address, found.host) == ("192.0.2.1", "iort.lab")
     assert found.hosts == ("192.0.2.1", "10.0.0.1", "iort.lab", "other")
+    assert (found.at(8444), found.at(443)) == ("iort.lab:8444", "iort.lab")
+    assert Listen.parse("FD77:0::1", "LISTEN").at(8444) == "[fd77::1]:8444"
     with pytest.raises(LocalError, match=r"must be an address of this machine, got 192\.0\.2\.1"):
         found.check("LISTEN")
 
@@ -199,3 +213,12 @@ def test_a_full_disk_shortens_a_log_all_the_same(tmp_path):
     (tmp_path / "log.1").mkdir()
     child.shorten_log(50)
     assert log.read_bytes() == b""
+
+
+def test_a_page_at_an_ipv6_address_needs_a_name_that_a_browsers_policy_can_have(tmp_path):
+    up = [sys.executable, "-m", "local.up.run", "--state", str(tmp_path / "cloud"), "--page", "::1"]
+    done = subprocess.run(up, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (
+        1,
+        "up: PAGE must have a name after an IPv6 address, such as PAGE=::1,iort.lab\n",
+    )

@@ -1,4 +1,5 @@
-"""`make up` on one machine and a car on another: what the network reaches, and what kills leave."""
+"""`make up` on one machine and a car on another: what the network reaches, and what kills leave. Then systemd
+runs the same cloud."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from iort_station.cloud import EMBEDDED_VARIABLE
 from local.deployment import ROOT
 from local.processes import Child
 from local.up.down import stop
+from local.up.service import NAME
 from tests.local.conftest import until
+from tests.local.network.booted import booted
 from tests.local.network.namespaces import Machine, two_machines
 
 BIN = Path(sys.executable).parent
@@ -199,3 +202,47 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
     assert laboratory.listeners() == set()
     ended = laboratory.car.run("sh", "-c", '"$@" || true', "sh", *check)
     assert f"port: {address} answers, but nothing listens on {ports['mqtt']}" in ended
+
+
+def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
+    address = laboratory.cloud.address6
+    bundle = laboratory.folder / "car6"
+    with laboratory.running("--listen", address, "--page", f"{address},cloud.lab"):
+        ports = kept.Up.load(laboratory.state).ports
+        reached = {(address, ports[name]) for name in ("mqtt", "files", "network page")}
+        assert laboratory.listeners() == reached
+        laboratory.iort("robots", "add", "car6", "--out", str(laboratory.folder))
+        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
+        assert "rules: answer a ping" in laboratory.car.run(*check)
+        upload = laboratory.folder / "drive.bag"
+        upload.write_bytes(b"samples")
+        sent = car(bundle, "upload", str(upload))
+        assert sent.wait(60.0) == 0, sent.tail()
+        assert "drive.bag" in laboratory.iort("files", "list", "car6")
+        assert f"cars connect to [{address}]:{ports['mqtt']}" in laboratory.iort("doctor")
+
+
+def test_systemd_starts_the_cloud_again_after_a_kill_and_stops_it(laboratory):
+    def service(*options: str) -> None:
+        machine.run(sys.executable, "-m", "local.up.service", "--state", str(laboratory.state), *options)
+
+    def said(key: str) -> str:
+        return machine.run("systemctl", "show", NAME, "--property", key, "--value").strip()
+
+    with booted(laboratory.folder) as machine:
+        service("--listen", "127.0.0.5,iort.lab", "--page", "no")
+        # Starting it ends when it is ready.
+        assert said("ActiveState") == "active"
+        main = said("MainPID")
+        machine.run("kill", "-KILL", main)
+        until(lambda: said("ActiveState") == "active" and said("MainPID") not in {"0", main})
+        assert said("NRestarts") == "1"
+        doctor = machine.run(str(BIN / "iort"), "doctor", IORT_STATE=str(laboratory.state))
+        assert f"processes: up {said('MainPID')}, emulator " in doctor
+        assert "ok    servers: all answer" in doctor
+        assert "connect to iort.lab:" in machine.run("journalctl", "--identifier", "iort-cloud")
+        machine.run("systemctl", "stop", NAME)
+        assert (said("Result"), said("ExecMainStatus")) == ("success", "0")
+        assert not (laboratory.state / kept.UP).exists()
+        service("--remove")
+        assert said("LoadState") == "not-found"

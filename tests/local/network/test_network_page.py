@@ -12,7 +12,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from iort_contract.cloud import IOT
-from local.certificates import ServerCertificate
+from local.certificates import LASTS_S, ServerCertificate
 from local.network.listen import Listen
 from local.up import network_page
 from local.up.login import TRIES, Password
@@ -22,20 +22,22 @@ from tests.browser import until
 from tests.ports import free_port
 
 ADDRESS = Listen("127.0.0.3", ("127.0.0.3",))
+NAMED = Listen("::1", ("::1", "localhost"))
 RIGHT = "correct horse battery"
 UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Protocol": "mqtt"}
 
 
 @pytest.fixture
-def page(embedded, tmp_path) -> Iterator[NetworkPage]:
+def page(embedded, tmp_path, request) -> Iterator[NetworkPage]:
+    listen: Listen = getattr(request, "param", ADDRESS)
     password = Password(tmp_path, PasswordHasher(time_cost=1, memory_cost=8, parallelism=1))
     password.set(RIGHT)
-    certificate = ServerCertificate(embedded.authority, tmp_path / "page.pem", ADDRESS.hosts)
+    certificate = ServerCertificate(embedded.authority, tmp_path / "page.pem", listen.hosts)
     certificate.renew()
     port = free_port()
-    cloud = replace(embedded.cloud, websocket=f"wss://{ADDRESS.in_url}:{port}{SOCKET}")
+    cloud = replace(embedded.cloud, websocket=f"wss://{listen.at(port)}{SOCKET}")
     with NetworkPage(
-        ADDRESS,
+        listen,
         port,
         password=password,
         gateway=cloud.endpoint_url or "",
@@ -117,6 +119,18 @@ def test_pages_elsewhere_can_neither_log_in_nor_listen(page, ask, log_in):
     assert ask("GET", "/", Host="iort.lab")[0].headers["Location"] == page.url
 
 
+def test_the_page_takes_over_a_renewed_certificate(page, embedded, tmp_path):
+    shown = [ssl.get_server_certificate((ADDRESS.host, page.port)).strip()]
+    # As after two months.
+    certificate = ServerCertificate(
+        embedded.authority, tmp_path / "page.pem", ADDRESS.hosts, renewed_s=LASTS_S
+    )
+    assert certificate.renew()
+    # The first connection after the change tells the server.
+    shown += [ssl.get_server_certificate((ADDRESS.host, page.port)).strip() for _ in range(2)]
+    assert [one in certificate.path.read_text() for one in shown] == [False, False, True]
+
+
 def test_guesses_come_to_an_end(ask, log_in):
     assert [log_in(f"guess {i} of many")[0].status for i in range(TRIES)] == [403] * TRIES
     answer, body = log_in()
@@ -147,6 +161,7 @@ def test_a_password_may_come_in_pieces_but_not_for_ever(page, embedded, monkeypa
     assert post(body[:15]) == 408
 
 
+@pytest.mark.parametrize("page", [ADDRESS, NAMED], indirect=True, ids=str)
 def test_a_browser_logs_in_listens_and_may_drive(page, open_page):
     tab = open_page(page.url, listening=False, ignore_https_errors=True)
     tab.fill("input[type=password]", "not the password")

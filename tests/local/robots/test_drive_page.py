@@ -12,7 +12,7 @@ from playwright.sync_api import TimeoutError  # noqa: A004 - as playwright names
 
 from bench.load.agent_process import AgentProcess
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.commands import Command, encode_command
+from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.page.answers import control, socket
 from iort_station.page.answers.index import actions, answers

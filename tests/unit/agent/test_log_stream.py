@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Iterator
 
 import pytest
 
@@ -20,6 +21,7 @@ from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.live import decode_live
+from iort_contract.topics import LIVE, RECORD, build_topic
 from tests.agent_fakes import Loopback, ManualClock
 
 T0_S = 1_700_000_000.0
@@ -109,32 +111,62 @@ class Failing:
         raise SourceError("the device is gone")
 
 
-@pytest.mark.parametrize("working", [True, False])
-def test_lines_are_recorded_and_live_and_a_failing_link_adds_few(working: bool) -> None:
-    clock = ManualClock()
-    uplink = Loopback(clock, Dispatcher())
-    if not working:
-        uplink.verdict = lambda message: "no" if "/record" in message.topic or message.qos else None
-    spool = MemorySpool(max_bytes=2000, policy=REJECT_NEW)
+@contextmanager
+def logging_agent(uplink: Loopback, clock: ManualClock) -> Iterator[Agent]:
+    """An agent whose only source fails, and which sends what is logged."""
     troubles = Troubles()
+    spool = MemorySpool(max_bytes=2000, policy=REJECT_NEW)
+    config = Config("car1", "host", Path(), Path(), (Failing(),))  # type: ignore[arg-type]  # no check
     logging.getLogger().addHandler(troubles)
     try:
-        config = Config("car1", "host", Path(), Path(), (Failing(),))  # type: ignore[arg-type]  # no check
-        agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
-        assert Runtime(agent).run(drain_s=10 if working else 0.2) == 1
+        yield Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
     finally:
         logging.getLogger().removeHandler(troubles)
-    topics = f"car1/{LOG_STREAM}"
-    live = [
-        decode_live(m.payload) for m in uplink.published if m.topic.endswith(topics) and "live" in m.topic
-    ]
-    stored = [
-        decode_batch(m.payload) for m in uplink.published if m.topic.endswith(topics) and "/dt/" in m.topic
-    ]
-    if working:
-        told = ["source failed: failing: the device is gone"]
-        # The waiting threads move the manual clock by minutes: a live line may be too old to send.
-        assert [one.sample["text"] for one in live] in (told, [])
-        assert [text for batch in stored for text in batch.columns["text"]] == told
+
+
+def payloads(uplink: Loopback, lane: str) -> list[bytes]:
+    return [m.payload for m in uplink.published if m.topic.endswith(build_topic(lane, "car1", LOG_STREAM))]
+
+
+def recorded(uplink: Loopback) -> list[Any]:
+    return [text for one in payloads(uplink, RECORD) for text in decode_batch(one).columns["text"]]
+
+
+def test_a_line_is_live_at_once_and_recorded() -> None:
+    clock = ManualClock()
+    uplink = Loopback(clock, Dispatcher())
+    with logging_agent(uplink, clock) as agent:
+        uplink.start()
+        logging.getLogger("iort_agent.x").warning("the first")
+        Runtime(agent).tick()
+        (live,) = payloads(uplink, LIVE)
+        assert decode_live(live).sample["text"] == "the first"
+        agent.streams.flush()
+        agent.record.step()
+        assert recorded(uplink) == ["the first"]
+        uplink.stop(10)
+
+
+def test_the_last_line_of_a_run_is_recorded() -> None:
+    clock = ManualClock()
+    uplink = Loopback(clock, Dispatcher())
+    with logging_agent(uplink, clock) as agent:
+        assert Runtime(agent).run(drain_s=10) == 1
+    assert recorded(uplink) == ["source failed: failing: the device is gone"]
+
+
+def test_a_failing_link_adds_few_lines() -> None:
+    clock, dispatcher = ManualClock(), Dispatcher()
+    uplink = Loopback(clock, dispatcher)
+    uplink.verdict = lambda message: "no" if message.qos else None
+    with logging_agent(uplink, clock) as agent:
+        runtime = Runtime(agent)
+        uplink.connect()
+        logging.getLogger("iort_agent.x").warning("the first")
+        for _ in range(3000):
+            clock.advance(0.2)
+            runtime.tick()
+            agent.record.step()
+            dispatcher.run_pending()
     # Each refusal of a batch of lines is a warning, too.
-    assert agent.streams.counts()[LOG_STREAM].samples < 30
+    assert 2 < agent.streams.counts()[LOG_STREAM].samples <= 20

@@ -8,7 +8,9 @@ from functions import live
 from functions.shared.summary import stored
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
-from iort_contract.messages import ask, commands, files, viewing
+from iort_contract.messages import viewing
+from iort_contract.messages.control import commands
+from iort_contract.messages.requests import ask, files
 from iort_contract.ros1.message import MAX_LAYOUT
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section

@@ -15,19 +15,8 @@ from iort_agent.control.runtime_settings import RuntimeSettings, overlay
 from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
-from iort_contract.messages.ask import (
-    OVER_QUOTA,
-    Answer,
-    Ask,
-    Content,
-    Refusal,
-    decode_answer,
-    decode_ask,
-    encode_answer,
-    encode_ask,
-)
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
-from iort_contract.messages.commands import (
+from iort_contract.messages.control.commands import (
     Command,
     FleetMessage,
     decode_command,
@@ -35,18 +24,9 @@ from iort_contract.messages.commands import (
     encode_command,
     encode_fleet,
 )
+from iort_contract.messages.control.settings import CHANGEABLE
+from iort_contract.messages.control.shadow import decode_desired, decode_reported, encode_reported
 from iort_contract.messages.event import rule_event
-from iort_contract.messages.files import (
-    Address,
-    File,
-    FileAnswer,
-    FileRequest,
-    decode_file_answer,
-    decode_file_request,
-    encode_file_answer,
-    encode_file_request,
-    file_key,
-)
 from iort_contract.messages.live import (
     LiveSample,
     Pong,
@@ -57,8 +37,28 @@ from iort_contract.messages.live import (
     live_update,
 )
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.messages.settings import CHANGEABLE
-from iort_contract.messages.shadow import decode_desired, decode_reported, encode_reported
+from iort_contract.messages.requests.ask import (
+    OVER_QUOTA,
+    Answer,
+    Ask,
+    Content,
+    Refusal,
+    decode_answer,
+    decode_ask,
+    encode_answer,
+    encode_ask,
+)
+from iort_contract.messages.requests.files import (
+    Address,
+    File,
+    FileAnswer,
+    FileRequest,
+    decode_file_answer,
+    decode_file_request,
+    encode_file_answer,
+    encode_file_request,
+    file_key,
+)
 from iort_contract.messages.viewing import Lease, decode_lease, encode_lease
 from iort_contract.tables import (
     OVER_SHARE,

@@ -19,7 +19,7 @@ from functions.shared.quota import DAY, Quota
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
 from iort_contract.messages.event import rule_event
-from iort_contract.messages.files import (
+from iort_contract.messages.requests.files import (
     MAX_ADDRESSES,
     MAX_FILE_BYTES,
     PART_BYTES,

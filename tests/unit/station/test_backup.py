@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gzip
 import os
 import sqlite3
@@ -84,6 +85,30 @@ def test_a_backup_of_a_cloud_that_is_written_to_is_of_one_moment(
     assert not (state / ".backup").exists()
 
 
+def test_the_next_backup_removes_what_a_killed_one_has_left(state: Path, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(state / "ledger.db")) as ledger:
+        ledger.execute("CREATE TABLE written (number INTEGER PRIMARY KEY)")
+    backups = tmp_path / "back[1]ups"
+    backups.mkdir()
+    code = (
+        "import os, signal, sys; from pathlib import Path; from iort_station.upkeep.backup import back_up\n"
+        "def kill(_bytes): os.kill(os.getpid(), signal.SIGKILL)\n"
+        "back_up(Path(sys.argv[1]), Path(sys.argv[2]), progress=kill)"
+    )
+    archive = backups / "cloud.tar"
+    subprocess.run([sys.executable, "-c", code, str(state), str(archive)], check=False, timeout=60)
+    assert len(list(backups.iterdir())) == 2
+    # One that another process is writing, and a file of somebody's.
+    others = {backups / ".cloud.tar.1.part", backups / ".cloud.tar.notes"}
+    for other in others:
+        other.touch()
+    with (backups / ".cloud.tar.1.part").open() as written:
+        fcntl.flock(written, fcntl.LOCK_EX)
+        back_up(state, archive)
+    assert set(backups.iterdir()) == {archive, *others}
+    verify(archive)
+
+
 def test_a_robots_files_are_copied_byte_by_byte_whatever_their_names(state: Path, tmp_path: Path) -> None:
     files = state / "s3" / "files"
     for name in ("vesc.log", "up.json", "tmp/drive.bag", "notes-wal"):
@@ -121,6 +146,8 @@ def test_a_file_system_without_links_gets_copies(
 
 def test_a_damaged_backup_changes_nothing(state: Path, tmp_path: Path) -> None:
     archive = tmp_path / "cloud.tar"
+    with pytest.raises(StationError, match="must be in a folder that exists"):
+        back_up(state, tmp_path / "nowhere" / "cloud.tar")
     (state / "s3" / "drive.bag").write_bytes(b"drive" * 1000)
     back_up(state, archive)
     good = archive.read_bytes()

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import decode_command
-from iort_contract.messages.driving import DriveLimits
+from iort_contract.messages.control.commands import decode_command
+from iort_contract.messages.control.driving import DriveLimits
 from iort_station.cli.verbs.fleet.drive import _Seat
 from iort_station.errors import StationError
 from iort_station.fleet.control import stopping

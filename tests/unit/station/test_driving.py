@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import Command, decode_command, encode_command
-from iort_contract.messages.driving import DriveLimits
+from iort_contract.messages.control.commands import Command, decode_command, encode_command
+from iort_contract.messages.control.driving import DriveLimits
 from iort_contract.messages.live import LiveSample
 from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
 from iort_station.fleet.control.driving import Driver, Phase, Stick

@@ -1,4 +1,6 @@
-"""A move replaces nothing that the target has of its own, and finds that both sides are one account."""
+"""A move replaces nothing that the target has of its own, nothing that was deleted comes back, and both sides
+are not one account.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +10,37 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from botocore.exceptions import ClientError
 
-from iort_contract.archive import ArchivedHour
+from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.archive.writing import described, write_day
+from iort_analysis.samples.blocks import join, values
+from iort_contract.archive import ArchivedHour, archived_hour, parse_hour
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.operations import move
+from iort_station.moving import archived, plan, written
+from tests.unit.analysis.test_archive import batch_at, item_of
+from tests.unit.analysis.test_archive import written as written_hour
 from tests.unit.contract.test_findings import FINDING
 from tests.unit.contract.test_notes import OneTable, note
 
-TOPIC, DAY = "rec/iort/car7/vesc", "archive/robot=car7/stream=vesc/date=2026-11-22/day.parquet"
+TOPIC = build_topic(RECORD, "car7", "vesc")
+DAY = "archive/robot=car7/stream=vesc/date=2026-11-22/day.parquet"
+
+
+def day(*hours: str) -> bytes:
+    """A day's object; each batch tells its hour."""
+    files = {}
+    for name in hours:
+        hour = parse_hour(f"2026-11-22T{name}")
+        files[hour] = written_hour([item_of(batch_at(hour, 0, {"speed": [float(name)] * 3}))], hour)[0]
+    into = io.BytesIO()
+    write_day(files, into, describe=described("vesc"))
+    return into.getvalue()
 
 
 class Account:
@@ -27,8 +48,13 @@ class Account:
 
     endpoint_url, region_name = None, "eu-west-1"
 
-    def __init__(self, number: str, content: bytes, *hours: str) -> None:
-        self.number, self.content, self.rows = number, {DAY: content}, [row(hour, content) for hour in hours]
+    def __init__(self, number: str, *hours: str) -> None:
+        self.number = number
+        self.content = {DAY: day(*hours)} if hours else {}
+        sha256 = hashlib.sha256(self.content.get(DAY, b"")).hexdigest()
+        self.rows = [
+            ArchivedHour(TOPIC, f"2026-11-22T{hour}", DAY, 1, 50, 0, "", sha256, 1, 0, 0) for hour in hours
+        ]
         self.findings = FindingsTable(OneTable(), "findings")
 
     def client(self, _service: str) -> Account:
@@ -43,15 +69,23 @@ class Account:
     def get_object(self, *, Bucket: str, Key: str) -> dict[str, Any]:
         return {"Body": io.BytesIO(self.content[Key])}
 
-    def put_object(self, *, Bucket: str, Key: str, Body: bytes) -> None:
+    def put_object(self, *, Bucket: str, Key: str, Body: bytes, IfNoneMatch: str = "") -> None:
+        if IfNoneMatch and Key in self.content:
+            raise ClientError({"Error": {"Code": "PreconditionFailed"}}, "PutObject")
         self.content[Key] = Body
 
     def put_item(self, *, TableName: str, Item: dict[str, Any]) -> None:
-        self.rows.append(row(Item["hour"]["S"], self.content[DAY]))
+        self.rows.append(archived_hour(Item))
 
-
-def row(hour: str, content: bytes) -> ArchivedHour:
-    return ArchivedHour(TOPIC, hour, DAY, 1, 50, 0, "", hashlib.sha256(content).hexdigest(), 1, 0, 0)
+    def speeds(self) -> dict[str, list[Any]]:
+        """What the manifest leads to, by hour."""
+        found = {}
+        for row in self.rows:
+            file = ArchiveFile(self.content[row.key])
+            assert hashlib.sha256(self.content[row.key]).hexdigest() == row.sha256
+            parts = list(file.pages(parse_hour(row.hour)))
+            found[row.hour[-2:]] = values(join([part.block for part in parts]).columns["speed"])
+        return found
 
 
 @pytest.fixture(autouse=True)
@@ -60,40 +94,63 @@ def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, account: Account, _topic: str) -> None:
             self.rows = account.rows.copy
 
-    monkeypatch.setattr(move, "Archive", Rows)
-    monkeypatch.setattr(move.findings, "table", lambda account: account.findings)
+    monkeypatch.setattr(archived, "Archive", Rows)
+    monkeypatch.setattr(written.findings, "table", lambda account: account.findings)
 
 
 def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Cloud, "client", lambda cloud, _service: Account("1" if cloud.profile else "2", b""))
+    monkeypatch.setattr(Cloud, "client", lambda cloud, _service: Account("1" if cloud.profile else "2"))
     monkeypatch.setattr(Cloud, "region_name", property(lambda cloud: cloud.region))
+    monkeypatch.setattr(Cloud, "output", lambda *_: "name")
     here, lab, other = (Cloud(profile=profile, region="eu-west-1") for profile in ("a", "b", None))
     with pytest.raises(StationError, match="the source itself"):
-        move.check(here, lab)
-    move.check(here, other)
-    move.check(here, replace(lab, region="us-east-1"))
+        plan.check(here, lab)
+    plan.check(here, other)
+    plan.check(here, replace(lab, region="us-east-1"))
 
 
-def test_a_day_of_the_targets_own_is_not_replaced() -> None:
-    source = Account("1", b"source", "2026-11-22T07", "2026-11-22T08")
-    new, other = Account("2", b""), Account("2", b"own", "2026-11-22T08", "2026-11-22T09")
-    assert move._copy_archive(source, new, TOPIC) == (2, 0)
-    assert new.content[DAY] == b"source"
-    assert move._copy_archive(source, other, TOPIC) == (0, 1)
-    assert other.content[DAY] == b"own"
-    assert [one.hour[-2:] for one in other.rows] == ["08", "09"]
+def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
+    source = Account("1", "07", "08")
+    new, other = Account("2"), Account("2", "08", "09")
+    assert archived.copy(source, new, TOPIC) == (2, 0)
+    assert (new.content, new.rows) == (source.content, source.rows)
+    own = other.content[DAY]
+    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert other.content[DAY] == own
+    assert other.speeds() == {"08": [8.0] * 3, "09": [9.0] * 3, "07": [7.0] * 3}
+    assert archived.copy(source, other, TOPIC) == (0, 0)
+    # Killed before the row was written; then the target's archive is about to write the same hour.
+    hour = other.rows.pop()
+    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert other.rows.pop() == hour
+    other.content[hour.key] = b"being written"
+    assert archived.copy(source, other, TOPIC) == (0, 1)
+    assert other.content[hour.key] == b"being written"
 
 
 def test_what_the_target_has_analysed_again_is_not_replaced() -> None:
-    source, target = Account("1", b""), Account("2", b"")
+    source, target = Account("1"), Account("2")
     finding: Finding = FINDING
     robot = finding.drive.robot
     source.findings.put_finding(finding)
     source.findings.put_drive(AnalysedDrive(finding.drive, finding.drive.start_us + 1, "old", 1, {}, {}, {}))
     source.findings.put_note(note(robot=robot))
-    assert [move.copy_findings(source, target, robot) for _ in range(2)] == [3, 0]
+    assert [written.copy(source, target, robot) for _ in range(2)] == [3, 0]
     again = AnalysedDrive(finding.drive, finding.drive.start_us + 1, "again", 1, {}, {}, {})
     target.findings.put_drive(again)
     target.findings.remove(finding)
-    assert move.copy_findings(source, target, robot) == 0
+    assert written.copy(source, target, robot) == 0
     assert (list(target.findings.drives(robot)), list(target.findings.findings(robot))) == ([again], [])
+
+
+def test_a_note_that_was_deleted_on_either_side_does_not_come_back() -> None:
+    source, target = Account("1"), Account("2")
+    notes = [note(seconds) for seconds in (0, 60, 120)]
+    for one in notes:
+        source.findings.put_note(one)
+    assert written.copy(source, target, "car7") == 3
+    assert source.findings.remove_note("car7", notes[0].id)
+    assert target.findings.remove_note("car7", notes[1].id)
+    assert written.copy(source, target, "car7") == 0
+    assert list(target.findings.notes("car7")) == [notes[2]]
+    assert list(source.findings.notes("car7")) == [notes[2], notes[1]]

@@ -7,8 +7,8 @@ import hashlib
 import pytest
 
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
+from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_contract.ros1.message import Messages, RosType, cut
 from iort_station.data.selection import select
 from iort_station.recordings.published import Export

@@ -22,7 +22,7 @@ from iort_station.recordings import recordings
 from iort_station.recordings.export import write
 from tests.agent_fakes import ManualClock
 from tests.fakes import TELEMETRY, item_of_message
-from tests.ros.mixed_robot import MESSAGES
+from tests.ros.mixed.robot import MESSAGES
 from tests.ros1_strategies import definitions, messages
 from tests.ros1_types import HEADER, Message, fields, header
 from tests.unit.station.test_data import cloud_of

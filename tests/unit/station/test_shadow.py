@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from iort_contract.messages.shadow import OverShare, Reported, decode_desired, decode_reported
+from iort_contract.messages.control.shadow import OverShare, Reported, decode_desired, decode_reported
 from iort_station.errors import StationError
 from iort_station.fleet.control.shadow import State, _check_clock, answered, outcome, over_share
 

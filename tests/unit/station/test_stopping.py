@@ -11,7 +11,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from iort_agent.control.shadow import _merged
-from iort_contract.messages.driving import DriveLimits, encode_limits
+from iort_contract.messages.control.driving import DriveLimits, encode_limits
 from iort_station.errors import StationError
 from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user

@@ -15,8 +15,8 @@ from iort_agent.control.motion.named import Motion, Named
 from iort_agent.control.motion.stops import STOP_AHEAD_MS
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.messages.commands import Command, decode_command
-from iort_contract.messages.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
+from iort_contract.messages.control.commands import Command, decode_command
+from iort_contract.messages.control.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)

@@ -6,8 +6,8 @@ import math
 from typing import Any, Mapping
 
 from iort_contract.limits import Value
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import STOPPED, DriveLimits
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import STOPPED, DriveLimits
 from iort_contract.topics import ACCEPTED
 
 

@@ -22,8 +22,8 @@ from collections import deque
 from typing import NamedTuple
 
 from iort_agent.control.motion.stops import STOP_AHEAD_MS, Stops
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import (
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import (
     BEGIN_AGAIN,
     CLOCK_UNKNOWN,
     CLOSED,

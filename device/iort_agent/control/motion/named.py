@@ -10,8 +10,8 @@ from iort_agent.control.motion.leases import Leases, Limits
 from iort_agent.errors import ConfigError
 from iort_agent.ros1.json_message import encode
 from iort_contract.limits import MessageError, Value
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import DriveLimits
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import DriveLimits
 from iort_contract.ros1.definition import Definition
 
 

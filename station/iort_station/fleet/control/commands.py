@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.commands import MAX_BY_CHARACTERS, Command, encode_command
+from iort_contract.messages.control.commands import MAX_BY_CHARACTERS, Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.streams import DRIVE_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.commands import Command
-from iort_contract.messages.driving import (
+from iort_contract.messages.control.commands import Command
+from iort_contract.messages.control.driving import (
     CLOCK_UNKNOWN,
     DRIVE_LEASE_MS,
     DRIVE_MAX_AGE_MS,

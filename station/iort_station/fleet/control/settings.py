@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.settings import FIELDS, SETTINGS, Choice, check_name, check_setting
-from iort_contract.messages.shadow import Rejection
+from iort_contract.messages.control.settings import FIELDS, SETTINGS, Choice, check_name, check_setting
+from iort_contract.messages.control.shadow import Rejection
 from iort_contract.tables import ONLINE
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from iort_contract.messages.settings import MOTION_STOPPED
-from iort_contract.messages.shadow import (
+from iort_contract.messages.control.settings import MOTION_STOPPED
+from iort_contract.messages.control.shadow import (
     STOPS,
     Desired,
     OverShare,

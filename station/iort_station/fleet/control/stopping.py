@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.messages.driving import DriveLimits
-from iort_contract.messages.settings import MOTION_STOPPED
-from iort_contract.messages.shadow import (
+from iort_contract.messages.control.driving import DriveLimits
+from iort_contract.messages.control.settings import MOTION_STOPPED
+from iort_contract.messages.control.shadow import (
     Pressed,
     encode_fleet_released,
     encode_release,

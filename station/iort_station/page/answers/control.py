@@ -7,9 +7,9 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from iort_contract.messages.commands import MAX_LEASE_MS
+from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
-from iort_contract.messages.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
@@ -86,7 +86,7 @@ def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
             "value": _written(in_force.get(name)),
             # A rejected change is withdrawn.
             "desired": name in desired and name not in reasons,
-            "pending": _written(pending.get(name)),
+            "pending": _written(pending[name]) if name in pending else None,
             "reason": reasons.get(name) or rejected.get(name, ""),
         }
         for name in (*SETTINGS, *selections)

@@ -9,9 +9,9 @@ import numpy as np
 
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
-from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
+from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud

@@ -289,11 +289,13 @@ export const FIELD_TABLE: FieldTable = {
       },
       "seq": {
         "unit": "",
-        "meaning": "the command's number in its session"
+        "meaning": "the command's number in its session",
+        "label": "Command"
       },
       "sent_us": {
         "unit": "us",
-        "meaning": "when it was sent, by the cloud's clock"
+        "meaning": "when it was sent, by the cloud's clock",
+        "label": "Sent at"
       },
       "outcome": {
         "unit": "",
@@ -309,7 +311,8 @@ export const FIELD_TABLE: FieldTable = {
       },
       "lease_left_ms": {
         "unit": "ms",
-        "meaning": "how long the driver's lease still holds"
+        "meaning": "how long the driver's lease still holds",
+        "label": "Lease left"
       },
       "speed": {
         "unit": "m/s",
@@ -627,7 +630,7 @@ export interface SettingKind {
   readonly names: readonly string[];
 }
 
-/** A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's. ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has not taken yet; ``reason`` says why it rejected the last one. */
+/** A setting of a running agent. ``low``, ``high`` and ``unit`` are a number's, ``names`` a choice's. ``value`` is in force, as text, and empty if the agent has not reported it. ``desired`` tells whether it was changed from here, so that car.yaml's value can return. ``pending`` is the value that the agent has not taken yet: null if it took the last one, and empty if it shall send all fields. ``reason`` says why it rejected the last one. */
 export interface SettingEntry {
   readonly kind: "flag" | "number" | "choice" | "fields";
   readonly low: number;
@@ -637,7 +640,7 @@ export interface SettingEntry {
   readonly name: string;
   readonly value: string;
   readonly desired: boolean;
-  readonly pending: string;
+  readonly pending: string | null;
   readonly reason: string;
 }
 
@@ -647,7 +650,7 @@ export interface SettingsAnswer {
   readonly online: boolean;
 }
 
-/** What a stick drives, and how far: `iort_contract.messages.driving.DriveLimits`. */
+/** What a stick drives, and how far: `iort_contract.messages.control.driving.DriveLimits`. */
 export interface DriveLimitsEntry {
   readonly command: string;
   readonly speed: string;

@@ -19,6 +19,8 @@ export interface Spec extends Linear {
   /** Digits after the point, where fixed. */
   readonly digits: number | undefined;
   readonly texts?: Readonly<Record<string, string>>;
+  /** The value is a time, in microseconds since 1970. */
+  readonly time?: boolean;
 }
 
 export const NOTHING = "–";
@@ -41,6 +43,7 @@ export function spec(field: string, table: FieldTable, ros2 = false, stream = ""
   const { meaning } = known;
   const unit = (ros2 ? known.ros2_unit : undefined) ?? known.unit;
   if (field === "fault_code") return { label, meaning: "", unit: "", ...AS_SENT, digits: 0, texts: table.faults };
+  if (unit === "us") return { label, meaning, unit: "", ...AS_SENT, digits: 0, time: true };
   // Shares are shown in percent, and 1e-4 Ah in Ah.
   if (unit === "1") return { label, meaning, unit: "%", ...times(100), digits: 1 };
   const scaled = /^1e(-?\d+) (.+)$/.exec(unit);
@@ -66,8 +69,9 @@ export function asSpeed(field: string, spec: Spec, speed: Linear | undefined): S
 }
 
 export function write(value: Value | undefined, spec: Spec): string {
-  const { digits, texts } = spec;
+  const { digits, texts, time } = spec;
   if (value === null || value === undefined) return NOTHING;
+  if (time && typeof value === "number") return dayTime(value / 1e6);
   if (typeof value === "number") return texts?.[String(value)] ?? number(linear(value, spec), digits);
   return String(value);
 }

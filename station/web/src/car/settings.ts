@@ -52,9 +52,9 @@ export class Settings {
   private draw({ settings, online }: SettingsAnswer): void {
     const known = new Set(settings.map(({ name }) => name));
     const free = [...(this.robot?.streams.keys() ?? [])].map((stream) => `fields.${stream}`).filter((name) => !known.has(name));
-    const fields = free.map((name): SettingEntry => ({ name, kind: "fields", low: 0, high: 0, unit: "", names: [], value: "", desired: false, pending: "", reason: "" }));
+    const fields = free.map((name): SettingEntry => ({ name, kind: "fields", low: 0, high: 0, unit: "", names: [], value: "", desired: false, pending: null, reason: "" }));
     this.rows.replaceChildren(...[...settings, ...fields].map((entry) => this.row(entry)));
-    const waits = settings.some(({ pending }) => pending !== "");
+    const waits = settings.some(({ pending }) => pending !== null);
     this.say("", waits ? (online ? "The agent has not answered yet." : "The car is offline. It applies what is pending when it is back.") : "");
   }
 
@@ -62,13 +62,13 @@ export class Settings {
     const { name, value, pending, desired, reason, unit } = entry;
     const input = inputOf(entry);
     input.setAttribute("name", name);
-    input.value = pending || value;
+    input.value = pending ?? value;
     const set = el("button", { type: "submit", class: "tool", "aria-label": `Set ${name}`, hidden: "" }, "Set");
     const undo = el("button", { type: "button", class: "tool", title: "Return to the value of car.yaml", "aria-label": `Reset ${name}` }, "Reset");
     undo.hidden = !desired;
-    const note = reason ? el("p", { class: "said", "data-kind": "bad" }, `rejected: ${reason}`) : pending ? el("p", { class: "said" }, `pending; in force is ${value || "car.yaml's"}`) : "";
+    const note = reason ? el("p", { class: "said", "data-kind": "bad" }, `rejected: ${reason}`) : pending === null ? "" : el("p", { class: "said" }, `${pending === "" ? "all fields are pending" : "pending"}; in force is ${value || "car.yaml's"}`);
     const row = el("form", { class: "setting" }, el("label", {}, name, input, ...(unit ? [el("span", { class: "unit" }, unit)] : [])), set, undo, note);
-    input.addEventListener("input", () => (set.hidden = input.value === (pending || value)));
+    input.addEventListener("input", () => (set.hidden = input.value === (pending ?? value)));
     row.addEventListener("submit", (event) => {
       event.preventDefault();
       void this.ask("set", { name, value: input.value });

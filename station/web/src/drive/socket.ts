@@ -62,7 +62,7 @@ export class DriveSocket {
   }
 
   private connect(url: string, clientId: string): void {
-    const client = (this.client = mqtt.connect(url, { protocolVersion: 5, clientId, clean: true, reconnectPeriod: 0, connectTimeout: CONNECT_MS, keepalive: 10, queueQoSZero: false }));
+    const client = (this.client = mqtt.connect(url, { protocolVersion: 5, clientId, clean: true, reconnectPeriod: 0, connectTimeout: CONNECT_MS, keepalive: 10, queueQoSZero: false, timerVariant: "native" }));
     client.on("connect", () => {
       client.subscribe(this.topic(LIVE, "+"), { qos: 0 }, (error) => {
         if (client !== this.client) return;

@@ -66,7 +66,7 @@ export class AlarmsView {
     if (this.quietDrawn !== entries) {
       this.quietDrawn = entries;
       const others = (entries ?? []).filter(({ state }) => state !== "ALARM");
-      this.count.set(`${others.length} others`);
+      this.count.set(`${others.length} ${others.length === 1 ? "alarm is" : "alarms are"} not raised`);
       this.quiet.replaceChildren(...others.map(row));
     }
   }

@@ -191,7 +191,7 @@ export class CompareView {
   private read(index: number): void {
     const at = this.grid[index];
     if (at === undefined) return;
-    this.at.set(`at ${number(at, 2)} ${this.unit}`);
+    this.at.set(this.parts.length === 0 ? "" : `at ${number(at, 2)} ${this.unit}`);
     this.charts.read(index);
   }
 }

@@ -24,7 +24,8 @@ const SETTLED_MS = 200;
 export class HistoryView {
   readonly node: HTMLElement;
   private readonly title = new Text("car-name", "h2");
-  private readonly back = el("a", { class: "tool" }, "Live");
+  private readonly live = el("a", { class: "tool" }, "Live");
+  private readonly insights = el("a", { class: "tool" }, "Insights");
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly form: RangeForm;
   private readonly runs = new RunsList((before_us) => void this.findRuns(before_us));
@@ -62,7 +63,7 @@ export class HistoryView {
     this.node = el(
       "article",
       { class: "history" },
-      el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "history"), el("p", { class: "tools" }, this.back)),
+      el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "history"), el("p", { class: "tools" }, this.live, this.insights)),
       ...(config.answers ? served : [told]),
     );
   }
@@ -81,7 +82,8 @@ export class HistoryView {
     this.loading?.abort();
     this.robot = robot;
     this.title.set(robot);
-    this.back.href = route({ view: "car", robot });
+    this.live.href = route({ view: "car", robot });
+    this.insights.href = route({ view: "insights", robot });
     [this.range, this.zooms] = [undefined, []];
     this.result.clear();
     this.note.set("");

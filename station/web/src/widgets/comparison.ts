@@ -1,8 +1,8 @@
 // A table of values: at the time under the cursor, and now.
 
-import type { Value } from "../base/contract";
+import { power_w, type Value } from "../base/contract";
 import { el, Text } from "../base/dom";
-import type { Stream } from "../live/stream";
+import { numeric, type Stream } from "../live/stream";
 import { NOTHING, number, write, type Spec } from "../base/format";
 
 interface Row {
@@ -53,10 +53,17 @@ export class Comparison {
   now(stream: Stream | undefined): void {
     this.live = stream;
     for (const [field, row] of this.rows) {
-      const value = stream?.sample.get(field);
+      const value = stream && newest(field, stream);
       row.now.set(write(value, row.spec));
       const change = typeof value === "number" && typeof row.value === "number" ? (value - row.value) * row.spec.scale : NaN;
       row.change.set(Number.isNaN(change) || row.spec.texts ? NOTHING : `${change > 0 ? "+" : ""}${number(change, row.spec.digits)}`);
     }
   }
+}
+
+/** The newest value of a field. A car does not send what is derived. */
+function newest(field: string, { sample }: Stream): Value | undefined {
+  if (field !== "power_w") return sample.get(field);
+  const power = power_w(numeric(sample.get("voltage_input")), numeric(sample.get("current_input")));
+  return Number.isNaN(power) ? null : power;
 }

@@ -32,7 +32,7 @@ export class NotesPanel {
     private readonly config: Config,
     private readonly options: NotesOptions = {},
   ) {
-    this.text.placeholder = options.at ? "What happened at the cursor's time" : "What happened, what was changed";
+    this.text.placeholder = options.at ? "What happened at this time?" : "What happened?";
     this.form = el("form", { class: "range note-form" }, this.text, el("button", { type: "submit", class: "tool" }, "Add note"));
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();

@@ -21,8 +21,13 @@ from rich.text import Text
 
 from iort_contract.cloud import DRIVER
 from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
-from iort_contract.messages.commands import encode_command
-from iort_contract.messages.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, DriveLimits
+from iort_contract.messages.control.commands import encode_command
+from iort_contract.messages.control.driving import (
+    DRIVE_MAX_AGE_MS,
+    DRIVE_MAX_RTT_MS,
+    DRIVE_RATE_HZ,
+    DriveLimits,
+)
 from iort_contract.messages.live import decode_live
 from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
 from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
@@ -62,7 +67,7 @@ def drive(
     when round trip or newest sample are too old. It needs the right to drive (docs/how-to/drive.md).
     """
     if not (sys.stdin.isatty() and out.is_terminal):
-        raise UsageError("it needs a terminal with a keyboard")
+        raise UsageError("iort drive needs a terminal with a keyboard")
     cloud = context.obj.cloud()
     limits = _limits(cloud, robot)
     top_mps = min(max_speed or _USUAL_MPS, limits.max_speed_mps)

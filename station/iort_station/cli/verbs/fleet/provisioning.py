@@ -31,11 +31,12 @@ def add(
     as_json: AsJson = False,
 ) -> None:
     """Register a robot and write its folder: car.yaml, certificate and key."""
-    bundle = robots.add(context.obj.cloud(), name, out=folder, vehicle=_vehicle(speed_to_erpm_gain))
-    text = (
-        f"{name} is registered. Copy {bundle.folder} to it, then run there:\n\n"
-        f"  iort-agent run --config {bundle.folder.name}/car.yaml"
-    )
+    cloud = context.obj.cloud()
+    bundle = robots.add(cloud, name, out=folder, vehicle=_vehicle(speed_to_erpm_gain))
+    where, config = f"Copy {bundle.folder} to it, then run there", f"{bundle.folder.name}/car.yaml"
+    if cloud.mqtt_endpoint == "127.0.0.1":
+        where, config = "This cloud is for robots of this machine alone; run here", str(bundle.config)
+    text = f"{name} is registered. {where}:\n\n  iort-agent run --config {config}"
     tell({"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)}, text, as_json=as_json)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -53,6 +54,10 @@ def audit_(
     from_start: Annotated[
         bool, typer.Option("--from-start", help="Count batches before the first stored one as missing.")
     ] = False,
+    hashes: Annotated[
+        bool,
+        typer.Option("--hashes", help="Also hash what each run recorded, to compare it with another cloud."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Prove that every sample of a robot arrived, for each of its streams and each run of its agent.
@@ -69,6 +74,8 @@ def audit_(
     audited = []
     for name in names:
         audited.append(_audit(cloud, name, within, streams, late_us, from_start=from_start))
+        if hashes:
+            audited[-1] = audited[-1].hashed(cloud, name, within)
         if not as_json:
             if every:
                 out.print(Text(name, "bold"))
@@ -91,6 +98,19 @@ class _Audited(NamedTuple):
     found: list[Audit]
     causes: dict[str, Any]
     archive: Any
+    contents: Mapping[str, Mapping[str, str]] = {}
+
+    def hashed(self, cloud: Cloud, robot: str, within: Range) -> _Audited:
+        """With the hashes of each stream's runs."""
+        from iort_station.operations.delivery import contents  # noqa: PLC0415 - numpy, as below
+
+        with errors.status("reading contents"):
+            return self._replace(
+                contents={
+                    one.stream: contents.hashes(cloud, robot, one.stream, within.start_us, within.end_us)
+                    for one in self.found
+                }
+            )
 
     @property
     def complete(self) -> bool:
@@ -98,7 +118,7 @@ class _Audited(NamedTuple):
 
     def told(self) -> dict[str, Any]:
         return {
-            "streams": [_as_json(one) for one in self.found],
+            "streams": [_as_json(one, self.contents.get(one.stream, {})) for one in self.found],
             "not_recorded": self.causes,
             "archive": self.archive and between_hours(self.archive),
         }
@@ -154,6 +174,8 @@ def _print(robot: str, audited: _Audited) -> None:
         errors.print(f"this range holds nothing of {robot}")
     for one in audited.found:
         _show(one)
+        for boot, content in audited.contents.get(one.stream, {}).items():
+            out.print(f"  run {boot[:8]}: hash {content[:16]}")
     for boot, sources in audited.causes.items() if audited.found else ():
         for source, counts in sources.items():
             out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
@@ -239,7 +261,7 @@ def _table(one: Audit) -> Table:
     return table
 
 
-def _as_json(one: Audit) -> dict[str, Any]:
+def _as_json(one: Audit, contents: Mapping[str, str]) -> dict[str, Any]:
     left_out = {"samples_of", "first_us", "last_us"}
     runs = [
         {
@@ -247,6 +269,7 @@ def _as_json(one: Audit) -> dict[str, Any]:
             **stamped("first", run.first_us),
             **stamped("last", run.last_us),
             "expected": run.expected,
+            **({"content": contents[run.boot]} if run.boot in contents else {}),
             "missing_batches": sum(gap.batches for gap in run.missing),
             "missing": [
                 {

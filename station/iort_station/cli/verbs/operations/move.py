@@ -6,20 +6,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from botocore.exceptions import ClientError
+from rich.filesize import decimal
+from rich.progress import DownloadColumn, TransferSpeedColumn
 
+from iort_contract.tables import NO_ROBOT
 from iort_station.cli import completion
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, DryRun
+from iort_station.cli.progress import bar
 from iort_station.cli.words import examples, say
 from iort_station.cloud import EMBEDDED, Cloud
+from iort_station.errors import StationError
 from iort_station.fleet import registry
 
 if TYPE_CHECKING:
-    from iort_station.operations.move import Compared, Copied
+    from iort_station.moving.compared import Compared
+    from iort_station.moving.plan import Plan
 
 commands = typer.Typer()
 AWS = "aws"
+_DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "403"}
 
 
 @commands.command("move", epilog=examples("move --to aws --to-profile lab", "move --to ~/cloud-2 car7"))
@@ -39,6 +47,13 @@ def move_(
         Path | None,
         typer.Option(help="Make a certificate for each robot there, in a bundle in this folder."),
     ] = None,
+    with_files: Annotated[
+        bool, typer.Option("--files/--no-files", help="Whether to copy the robots' files.")
+    ] = True,
+    same_robots: Annotated[
+        bool,
+        typer.Option("--same-robots", help="Robots that both sides have registered already are the same."),
+    ] = False,
     units: Annotated[
         int,
         typer.Option(min=1, help="Speed in write units of DynamoDB (1 KB) a second. A stream takes 1,000."),
@@ -46,50 +61,139 @@ def move_(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Copy robots into another deployment: registry, archive, stored batches, findings and notes.
+    """Copy robots into another deployment, with all that they have recorded and all that is known of them.
 
     The source stays as it is. A second run copies what is new, and an interrupted one goes on. Then both
-    sides are compared, batch by batch and by their audits; --dry-run only compares. A moved robot has no
-    certificate there: it claims one, or gets a bundle by --bundles. Exit status 1 if something differs. See
-    docs/how-to/move.md.
+    sides are compared, batch by batch and file by file; --dry-run only tells the plan and compares. A moved
+    robot has no certificate there: it claims one, or gets a bundle by --bundles. Exit status 1 if something
+    is missing or differs. See docs/how-to/move.md.
     """
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.operations import move  # noqa: PLC0415 - as above
+    from iort_station.moving import plan  # noqa: PLC0415 - as above
 
     source = context.obj.cloud()
     target = _target(source, to, to_profile, to_region)
-    move.check(source, target)
-    chosen = sorted({registry.checked(name) for name in names or ()}) or sorted(registry.presence(source))
-    for robot in names or ():
-        # A robot that was removed has samples, and no row.
-        inventory.check_recorded(source, robot)
-    told: list[dict[str, Any]] = []
-    registered = findings = 0
-    if not dry_run:
-        registered = sum(move.register(source, target, robot, bundles) for robot in chosen)
-        move.copy_tags(source, target, chosen)
-        findings = sum(move.copy_findings(source, target, robot) for robot in chosen)
-    for robot in chosen:
-        for stream in inventory.known(source, robot):
-            with errors.status(f"{robot} {stream}") as status:
-                read = _Reading(status.update, f"{robot} {stream}")
-                copied = None
-                if not dry_run:
-                    copied = move.copy(source, target, robot, stream, units_per_s=units, progress=read.tell)
-                found = move.compare(source, target, robot, stream, read.tell)
-            if found.source.batches or found.target.batches:
-                told.append(_as_json(robot, stream, copied, found))
-                if not as_json:
-                    _show(told[-1])
+    plan.check(source, target)
+    try:
+        for robot in names or ():
+            # A robot that was removed has samples, and no row.
+            inventory.check_recorded(source, registry.checked(robot))
+        chosen = sorted(set(names or registry.presence(source)))
+        plans = plan.plan(source, target, chosen, same_robots=same_robots)
+        for one in plans:
+            if not as_json:
+                _show_plan(one, with_files=with_files)
+        moving = _Moving(source, target, None if dry_run else units, with_files=with_files, quiet=as_json)
+        for one in plans:
+            moving.move(one, bundles)
+        if not names:
+            # Messages that name no robot.
+            moving.quarantine(NO_ROBOT)
+    except ClientError as error:
+        if error.response["Error"]["Code"] not in _DENIED:
+            raise
+        raise StationError(f"{error}: docs/how-to/move.md lists the rights that a move needs") from error
     if as_json:
-        print_json({"streams": told, "registered": registered, "findings": findings})
+        print_json({"streams": moving.streams, **moving.counts, "problems": moving.problems})
     else:
-        robots = f"{len(chosen)} robots, {registered} of them new in the target"
-        out.print(f"{robots}, {len(told)} streams, {findings} findings, analysed drives and notes")
-    if registered and bundles is None:
+        _show_end(moving, plans)
+    if moving.counts["registered"] and bundles is None:
         say("each new robot still needs a certificate there: `iort robots claim ROBOT`, docs/how-to/move.md")
-    raise typer.Exit(1 if any(one["problem"] for one in told) else 0)
+    raise typer.Exit(1 if moving.problems else 0)
+
+
+class _Moving:
+    """Copies robot by robot, compares, and tells. Without ``units`` it only compares."""
+
+    def __init__(
+        self, source: Cloud, target: Cloud, units: int | None, *, with_files: bool, quiet: bool
+    ) -> None:
+        self._source, self._target, self._units = source, target, units
+        self._with_files, self._quiet = with_files, quiet
+        self.streams: list[dict[str, Any]] = []
+        self.counts = dict.fromkeys(
+            ("registered", "bundles", "findings", "quarantined", "files", "files_bytes"), 0
+        )
+        self.problems: list[str] = []
+
+    def move(self, plan: Plan, bundles: Path | None) -> None:
+        """Move a robot."""
+        from iort_station.moving import registered, written  # noqa: PLC0415 - numpy, as above
+
+        robot, between = plan.robot, (self._source, self._target)
+        if self._units is not None:
+            self.counts["registered"] += registered.copy(*between, robot)
+            if bundles is not None:
+                self.counts["bundles"] += registered.equip(self._target, robot, bundles)
+            self.counts["findings"] += written.copy(*between, robot)
+        self.quarantine(robot)
+        for stream in plan.streams:
+            self._stream(robot, stream)
+        if self._with_files:
+            self._files(plan)
+
+    def quarantine(self, robot: str) -> None:
+        """Move a robot's quarantined messages."""
+        from iort_station.moving import quarantined  # noqa: PLC0415 - as above
+
+        between = (self._source, self._target)
+        if self._units is not None:
+            self.counts["quarantined"] += quarantined.copy(*between, robot)
+        if lacking := quarantined.lacking(*between, robot):
+            self._problem(f"{robot}: the target lacks {len(lacking):,} quarantined messages: move again")
+
+    def _stream(self, robot: str, stream: str) -> None:
+        from iort_station.data.batches import topic_of  # noqa: PLC0415 - as above
+        from iort_station.moving import archived, compared, recorded  # noqa: PLC0415 - as above
+
+        source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)
+        batches, hours = 0, archived.Hours(0, 0)
+        with errors.status(f"{robot} {stream}") as status:
+            read = _Reading(status.update, f"{robot} {stream}")
+            if self._units is not None:
+                # Before the batches, which the target's archive adds to these hours.
+                hours = archived.copy(source, target, topic)
+                batches = recorded.copy(source, target, topic, units_per_s=self._units, progress=read.tell)
+            found = compared.compare(source, target, robot, stream, read.tell)
+        if not found.batches:
+            return
+        problem = found.problem
+        if hours.left:
+            problem += f"; {hours.left:,} hours are left, which the target is writing: move again later"
+        told = _as_json(robot, stream, found, problem.removeprefix("; "))
+        self.streams.append({**told, "copied_batches": batches, "copied_hours": hours.copied})
+        if problem:
+            self.problems.append(f"{robot} {stream}: {told['problem']}")
+        if not self._quiet:
+            _show(self.streams[-1])
+
+    def _files(self, plan: Plan) -> None:
+        from iort_station.fleet import files  # noqa: PLC0415 - as above
+        from iort_station.moving.stored_files import Files  # noqa: PLC0415 - as above
+
+        both = Files(self._source, self._target)
+        title = f"{plan.robot}: {len(plan.files):,} files"
+        columns = (DownloadColumn(), TransferSpeedColumn())
+        with bar(title, plan.files_bytes, *columns) as progress:
+            for file in plan.files if self._units is not None else ():
+                if problem := both.copy(file, progress):
+                    self._problem(f"{file.key}: {problem}")
+                else:
+                    self.counts["files"] += 1
+                    self.counts["files_bytes"] += file.size
+        there = {one.key for one in files.listed(self._target, plan.robot)}
+        here = list(files.listed(self._source, plan.robot))
+        if lacking := [one for one in here if one.key not in there]:
+            size = decimal(sum(one.size for one in lacking))
+            self._problem(f"{plan.robot}: the target lacks {len(lacking):,} files of {size}: move again")
+        for key in both.different([one for one in here if one.key in there]):
+            self._problem(f"{key}: another file in the target")
+
+    def _problem(self, text: str) -> None:
+        self.problems.append(text)
+        if not self._quiet:
+            out.print(text, style="red", soft_wrap=True)
 
 
 class _Reading:
@@ -111,31 +215,51 @@ def _target(source: Cloud, to: str, profile: str | None, region: str | None) -> 
     return CloudOptions(source.namespace, None, None, local=True, embedded=path).cloud()
 
 
-def _as_json(robot: str, stream: str, copied: Copied | None, found: Compared) -> dict[str, Any]:
-    audit = found.source.audit
+def _as_json(robot: str, stream: str, found: Compared, problem: str) -> dict[str, Any]:
     return {
         "robot": robot,
         "stream": stream,
-        "copied_batches": copied.batches if copied is not None else 0,
-        "copied_hours": copied.hours if copied is not None else 0,
-        "left_hours": copied.left if copied is not None else 0,
-        "batches": found.source.batches,
-        "samples": sum(run.samples for run in audit.runs),
-        "missing": audit.missing,
-        "content": found.source.content,
-        "problem": found.problem,
+        "batches": found.batches,
+        "samples": sum(run.samples for run in found.audit.runs),
+        "missing": found.audit.missing,
+        "content": found.content,
+        "more": found.more,
+        "problem": problem,
     }
+
+
+def _show_plan(plan: Plan, *, with_files: bool) -> None:
+    """A line for a robot: what there is to do."""
+    parts = [f"{len(plan.streams)} streams", f"{plan.hours:,} archived hours"]
+    if plan.files:
+        what = f"{len(plan.files):,} files of {decimal(plan.files_bytes)}"
+        parts.append(what if with_files else f"{what} stay, by --no-files")
+    if plan.files_there:
+        parts.append(f"{plan.files_there:,} files are there")
+    new = "new in the target" if plan.new else "is in the target"
+    out.print(f"{plan.robot}: {new}; {', '.join(parts)}", soft_wrap=True)
 
 
 def _show(one: dict[str, Any]) -> None:
     has = f"{one['batches']:,} batches, {one['samples']:,} samples, {one['missing']:,} missing"
     copied = f"copied {one['copied_batches']:,} batches, {one['copied_hours']:,} archived hours"
-    text = f"{one['robot']} {one['stream']}: {has}; {copied}; "
-    problem = one["problem"]
-    if one["left_hours"]:
-        problem += f"; {one['left_hours']:,} hours are left: the target has another object of their day"
+    more = f"; the target has {one['more']:,} more" if one["more"] else ""
     out.print(
-        text + (problem or f"the same, {one['content'][:12]}"),
-        style="red" if problem else None,
+        f"{one['robot']} {one['stream']}: {has}; {copied}; "
+        + (one["problem"] or f"the same, {one['content'][:12]}{more}"),
+        style="red" if one["problem"] else None,
         soft_wrap=True,
     )
+
+
+def _show_end(moving: _Moving, plans: list[Plan]) -> None:
+    counts = moving.counts
+    out.print(
+        f"{len(plans)} robots, {counts['registered']} of them new in the target; "
+        f"{len(moving.streams)} streams; copied {counts['findings']:,} findings, analysed drives and notes, "
+        f"{counts['quarantined']:,} quarantined messages, {counts['files']:,} files of "
+        f"{decimal(counts['files_bytes'])}; {counts['bundles']} bundles",
+        soft_wrap=True,
+    )
+    if moving.problems:
+        out.print(f"{len(moving.problems)} problems", style="red")

@@ -1,0 +1,131 @@
+"""Driving a robot by hand: what the stick drives and how far, and what becomes of each command.
+
+A driver's session is one hold of the stick. It sends `DRIVE_RATE_HZ` commands a second with a lease of
+`DRIVE_LEASE_MS`, and ends when the round trip or the age of the newest sample is above its limit.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any, Mapping
+
+from iort_contract.checks import FIELD_NAME, checked, shown
+from iort_contract.limits import ContractError
+from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.topics import check_stream
+
+DRIVE_RATE_HZ = 20.0
+DRIVE_LEASE_MS = 500
+# Above either, a driver sees too late what the car does. The round trip is from a command to its sample of
+# the stream `drive`.
+DRIVE_MAX_RTT_MS, DRIVE_MAX_AGE_MS = 500, 1_000
+
+# The outcomes of a motion, beside `ACCEPTED`: why it was refused.
+STALE, LEASE_OVER, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED, NO_ROS = (
+    "stale",
+    "lease_over",
+    "from_the_future",
+    "repeated_or_out_of_order",
+    "from_an_earlier_session",
+    "without_lease",
+    "clock_offset_unknown",
+    "shutting_down",
+    "no_ros",
+)
+DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SETTINGS_UNKNOWN, NO_GUARD = (
+    "driven_by_another",
+    "emergency_stop",
+    "begin_again",
+    "settings_unknown",
+    "guard_not_ready",
+)
+# Not of a command: the lease ended, or an emergency stop began, and the robot was stopped.
+STOPPED = "stopped"
+REFUSALS: Mapping[str, str] = {
+    DRIVEN_BY_ANOTHER: "another session drives; begin a new one that takes over",
+    EMERGENCY_STOP: "the robot is stopped until somebody releases it",
+    BEGIN_AGAIN: "this session was refused before, or a stop ended it; let go, and begin a new one",
+    SUPERSEDED: "a later session has driven since",
+    REPEATED: "a later command of the session has passed",
+    SETTINGS_UNKNOWN: "the robot has just connected, and does not know yet whether it must stand still",
+    CLOCK_UNKNOWN: "the robot does not know the cloud's time yet",
+    LEASE_OVER: "the command's lease had ended when it came, or the robot was stopped after it was sent",
+    STALE: "the command was too old when it came",
+    EARLY: "the command's time lies in the future: the sender's clock is wrong",
+    NO_LEASE: "a motion needs `lease_ms`",
+    NO_GUARD: "the process that stops the robot if the agent dies is not running yet",
+    NO_ROS: "the agent is not in the ROS graph",
+    CLOSED: "the agent is ending",
+}
+
+
+@dataclass(frozen=True)
+class DriveLimits:
+    """The motion command that a stick drives, and the robot's own limits for it.
+
+    ``speed`` and ``steering`` are the paths of two fields of its ROS message. The robot limits both, to
+    either side, in every command of this name, and a lease to ``lease_ms``.
+    """
+
+    command: str
+    speed: str
+    steering: str
+    max_speed_mps: float
+    max_steering_rad: float
+    lease_ms: int
+
+    def message(self, speed_mps: float, steering_rad: float) -> dict[str, Any]:
+        """The ROS message with these values; all its other fields are left out."""
+        message: dict[str, Any] = {}
+        for path, value in ((self.speed, speed_mps), (self.steering, steering_rad)):
+            *above, name = path.split(".")
+            inner = message
+            for part in above:
+                inner = inner.setdefault(part, {})
+            inner[name] = value
+        return message
+
+
+def encode_limits(limits: DriveLimits | None) -> dict[str, Any]:
+    """The limits as an object of the shadow; empty for a robot that cannot be driven by hand."""
+    return asdict(limits) if limits is not None else {}
+
+
+def decode_limits(document: Any) -> DriveLimits | None:
+    """The limits from the shadow; None if the robot has none, or others than `check_limits` allows."""
+    try:
+        return check_limits(DriveLimits(**document)) if document else None
+    except (ContractError, TypeError):
+        return None
+
+
+def check_limits(limits: DriveLimits) -> DriveLimits:
+    """Return the limits, if they are valid; raises `ContractError`."""
+    check_stream(limits.command)
+    for what, path in (("speed", limits.speed), ("steering", limits.steering)):
+        check_path(path, what)
+    if f"{limits.speed}.".startswith(f"{limits.steering}.") or limits.steering.startswith(f"{limits.speed}."):
+        raise ContractError(f"speed and steering must be two fields, got {limits.speed}, {limits.steering}")
+    for name, value in (
+        ("max_speed_mps", limits.max_speed_mps),
+        ("max_steering_rad", limits.max_steering_rad),
+    ):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        # An integer may be larger than every float.
+        if not number or not 0 < value <= sys.float_info.max:
+            raise ContractError(f"{name} must be a number above 0, got {shown(value)}")
+    if type(limits.lease_ms) is not int or not 1 <= limits.lease_ms <= MAX_LEASE_MS:
+        raise ContractError(
+            f"lease_ms must be an integer from 1 to {MAX_LEASE_MS}, got {shown(limits.lease_ms)}"
+        )
+    return limits
+
+
+def check_path(path: str, what: str) -> str:
+    """Return ``path`` if it is a field of a message, or of messages within it; not an array's element."""
+    checked(FIELD_NAME, path, what, "a ROS field name or a dotted path of them")
+    # A page makes an object of the path, where `__proto__` is no name.
+    if any(part.isdigit() or part.startswith("_") for part in path.split(".")):
+        raise ContractError(f"{what} must not be an array's element, nor begin with _, got {shown(path)}")
+    return path

@@ -1,0 +1,185 @@
+"""The named shadow of a robot: the settings that the operator desires, and what the agent reports.
+
+The operator, the cloud and the robot write it, so a reader ignores what has another form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Iterator, Mapping, NamedTuple
+
+from iort_contract.messages.control.driving import DriveLimits, decode_limits, encode_limits
+from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS
+from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
+from iort_contract.topics import COMMANDS
+
+REJECTED, DRIVE, STOPS = "rejected", "drive", "stops"
+# Larger than any count, and than any time of a calendar.
+_MOST = 10**15
+_SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
+
+
+@dataclass(frozen=True)
+class OverShare:
+    """The batches over a robot's share of the cloud, and the cloud's time of the first and the last one."""
+
+    since_ms: int
+    last_ms: int
+    batches: int
+
+
+class Rejection(NamedTuple):
+    """A desired value that the agent rejects, and the reason for a human."""
+
+    value: Any
+    reason: str
+
+
+class Outcome(NamedTuple):
+    """What became of a command: accepted, or the reason of its rejection."""
+
+    session: str
+    seq: int
+    outcome: str
+
+
+class Pressed(NamedTuple):
+    """Who stopped a robot or released it, as they say, and when, by their clock."""
+
+    by: str
+    t_ms: int
+
+
+class StopNotes(NamedTuple):
+    """Who has stopped the ``robot`` alone, and who the ``fleet``; who has ``released`` the robot last."""
+
+    robot: Pressed | None = None
+    fleet: Pressed | None = None
+    released: Pressed | None = None
+
+
+@dataclass(frozen=True)
+class Desired:
+    """The desired settings by name, the cloud's notice, and who asked for the emergency stop. The settings
+    are not checked."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    over_share: OverShare | None = None
+    stops: StopNotes = field(default_factory=StopNotes)
+
+    @property
+    def stopped_alone(self) -> bool:
+        """Whether the release of the fleet leaves the robot stopped. A stop of an unknown source is its
+        own."""
+        return self.stops.robot is not None or self.stops.fleet is None
+
+
+@dataclass(frozen=True)
+class Reported:
+    """The settings in force and the rejected ones, by name; the newest outcome of each command; what a stick
+    drives, if the robot can be driven by hand."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    rejected: Mapping[str, Rejection] = field(default_factory=dict)
+    commands: Mapping[str, Outcome] = field(default_factory=dict)
+    agent_version: str = ""
+    drive: DriveLimits | None = None
+
+
+def decode_desired(document: Any) -> Desired:
+    """The desired part of a shadow."""
+    found = dict(_mapping(document))
+    notice = _mapping(found.pop(OVER_SHARE, None))
+    counts = [notice.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
+    valid = [count for count in counts if type(count) is int and 0 <= count < _MOST]
+    notes = _mapping(found.pop(STOPS, None))
+    return Desired(
+        dict(_flat(found)),
+        OverShare(*valid) if len(valid) == len(counts) else None,
+        StopNotes(*(_pressed(notes.get(name)) for name in StopNotes._fields)),
+    )
+
+
+def encode_stop(by: Pressed, *, fleet: bool) -> dict[str, Any]:
+    """The change of the desired part that stops a robot, alone or with the fleet."""
+    note = StopNotes(fleet=by) if fleet else StopNotes(robot=by)
+    written = {name: one._asdict() for name, one in note._asdict().items() if one is not None}
+    return {**nested({MOTION_STOPPED: True}), STOPS: written}
+
+
+def encode_release(by: Pressed) -> dict[str, Any]:
+    """The change of the desired part that releases a robot."""
+    notes: dict[str, Any] = {**StopNotes()._asdict(), "released": by._asdict()}
+    return {**nested({MOTION_STOPPED: False}), STOPS: notes}
+
+
+def encode_fleet_released() -> dict[str, Any]:
+    """The change for a robot that is stopped alone, too: it stays stopped."""
+    return {STOPS: {"fleet": None}}
+
+
+def decode_reported(document: Any) -> Reported:
+    """The reported part of a shadow."""
+    found = dict(_mapping(document))
+    rejected = _mapping(found.pop(REJECTED, None))
+    commands = _mapping(found.pop(COMMANDS, None))
+    version = found.pop(AGENT_VERSION, "")
+    drive = decode_limits(found.pop(DRIVE, None))
+    return Reported(
+        dict(sorted(_flat(found))),
+        {
+            name: Rejection(one.get("value"), str(one.get("reason", "")))
+            for name, one in sorted(rejected.items())
+            if isinstance(one, dict)
+        },
+        {
+            name: Outcome(one["session"], one["seq"], str(one.get("outcome")))
+            for name, one in commands.items()
+            if isinstance(one, dict) and isinstance(one.get("session"), str) and type(one.get("seq")) is int
+        },
+        version if isinstance(version, str) else "",
+        drive,
+    )
+
+
+def encode_reported(reported: Reported) -> dict[str, Any]:
+    """The reported part as an object for JSON."""
+    return {
+        **{section: {} for section in _SECTIONS},
+        **nested(reported.settings),
+        REJECTED: {name: one._asdict() for name, one in reported.rejected.items()},
+        COMMANDS: {name: one._asdict() for name, one in reported.commands.items()},
+        AGENT_VERSION: reported.agent_version,
+        DRIVE: encode_limits(reported.drive),
+    }
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name as the sections of a document."""
+    document: dict[str, Any] = {}
+    for name, value in settings.items():
+        section, _, rest = name.partition(".")
+        if rest:
+            document.setdefault(section, {})[rest] = value
+        else:
+            document[section] = value
+    return document
+
+
+def _pressed(note: Any) -> Pressed | None:
+    found = _mapping(note)
+    by, t_ms = found.get("by"), found.get("t_ms")
+    return Pressed(by, t_ms) if isinstance(by, str) and type(t_ms) is int and 0 <= t_ms < _MOST else None
+
+
+def _flat(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in document.items():
+        if isinstance(value, dict):
+            for inner, item in value.items():
+                yield f"{name}.{inner}", item
+        else:
+            yield name, value
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}

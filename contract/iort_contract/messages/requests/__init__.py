@@ -1,0 +1,1 @@
+"""What robots and operators ask the cloud, with the answers: questions, upload addresses, samples."""

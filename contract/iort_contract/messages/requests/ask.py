@@ -1,0 +1,178 @@
+"""Questions of a robot to a function of the cloud, and the answers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Mapping, NamedTuple
+
+from iort_contract.checks import (
+    BOOT,
+    check_time,
+    check_version,
+    checked,
+    integer,
+    json_object,
+    offset_entry,
+    shown,
+    text,
+)
+from iort_contract.limits import SCHEMA_VERSION, ContractError
+from iort_contract.messages.requests.files import check_sha256, parse_file_key
+
+# A larger question or answer travels as a file in the bucket, and the message names the file.
+MAX_INLINE_BYTES = 100 * 1024
+# The longest time that a robot waits for an answer.
+MAX_ASK_MS = 60_000
+# The first level of an uploaded question's file name; functions may read no other files of robots.
+ASK_FOLDER = "ask"
+ANSWER_URL_S = 900
+
+# Why a question has no answer.
+UNKNOWN, OVER_QUOTA, TOO_LATE, TOO_LARGE = "unknown", "over_quota", "too_late", "too_large"
+MALFORMED, INVALID, NO_DATA, FAILED = "malformed", "invalid", "no_data", "failed"
+REASONS = {
+    UNKNOWN: "the deployment answers no such question",
+    OVER_QUOTA: "the robot asked it too often within this hour, or is not registered",
+    TOO_LATE: "the deadline passed before the function began",
+    TOO_LARGE: "the question or its answer is larger than the question allows",
+    MALFORMED: "the message is not a question",
+    INVALID: "the body does not fit the question",
+    NO_DATA: "the cloud has nothing to answer with",
+    FAILED: "the function failed; its log has more",
+}
+
+
+class Content(NamedTuple):
+    """A body that is a file in the bucket: where it is (a key for the cloud, an address for the robot), the
+    SHA-256 of its bytes in hex, and their number."""
+
+    place: str
+    sha256: str
+    size: int
+
+
+class Refusal(NamedTuple):
+    """Why a question is not answered: one of `REASONS`, and a text for a person."""
+
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A question. ``id`` names it; the answer repeats it.
+
+    An answer is wanted until ``valid_ms`` after ``sent_us``. ``offset_us`` converts ``sent_us`` to the
+    cloud's time by addition, if the robot knows it. The ``body`` is an object, or a file: its key.
+    """
+
+    id: str
+    sent_us: int
+    valid_ms: int
+    body: Mapping[str, Any] | Content
+    offset_us: int | None = None
+
+    def deadline_us(self, received_ms: int) -> int:
+        """Until when an answer is wanted, by the cloud's clock. Without an offset the robot's clock says
+        nothing, and the time counts from the receipt."""
+        sent_us = received_ms * 1000 if self.offset_us is None else self.sent_us + self.offset_us
+        return sent_us + self.valid_ms * 1000
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a question: its body, a file's address, or why there is none."""
+
+    id: str
+    body: Mapping[str, Any] | Content | Refusal
+
+
+def encode_ask(ask: Ask) -> bytes:
+    """The question as JSON; raises `ContractError` if it is invalid."""
+    envelope: dict[str, Any] = {
+        "v": SCHEMA_VERSION,
+        "id": ask.id,
+        "sent_us": ask.sent_us,
+        "valid_ms": ask.valid_ms,
+        **offset_entry(ask.offset_us),
+    }
+    if isinstance(ask.body, Content):
+        envelope["file"] = {"key": ask.body.place, "sha256": ask.body.sha256, "size": ask.body.size}
+    else:
+        envelope["body"] = ask.body
+    message = to_json(envelope)
+    decode_ask(message)
+    return message
+
+
+def decode_ask(message: bytes | str) -> Ask:
+    """Decode a question; raises `ContractError` for everything that `encode_ask` cannot have written."""
+    envelope = json_object(message, "question")
+    check_version(envelope)
+    valid_ms = integer(envelope, "valid_ms")
+    if not 1 <= valid_ms <= MAX_ASK_MS:
+        raise ContractError(f"valid_ms must be 1 to {MAX_ASK_MS}, got {valid_ms}")
+    offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
+    offset_entry(offset_us)
+    body = _body(envelope, "file", "key")
+    if isinstance(body, Content):
+        parse_file_key(body.place)
+    return Ask(_id(envelope), check_time(integer(envelope, "sent_us"), "sent_us"), valid_ms, body, offset_us)
+
+
+def ask_id(message: bytes | str) -> str | None:
+    """A question's id, even if the rest is invalid; None if an answer could not repeat it."""
+    try:
+        return _id(json_object(message, "question"))
+    except ContractError:
+        return None
+
+
+def encode_answer(answer: Answer) -> bytes:
+    """The answer as JSON."""
+    envelope: dict[str, Any] = {"v": SCHEMA_VERSION, "id": answer.id}
+    if isinstance(answer.body, Refusal):
+        envelope.update(refused=answer.body.reason, text=answer.body.text[:1000])
+    elif isinstance(answer.body, Content):
+        envelope["file"] = {"url": answer.body.place, "sha256": answer.body.sha256, "size": answer.body.size}
+    else:
+        envelope["body"] = answer.body
+    return to_json(envelope)
+
+
+def decode_answer(message: bytes | str) -> Answer:
+    """Decode an answer; raises `ContractError` for everything that `encode_answer` cannot have written.
+
+    A later version of the cloud may have other reasons.
+    """
+    envelope = json_object(message, "answer")
+    check_version(envelope)
+    if "refused" in envelope:
+        return Answer(_id(envelope), Refusal(text(envelope, "refused"), text(envelope, "text")))
+    return Answer(_id(envelope), _body(envelope, "file", "url"))
+
+
+def to_json(value: Mapping[str, Any]) -> bytes:
+    """A body or an envelope as JSON; raises `ContractError` for what JSON does not have."""
+    try:
+        return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ContractError(f"the body is not JSON: {error}") from error
+
+
+def _id(envelope: Mapping[str, Any]) -> str:
+    return checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")
+
+
+def _body(envelope: Mapping[str, Any], large: str, place: str) -> Mapping[str, Any] | Content:
+    file = envelope.get(large)
+    if isinstance(file, Mapping):
+        size = integer(file, "size")
+        if size < 0:
+            raise ContractError(f"size must be from 0, got {size}")
+        return Content(text(file, place), check_sha256(file.get("sha256")), size)
+    body = envelope.get("body")
+    if not isinstance(body, dict):
+        raise ContractError(f"body must be an object, got {shown(body)}")
+    return body

@@ -1,0 +1,52 @@
+"""Moves a stream's stored batches, byte for byte."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from iort_analysis.samples.batches import Item
+from iort_contract.dynamodb import WRITE_ITEMS, Keys
+from iort_contract.tables import BATCH, EXPIRES_S
+from iort_station.cloud import Cloud
+from iort_station.data.archive import key_of
+from iort_station.data.batches import ahead, telemetry_table
+from iort_station.recordings.adopt import UNITS_PER_S, write
+
+# Receives the number of batches read.
+BatchProgress = Callable[[int], None]
+
+
+def copy(
+    source: Cloud,
+    target: Cloud,
+    topic: str,
+    *,
+    units_per_s: int = UNITS_PER_S,
+    progress: BatchProgress = lambda _batches: None,
+) -> int:
+    """Copy what the target's table lacks, at so many write units a second; returns the number of batches.
+
+    Raises `StationError` if DynamoDB rejects a write. What was copied until then is good.
+    """
+    table, batches = telemetry_table(target), 0
+    for items in ahead(page.items for page in telemetry_table(source).pages(topic)):
+        new = list(_lacking(target, topic, items))
+        for start in range(0, len(new), WRITE_ITEMS):
+            write(table, new[start : start + WRITE_ITEMS], units_per_s)
+        batches += len(new)
+        progress(len(items))
+    return batches
+
+
+def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]:
+    """The items that the target does not have, and that DynamoDB is not about to delete."""
+    if not items:
+        return
+    keys = Keys(items[0][BATCH], items[-1][BATCH], empty=False)
+    pages = telemetry_table(target).pages(topic, keys, attributes=(BATCH,))
+    there = {key_of(item) for page in pages for item in page.items}
+    now_s = time.time()
+    for item in items:
+        if key_of(item) not in there and int(item.get(EXPIRES_S, {"N": now_s + 1})["N"]) > now_s:
+            yield item

@@ -1,0 +1,179 @@
+"""A downlink with ROS topics in memory and a broker in the same process."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from iort_agent.common.schema import Place, load
+from iort_agent.common.state import ClockOffset
+from iort_agent.control.config import DownlinkConfig, share_rule
+from iort_agent.control.downlink import Downlink
+from iort_agent.control.motion.commands import Operator
+from iort_agent.control.motion.stops import STOP_AHEAD_MS
+from iort_agent.errors import SourceError
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.ros1.trigger import OnTrigger
+from iort_contract.limits import Value
+from iort_contract.messages.control.commands import Command, encode_command
+from iort_contract.ros1.definition import Definition, parse
+from tests.agent_fakes import Loopback, ManualClock, link_of
+
+RULE = "=" * 80
+HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+POSE = f"""Header header
+Pose pose
+{HEADER}{RULE}
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+{RULE}
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+{RULE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+TYPES = {
+    "std_msgs/Float64": "float64 data",
+    "std_msgs/String": "string data",
+    "geometry_msgs/PoseStamped": POSE,
+}
+T0 = 1_700_000_000_000_000
+# For the agent, 0.3 s.
+LEASE_MS = 300 + STOP_AHEAD_MS
+
+
+def doubles(*values: float) -> bytes:
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+class FakeGraph:
+    """ROS topics in memory; what is published on one is heard on it."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[str, bytes]] = []
+        self.kinds: dict[str, str] = {}
+        self.released: list[str] = []
+        self.up = True
+        self.closed = False
+        self.stopped = threading.Event()
+        self.services: dict[str, OnTrigger] = {}
+        self._news = threading.Condition()
+        self._handlers: dict[str, Callable[[Mapping[str, str], bytes], None]] = {}
+
+    def definition(self, kind: str) -> Definition:
+        if kind not in TYPES:
+            raise SourceError(f"{kind} is not installed")
+        return parse(kind, TYPES[kind])
+
+    def advertise(self, topic: str, kind: str) -> None:
+        self.kinds[topic] = kind
+
+    def publish(self, topic: str, data: bytes) -> bool:
+        assert topic in self.kinds
+        if self.up:
+            with self._news:
+                self.published.append((topic, data))
+                self._news.notify_all()
+        if data == doubles(0):
+            self.stopped.set()
+        return self.up
+
+    def await_published(self, count: int) -> None:
+        """Wait for so many messages."""
+        with self._news:
+            assert self._news.wait_for(lambda: len(self.published) >= count, 30), self.published
+
+    def offer(self, service: str, handler: OnTrigger) -> None:
+        self.services[service] = handler
+
+    def release(self, topic: str) -> None:
+        self.released.append(topic)
+
+    def subscribe(self, topic: str, handler: Callable[[Mapping[str, str], bytes], None]) -> None:
+        self._handlers[topic] = handler
+
+    def hear(self, topic: str, kind: str, data: bytes) -> None:
+        self._handlers[topic]({"type": kind, "message_definition": TYPES[kind]}, data)
+
+    def waits(self) -> str | None:
+        return None
+
+    def start(self) -> None:
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
+
+
+CONFIG: dict[str, Any] = {
+    "cmd": {
+        "speed": {
+            "topic": "/commands/motor/speed",
+            "type": "std_msgs/Float64",
+            "motion": {"lease_s": 0.5, "stop": {"data": 0.0}},
+        },
+        "say": {"topic": "/say", "type": "std_msgs/String"},
+    },
+    "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": "geometry_msgs/PoseStamped"}},
+}
+
+
+class Rig:
+    def __init__(
+        self, robot: str = "car1", *, share: Any = None, uplink: Loopback | None = None, clock: Any = None,
+        graph: Any = None, guard: Any = None, **config: Any,
+    ) -> None:  # fmt: skip
+        self.clock = clock or ManualClock(now_us=T0)
+        self.dispatcher = Dispatcher()
+        self.uplink = uplink or Loopback(self.clock, self.dispatcher)
+        self.graph = FakeGraph()
+        self.answers: list[tuple[str, int, str | None]] = []
+        self.drove: list[Mapping[str, Value]] = []
+        self.settings_known = True
+        self.offset: ClockOffset | None = ClockOffset(0.0, 0.0)
+        where = Place(Path("car.yaml"))
+        self.downlink = Downlink(
+            load(DownlinkConfig, {**(CONFIG if graph is None else {}), **config}, where),
+            share_rule()(share, where) if share else (),
+            link=link_of(self.uplink, self.clock, robot=robot),
+            boot="0badcafe",
+            graph=graph or self.graph,
+            guard=guard,
+            offset=lambda: self.offset,
+            operator=Operator(
+                lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
+                self.drove.append,
+                lambda: self.settings_known,
+            ),
+        )
+        if uplink is None:
+            self.uplink.connect()
+        self.seq = 0
+
+    def send(self, message: Any, *, name: str = "speed", raw: bytes | None = None, **changes: Any) -> None:
+        now_us = self.clock.now_us()
+        command = Command("feedbeef", now_us - 10, self.seq, now_us, 500, message, LEASE_MS)
+        self.seq += 1
+        payload = raw if raw is not None else encode_command(replace(command, **changes))
+        self.uplink.deliver(f"cmd/iort/car1/{name}", payload)
+        self.dispatcher.run_pending()
+
+    def refused(self) -> dict[str, int]:
+        found: dict[str, int] = self.downlink.report()["refused"]
+        return found
+
+
+POSE_MESSAGE = {
+    "pose": {"position": {"x": 1.0, "y": 2.0, "z": 0.0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+}

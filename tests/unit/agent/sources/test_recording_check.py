@@ -1,0 +1,204 @@
+"""What `iort-agent check` says of recordings: those that can be played, and those that cannot."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Iterator
+
+import pytest
+
+from iort_agent.config import load_config
+from iort_agent.errors import SourceError
+from iort_agent.sources import FAIL, OK, Finding
+from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.recording.look import look_into
+from iort_agent.sources.recording.player import Message
+from tests.unit.agent.sources.test_bag import START, STORAGES, play, write_ros1, write_ros2
+from tests.unit.agent.sources.test_vesc_csv import row, write
+from tests.unit.agent.test_agent import config_file
+
+
+def found(folder: Path, path: Path, settings: str = "") -> Finding:
+    config = load_config(config_file(folder, f"{{type: bag, path: {path}, {settings}}}"))
+    (finding,) = config.sources[0].check("source 0")
+    return finding
+
+
+def mcap_of(folder: Path) -> Path:
+    return next(write_ros2(folder / "drive", "mcap").glob("*.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "streams"), [("", "vesc"), ("topics: {/servo: servo, /sensors/core: car}", "car, servo")]
+)
+def test_a_recording_that_can_be_played(tmp_path: Path, settings: str, streams: str) -> None:
+    finding = found(tmp_path, write_ros1(tmp_path / "a.bag"), settings)
+    assert (finding.level, finding.text) == (OK, f"has messages of {streams}")
+
+
+def test_a_log_that_can_be_played(tmp_path: Path) -> None:
+    path = write(tmp_path, row(1000), name="2024-06-12_00-34-31.csv")
+    assert found(tmp_path, path, "stamps: original").level == OK
+
+
+def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
+    finding = found(tmp_path, write_ros1(tmp_path / "a.bag"), "topics: {/odom: odom}")
+    assert finding.level == FAIL
+    assert "no topic /odom; the recording has /sensors/core (" in finding.text
+
+
+def test_a_topic_without_a_message(tmp_path: Path) -> None:
+    finding = found(tmp_path, write_ros1(tmp_path / "a.bag", count=0))
+    assert (finding.level, finding.text) == (FAIL, "it has no message of vesc")
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ("stamps: original", "`stamps: original` needs the day"),
+        ("topics: {/core: vesc}", "has no topics; `stream` names its stream"),
+    ],
+)
+def test_settings_that_do_not_fit_a_log(tmp_path: Path, settings: str, words: str) -> None:
+    finding = found(tmp_path, write(tmp_path, row(1000)), settings)
+    assert finding.level == FAIL
+    assert words in finding.text
+
+
+def test_a_log_with_more_columns_than_a_sample_may_have(tmp_path: Path) -> None:
+    names = [f"x{i}" for i in range(754)]
+    path = write(tmp_path, ";".join(["1000", *["1"] * 754]), header=";".join(["ms_today", *names]))
+    finding = found(tmp_path, path)
+    assert finding.level == FAIL
+    assert "754 of its columns hold numbers, and a sample has at most 512 fields" in finding.text
+
+
+def cut(folder: Path) -> Path:
+    path = folder / "cut.mcap"
+    path.write_bytes(mcap_of(folder).read_bytes()[:-500])
+    return path
+
+
+def misnamed(folder: Path) -> Path:
+    return Path(shutil.copy(mcap_of(folder), folder / "drive.bag"))
+
+
+def without_metadata(folder: Path) -> Path:
+    path = write_ros2(folder / "drive", STORAGES[0])
+    (path / "metadata.yaml").unlink()
+    return path
+
+
+def bad_metadata(folder: Path) -> Path:
+    path = write_ros2(folder / "drive", STORAGES[0])
+    (path / "metadata.yaml").write_text("x: [1")
+    return path
+
+
+def in_capitals(folder: Path) -> Path:
+    return write_ros1(folder / "a.bag").rename(folder / "A.BAG")
+
+
+def ros1_as_mcap(folder: Path) -> Path:
+    return write_ros1(folder / "a.bag").rename(folder / "a.mcap")
+
+
+def cut_database(folder: Path) -> Path:
+    path = folder / "cut.db3"
+    path.write_bytes(next(write_ros2(folder / "drive", "sqlite3").glob("*.db3")).read_bytes()[:6000])
+    return path
+
+
+def zeros(folder: Path) -> Path:
+    path = folder / "zeros.bag"
+    path.write_bytes(bytes(1000))
+    return path
+
+
+def service_events(folder: Path) -> Path:
+    """As ROS 2 writes them: the service's own definition instead of the event's (ros2/rosbag2#2365)."""
+    from mcap.writer import Writer
+
+    path = folder / "services.mcap"
+    event = b"=" * 80 + b"\nSRV: std_srvs/srv/SetBool\nbool data\n---\nbool success\nstring message\n"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        number = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        service = writer.register_schema("std_srvs/srv/SetBool_Event", "ros2msg", event)
+        for topic, schema in (("/servo", number), ("/set/_service_event", service)):
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, START, b"\0\1\0\0" + bytes(8), START)
+        writer.finish()
+    return path
+
+
+ANYWHERE = [
+    (without_metadata, "`ros2 bag reindex FOLDER` writes its metadata.yaml; or name the .mcap or .db3"),
+    (bad_metadata, "`ros2 bag reindex FOLDER`"),
+    (in_capitals, "is a bag of ROS 1 by its content: rename it to A.bag"),
+    (ros1_as_mcap, "is a bag of ROS 1 by its content: rename it to a.bag"),
+    (zeros, "was it copied whole?"),
+]
+# The newest rosbags for Python 3.8 writes no MCAP, and says other things.
+NEWER = [
+    (cut, "`mcap recover IN.mcap -o OUT.mcap`"),
+    (misnamed, "is MCAP by its content: rename it to drive.mcap"),
+    (cut_database, "`sqlite3 IN.db3 .recover | sqlite3 OUT.db3`"),
+    (service_events, "--exclude-topic-regex '.*/_service_event'`"),
+]
+
+
+@pytest.mark.parametrize(("make", "advice"), ANYWHERE + (NEWER if "mcap" in STORAGES else []))
+def test_what_cannot_be_read_comes_with_what_to_do(tmp_path: Path, make: Any, advice: str) -> None:
+    path = make(tmp_path)
+    topics = (("/servo", "servo"),) if make is service_events else None
+    with pytest.raises(SourceError) as raised:
+        play(path, topics=topics)
+    assert advice in str(raised.value)
+    assert "\n" not in str(raised.value)
+    finding = found(tmp_path, path, "topics: {/servo: servo}" if topics else "")
+    assert (finding.level, finding.text) == (FAIL, str(raised.value))
+
+
+class Endless:
+    """A recording with messages of one stream, of which there is no end; or none that comes at all."""
+
+    def __init__(self, *, stuck: bool) -> None:
+        self.closed, self.gone = threading.Event(), threading.Event()
+        self._stuck = stuck
+
+    @contextmanager
+    def open(self) -> Iterator[Iterator[Message]]:
+        try:
+            yield self._messages()
+        finally:
+            self.closed.set()
+
+    def _messages(self) -> Iterator[Message]:
+        while not (self._stuck and self.gone.wait(10)):
+            yield Message("vesc", 0, 0, {})
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_it_is_looked_into_for_a_bounded_time(stuck: bool) -> None:
+    source: Any = Endless(stuck=stuck)
+    looked = look_into(source.open, {"vesc", "imu"}, 0.05)
+    assert looked == ([] if stuck else ["vesc"], False, "")
+    source.gone.set()
+    assert source.closed.wait(10), "what it began goes on"
+
+
+def test_the_rest_is_not_read(tmp_path: Path) -> None:
+    source: Any = Endless(stuck=False)
+    assert look_into(source.open, {"vesc"}, 60) == (["vesc"], False, "")
+    assert source.closed.is_set()
+
+
+def test_an_error_of_the_library_is_one_of_the_recording(tmp_path: Path) -> None:
+    source = BagConfig(path=tmp_path / "gone.bag").build(None)  # type: ignore[arg-type]  # nothing is played
+    looked = look_into(source.open, {"vesc"}, 60)
+    assert "gone.bag" in looked.error

@@ -1,0 +1,35 @@
+"""What the page calculates without a browser: the way from positions, and the labels of an axis."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.web.logic.node import call
+
+
+def test_the_noise_of_positions_is_no_way() -> None:
+    # 20 Hz: ten seconds of standing, then 10 m in ten seconds, all with 2 cm of noise.
+    times = [i / 20 for i in range(400)]
+    x = [max(0.0, t - 10) + 0.02 * math.sin(7 * i) for i, t in enumerate(times)]
+    y = [0.02 * math.cos(11 * i) for i in range(400)]
+    found = call(
+        "history/align.ts", "distance", {"times_s": times, "fields": {"x": {"mean": x}, "y": {"mean": y}}}
+    )
+    assert found[200] < 0.3
+    assert found[-1] == pytest.approx(10, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("splits", "labels"),
+    [
+        ([0, 2.5, 5, 7.5], ["0.0", "2.5", "5.0", "7.5"]),
+        ([11.75, 12, 12.25], ["11.75", "12.00", "12.25"]),
+        ([0, 20, 40], ["0", "20", "40"]),
+        ([-0.2, 0, 0.2], ["\u22120.2", "0.0", "0.2"]),
+        ([0, 5000, 10_000], ["0", "5000", "10k"]),
+    ],
+)
+def test_an_axis_is_labelled_with_its_values(splits: list[float], labels: list[str]) -> None:
+    assert call("charts/axes.ts", "labels", splits) == labels

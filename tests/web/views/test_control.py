@@ -1,0 +1,267 @@
+"""What the page has its server do with a car: commands and settings. A static site offers neither."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from iort_contract.catalog.streams import LOG_STREAM
+from iort_station.errors import StationError
+from iort_station.page.server import PageServer
+from tests.browser import drawn, show, until
+from tests.web.cars import SUBSCRIBE_KEY, Car
+from tests.web.lab import Lab
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+    from local.pubnub.standin import PubNubStandIn
+
+
+class Robot:
+    """Answers commands as told, and keeps them."""
+
+    def __init__(self) -> None:
+        self.sent: list[dict[str, Any]] = []
+        self.online = True
+        rate = {"name": "live.rate_hz", "kind": "number", "low": 0.1, "high": 10.0, "unit": "Hz", "names": []}
+        self.told: dict[str, dict[str, Any]] = {
+            "live.rate_hz": {**rate, "value": "10", "desired": False, "pending": None, "reason": ""},
+            "fields.vesc": {**rate, "name": "fields.vesc", "kind": "fields", "unit": "", "value": "speed"}
+            | {"desired": True, "pending": None, "reason": ""},
+        }
+        self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
+
+    def settings(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+        return {"settings": [dict(one) for one in self.told.values()], "online": self.online}
+
+    def set(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        """Take all but rates above 5 Hz."""
+        self.sent.append(dict(asked))
+        entry = self.told[asked["name"]]
+        if not self.online:
+            entry["pending"], entry["desired"] = asked["value"], True
+        elif "value" not in asked:
+            entry["value"], entry["desired"] = "10", False
+        elif float(asked["value"]) > 5:
+            return self.settings({}) | {"settings": [{**entry, "reason": "rate_hz must be at most 5"}]}
+        else:
+            entry["value"], entry["desired"] = asked["value"], True
+        return self.settings({})
+
+    def send(self, asked: Mapping[str, str]) -> dict[str, Any]:
+        self.sent.append({**asked, "message": json.loads(asked["message"])})
+        if asked["command"] == "nothing":
+            raise StationError("there is no such command")
+        return self.answer
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+@pytest.fixture
+def invite(pubnub: PubNubStandIn, robot: Robot) -> Iterator[Callable[[str], str]]:
+    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    with PageServer(
+        namespace="iort", actions={"send": robot.send, "settings": robot.settings, "set": robot.set}, **told
+    ) as server:
+        yield server.invitation
+
+
+def test_a_command_is_sent_and_its_answer_shown(
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
+) -> None:
+    page = open_page(invite("#/car/car-1"))
+    show(page, car.send())
+    page.get_by_role("heading", name="Commands").click()
+    said = page.locator(".control .said")
+    page.fill("[name=speed]", "1.2")
+    page.fill("[name=turn]", "-0.1")
+    page.fill("[name=lease]", "800")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: said.inner_text() == "drive accepted after 0.4 s", "the answer")
+    drive = {"robot": "car-1", "command": "drive", "lease_ms": "800"}
+    assert robot.sent == [{**drive, "message": {"drive": {"speed": 1.2, "steering_angle": -0.1}}}]
+    robot.answer = {"accepted": False, "reason": "clock_offset_unknown", "after_ms": 300}
+    page.get_by_role("button", name="Stop").click()
+    until(lambda: said.inner_text() == "drive rejected: clock offset unknown", "the rejection")
+    assert robot.sent[1]["message"] == {"drive": {"speed": 0, "steering_angle": 0}}
+    robot.answer = {"accepted": None, "reason": "", "after_ms": 10_000}
+    page.select_option("[name=type]", "JSON")
+    page.fill("[name=message]", '{"data": true')
+    page.get_by_role("button", name="Send").click()
+    until(lambda: "must be JSON" in said.inner_text(), "the refusal")
+    page.fill("[name=message]", '{"data": true}')
+    page.fill("[name=command]", "horn")
+    page.fill("[name=lease]", "")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: "No answer within 10 s" in said.inner_text(), "the end of the wait")
+    assert robot.sent[2] == {"robot": "car-1", "command": "horn", "lease_ms": "", "message": {"data": True}}
+    page.fill("[name=command]", "nothing")
+    page.get_by_role("button", name="Send").click()
+    until(lambda: said.inner_text() == "there is no such command", "the server's refusal")
+
+
+def test_a_setting_is_checked_changed_and_reset(
+    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
+) -> None:
+    page = open_page(invite("#/car/car-1"))
+    show(page, car.send())
+    page.get_by_role("heading", name="Settings").click()
+    rate, row = page.locator("[name='live.rate_hz']"), page.locator(".setting").first
+    until(lambda: rate.count() == 1 and rate.input_value() == "10", "the value in force")
+    # A stream's fields can be selected, too.
+    assert page.locator(".setting [name='fields.vesc']").count() == 1
+    rate.fill("11")
+    row.get_by_role("button", name="Set").click()
+    assert not robot.sent
+    rate.fill("8")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: "rejected: rate_hz must be at most 5" in row.inner_text(), "the rejection")
+    assert rate.input_value() == "10"
+    rate.fill("2.5")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: row.get_by_role("button", name="Reset").is_visible(), "the new value")
+    assert (rate.input_value(), robot.sent[-1]["value"]) == ("2.5", "2.5")
+    row.get_by_role("button", name="Reset").click()
+    until(lambda: rate.input_value() == "10", "the file's value")
+    robot.online = False
+    rate.fill("3")
+    row.get_by_role("button", name="Set").click()
+    until(lambda: "pending; in force is 10" in row.inner_text(), "the pending value")
+    fields = page.locator(".setting", has=page.locator("[name='fields.vesc']"))
+    fields.locator("input").fill("")
+    fields.locator("[type=submit]").click()
+    until(lambda: "all fields are pending; in force is speed" in fields.inner_text(), "the pending selection")
+    assert fields.locator("input").input_value() == ""
+
+
+def test_a_note_is_written_marked_in_the_history_and_deleted(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    with lab.server(pubnub) as server:
+        page = open_page(server.invitation())
+        page.goto(
+            f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
+            "&to=2026-05-04T10:01:00.000Z&at=2026-05-04T10:00:30.000Z"
+        )
+        chart = page.locator(".history .charts .plot canvas").first
+        chart.wait_for()
+        page.locator(".scrub-at").filter(has_text="10:00:30").wait_for()
+        drawn(page)
+        before = chart.screenshot()
+        page.fill("[name=note]", "<b>hit</b> the wall")
+        page.get_by_role("button", name="Add note").click()
+        # About the cursor's time, and as text.
+        page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
+        assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
+        drawn(page)
+        assert chart.screenshot() != before
+        # A note links to its time.
+        page.goto(f"{server.url}#/insights/car-1")
+        page.locator(".insights-view .notes-list a").last.click()
+        page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
+        page.locator(".history .notes-list li").wait_for()
+        for name in ("Delete the note", "Really delete"):
+            page.locator(".history .notes-list").get_by_role("button").filter(
+                has_text=name.split()[0]
+            ).click()
+        until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
+        assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
+
+
+def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    lab.confirms = False
+    with lab.server(pubnub) as server:
+        page = open_page(server.invitation())
+        words = page.locator(".stop-words")
+        # No car has been heard: it can be stopped all the same.
+        page.goto(f"{server.url}#/car/car-1")
+        page.get_by_role("button", name="Stop car-1").click()
+        until(lambda: words.inner_text().startswith("Not confirmed by car-1."), "the stop to be asked for")
+        lab.cars["car-1"][1] = lab.confirms = True
+        stands = "Emergency stop: car-1 stands."
+        until(lambda: words.inner_text().startswith(stands), "the car's confirmation")
+        assert "Stopped by operator@lab, " in words.inner_text()
+        # On every view, and in a browser that comes later and may only look.
+        page.goto(f"{server.url}#/alarms")
+        assert words.inner_text() == f"{stands} Stopped alone: car-1, to be released on the car's page."
+        assert not page.get_by_role("button", name="Release all").is_visible()
+        onlooker = open_page(f"{server.url}#/insights")
+        onlooker.get_by_text("Emergency stop: car-1 stands.").wait_for()
+        assert onlooker.locator(".stop-press, .stop-release:visible").count() == 0
+        page.goto(f"{server.url}#/")
+        page.get_by_role("button", name="Stop all").click()
+        until(
+            lambda: words.inner_text().startswith("Emergency stop: car-1, car-9 stand."), "the fleet to stand"
+        )
+        page.get_by_role("button", name="Release all").click()
+        assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
+        # Only what the fleet's stop has stopped.
+        page.get_by_role("button", name="Really release car-9: it may move").click()
+        until(lambda: words.inner_text().startswith(stands), "the release of car-9")
+        assert lab.asked[-1] == {"stopped": "false"}
+        page.goto(f"{server.url}#/car/car-1")
+        page.get_by_role("button", name="Release car-1").click()
+        page.get_by_role("button", name="Really release car-1").click()
+        until(lambda: not words.is_visible(), "the release")
+    assert lab.asked[-1] == {"stopped": "false", "robot": "car-1"}
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    page.get_by_text("The page's server does not answer: nobody can be stopped here").wait_for()
+
+
+def test_the_log_of_a_car_that_never_warned_is_not_asked_for(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    lab = Lab()
+    with lab.server(pubnub) as server:
+        page = open_page(f"{server.url}#/")
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        with page.expect_response(lambda answer: "/streams.json?" in answer.url):
+            page.goto(f"{server.url}#/car/car-1")
+        lab.streams = [*lab.streams, LOG_STREAM]
+        log = f"stream={LOG_STREAM}"
+        with page.expect_request(lambda request: log in request.url):
+            page.goto(f"{server.url}#/car/car-9")
+        assert [url for url in asked if log in url and "robot=car-9" not in url] == []
+
+
+def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
+    show(page, car.send())
+    assert page.get_by_role("heading", name="Commands").count() == 0
+    assert page.get_by_role("heading", name="Settings").count() == 0
+
+
+def test_only_a_browser_that_was_invited_may_act(
+    open_page: Callable[..., Page], invite: Callable[[str], str], car: Car
+) -> None:
+    address = invite("#/car/car-1")
+    page = open_page(address.partition("?")[0])
+    show(page, car.send())
+    commands = page.get_by_role("heading", name="Commands")
+    assert "open the address in the server's terminal" in page.inner_text(".aside")
+    assert not commands.is_visible()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    # In the same tab, only what follows the # is another.
+    with page.expect_event("load"):
+        page.goto(address)
+    until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
+    show(page, car.send())
+    assert commands.is_visible()
+    assert page.url == address.partition("?")[0]
+    # The address was used, and this browser keeps the key.
+    again = page.context.new_page()
+    again.goto(address)
+    until(lambda: again.evaluate("window.iort?.link") == "live", "another tab to connect")
+    show(again, car.send())
+    assert again.get_by_role("heading", name="Commands").is_visible()

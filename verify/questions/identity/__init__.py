@@ -1,0 +1,1 @@
+"""Questions about certificates, and how a robot gets its first one."""

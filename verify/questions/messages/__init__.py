@@ -1,0 +1,1 @@
+"""Questions about messages: topic rules, what they forward, the broker, and the live lane."""

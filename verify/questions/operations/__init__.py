@@ -1,0 +1,1 @@
+"""Questions about what runs and is watched: functions, logs, alarms."""

@@ -1,0 +1,1 @@
+"""Questions about what is kept: tables and their streams, files, the quarantine."""
