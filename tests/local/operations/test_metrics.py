@@ -126,6 +126,16 @@ def test_an_alarm_goes_off_and_ends():
     assert [state["newState"]["stateValue"] for state in states] == ["ALARM", "OK"]
 
 
+def test_an_alarm_from_before_a_start_stays_as_long_as_its_lost_points_could_keep_it():
+    raised_s = time.time() - 30
+    alarm = {**ALARM, "StateValue": "ALARM", "EvaluationPeriods": 2, "AlarmActions": []}
+    alarm["StateUpdatedTimestamp"] = raised_s
+    alarm_state.evaluate(alarm, since_s=raised_s + 10)
+    assert alarm["StateValue"] == "ALARM"
+    alarm_state.evaluate(alarm, since_s=raised_s - 100)
+    assert alarm["StateValue"] == "OK"
+
+
 @pytest.mark.parametrize("failed", [False, True])
 def test_an_invocation_is_counted(failed):
     execute = lambda_metrics.counting_invocations(lambda *_: {"error": failed})
