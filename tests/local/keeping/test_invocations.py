@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import closing, suppress
 
+import pytest
+
+from local.keeping import invocations as invocations_module
 from local.keeping.invocations import Invocations
 from local.keeping.ledger import Ledger, LedgerError
 
@@ -12,10 +16,15 @@ class Events:
     """Queues that a test works off by hand."""
 
     def __init__(self):
-        self.done = {}
+        self.done, self.forgotten = {}, []
 
-    def queue(self, _account, _region, _function, event, *, done):
+    def queue(self, _account, _region, function, event, *, done):
+        if function == "removed":
+            raise LookupError(function)
         self.done[event] = done
+
+    def dispatch(self, _account, _region, _function, event):
+        self.forgotten.append(event)
 
 
 def test_the_end_of_an_undone_event_leaves_the_next_one_waiting(tmp_path):
@@ -32,3 +41,36 @@ def test_the_end_of_an_undone_event_leaves_the_next_one_waiting(tmp_path):
         assert ledger.read("SELECT event FROM invocations") == [('"acknowledged"',)]
         events.done["acknowledged"]()
         assert ledger.read("SELECT event FROM invocations") == []
+
+
+def test_what_waited_goes_on_after_a_restart_and_new_events_come_behind(tmp_path):
+    with closing(Ledger(tmp_path / "ledger.db", sync="normal")) as ledger:
+        before = Invocations(ledger, Events())
+        before.dispatch("account", "region", "function", "lost")
+        before.dispatch("account", "region", "function", "first")
+        with ledger.write() as connection:
+            connection.execute("UPDATE invocations SET function = 'removed' WHERE event = '\"lost\"'")
+    with closing(Ledger(tmp_path / "ledger.db", sync="normal")) as ledger:
+        events = Events()
+        invocations = Invocations(ledger, events)
+        invocations.go_on()
+        invocations.dispatch("account", "region", "function", "second")
+        assert list(events.done) == ["first", "second"]
+        assert ledger.read("SELECT event FROM invocations") == [('"first"',), ('"second"',)]
+
+
+@pytest.mark.parametrize(
+    ("topic", "qos", "kept"), [("live", 0, False), ("live", 1, True), ("$aws/events/presence", None, True)]
+)
+def test_an_event_of_an_unacknowledged_message_is_not_kept(tmp_path, topic, qos, kept):
+    with closing(Ledger(tmp_path / "ledger.db", sync="normal")) as ledger:
+        events = Events()
+        invocations = Invocations(ledger, events)
+
+        async def rule(account, region, *_payload, **_rest):
+            invocations.dispatch(account, region, "function", "event")
+
+        publish = invocations_module._noting_acknowledgement(rule)
+        asyncio.run(publish("account", "region", topic, b"", qos=qos))
+        assert (list(events.done), events.forgotten) == ((["event"], []) if kept else ([], ["event"]))
+        assert len(ledger.read("SELECT * FROM invocations")) == kept
