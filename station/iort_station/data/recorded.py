@@ -203,7 +203,6 @@ class Recorded:
                 yield row
 
     def _pages(self, keys: Keys, attributes: Sequence[str], *, scan: bool) -> Iterator[Sequence[Item]]:
-        """The table's pages."""
         if not self.reads_table:
             return
         pages = self._table.pages(self._topic, keys, attributes=attributes, scan=scan)
@@ -247,7 +246,6 @@ class Recorded:
         return batch
 
     def _ids(self, row: ArchivedHour) -> list[BatchId]:
-        """The batches of an hour."""
         if row.hour not in self._known:
             self._known[row.hour] = list(_batch_ids(self._archive.read(row, HourFile.ids)))
         return self._known[row.hour]

@@ -42,7 +42,6 @@ class Part(NamedTuple):
 
     @property
     def extent(self) -> Extent:
-        """Its times."""
         return {"from_us": self.first.t_us, "to_us": self.to_us}
 
 

@@ -44,7 +44,6 @@ class Missing(NamedTuple):
 
     @property
     def batches(self) -> int:
-        """The number of batches."""
         return self.last - self.first + 1
 
 
