@@ -19,7 +19,7 @@ from typing import Any
 from bench.errors import BenchError
 from bench.keeping.clock import Clock, inherited
 from bench.keeping.counted import count
-from bench.load.fleet_load import Columns, Load, Robot, laps
+from bench.load.fleet.generator import Columns, Load, Robot, laps
 from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
