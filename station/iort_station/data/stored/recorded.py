@@ -25,8 +25,8 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.archive import Archive, HourFile, is_expiring, key_of, within
-from iort_station.data.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
+from iort_station.data.stored.archive import Archive, HourFile, is_expiring, key_of, within
+from iort_station.data.stored.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
 
 if TYPE_CHECKING:
     from iort_contract.messages.page import Archived
