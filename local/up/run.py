@@ -116,7 +116,7 @@ class _Kept:
         renewed = time.monotonic()
         while not self._stopped.is_set():
             if embedded.emulator.wait(_LOOK_S) is not None:
-                raise _EmulatorError(f"the emulator has ended:\n{embedded.emulator.tail()}")
+                raise _EmulatorError(f"the emulator {embedded.emulator.ended()}:\n{embedded.emulator.tail()}")
             embedded.emulator.shorten_log(_MOST_LOG_BYTES)
             if time.monotonic() - renewed > _RENEW_S:
                 renewed = time.monotonic()
