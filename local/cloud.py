@@ -240,17 +240,20 @@ class EmbeddedCloud:
             "MINISTACK_SSL_CERT": str(certificate),
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(certificate),
-            "PYTHONDONTWRITEBYTECODE": "1",
             # Its threads hold the interpreter's lock, and each arena of its own would keep what it once had.
             "MALLOC_ARENA_MAX": "2",
             "PYTHONPATH": str(patched.folder()),
         }
+        log = self.folder / "emulator.log"
+        if self.kept and log.exists():
+            # It may tell why the last one ended.
+            log.replace(f"{log}.1")
         self.emulator = Child(
             "the emulator",
             [sys.executable, "-m", "local.emulator"],
             environment=environment,
             cwd=ROOT,
-            log=None if self._journal else self.folder / "emulator.log",
+            log=None if self._journal else log,
             # What it must not lose is on the disk already, and its workers end with it.
             orphaned=signal.SIGKILL,
         )

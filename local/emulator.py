@@ -10,7 +10,7 @@ import os
 import sys
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import cast
+from typing import NoReturn, cast
 
 from ministack import app
 
@@ -30,6 +30,7 @@ def main() -> None:
         ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
     except LedgerError as error:
         sys.exit(f"{error}; `iort restore` brings a backup back")
+    ledger.on_broken = _end
     # Before the gaps, which read streams.
     streams.install(ledger)
     gaps.install()
@@ -39,6 +40,12 @@ def main() -> None:
     Gate(ledger).install()
     alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()
+
+
+def _end(error: LedgerError) -> NoReturn:
+    """End at once: nothing may be acknowledged any more. `make up` starts the emulator again."""
+    print(error, file=sys.stderr, flush=True)  # noqa: T201 - the process' last words
+    os._exit(os.EX_IOERR)
 
 
 if __name__ == "__main__":

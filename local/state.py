@@ -21,8 +21,11 @@ from local.errors import LocalError
 # Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.
 VERSION = 1
 _LEAST_FREE_BYTES = 500 * 1024 * 1024
-# The ports that a new kept cloud takes if they are free; the others are any free ones.
+# The ports that a new kept cloud takes if they are free.
 USUAL_PORTS = {"mqtt": 8883, "files": 8443, "page": 8080, "network page": 8444}
+# The system gives ports of this range to programs that ask for any, so a kept port is outside of it.
+_EPHEMERAL = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_FIRST_PORT, _ATTEMPTS = 20_000, 100
 
 
 class StateFolder:
@@ -104,16 +107,15 @@ class StateFolder:
         do, or a free one, on every host. Raises `LocalError` if it is in use."""
         known = self.settings().get("ports", {})
         asked = wanted or known.get(name, 0)
-        usual = USUAL_PORTS.get(name, 0) if self.kept and not asked and not self._any_ports else 0
-        found = _free(hosts, usual) if usual else None
-        if found is None:
-            found = _free(hosts, asked)
+        usual = 0 if self._any_ports else USUAL_PORTS.get(name, 0)
+        found = _lasting(hosts, usual) if self.kept and not asked else _free(hosts, asked)
         if found is None:
             advice = "free it, give another, or none"
             if asked == known.get(name):
                 advice = (
-                    "if another cloud of this machine has it, stop that one (`make down STATE=its folder`) "
-                    f"or choose another port for this one in {self._settings_path}"
+                    f"`sudo ss -tanp 'sport = :{asked}'` names the program. End it (another cloud of this "
+                    "machine by `make down STATE=its folder`), or choose another port for this one in "
+                    f"{self._settings_path}"
                 )
                 if name == "mqtt":
                     # It is in the bundles.
@@ -128,6 +130,22 @@ class StateFolder:
         if not path.exists():
             write_private(path, secrets.token_hex(size).encode())
         return path.read_text()
+
+
+def _lasting(hosts: Sequence[str], usual: int) -> int | None:
+    """The port ``usual`` if it is free, or one that no program has by chance at the next boot."""
+    if usual and _free(hosts, usual):
+        return usual
+    try:
+        low, high = map(int, _EPHEMERAL.read_text().split())
+    except (OSError, ValueError):
+        # Not Linux: the range of RFC 6335.
+        low, high = 49_152, 65_535
+    ports = [*range(_FIRST_PORT, low), *range(max(_FIRST_PORT, high + 1), 65_536)]
+    for _ in range(_ATTEMPTS if ports else 0):
+        if found := _free(hosts, secrets.choice(ports)):
+            return found
+    return _free(hosts, 0)
 
 
 def _free(hosts: Sequence[str], port: int) -> int | None:

@@ -46,11 +46,15 @@ class Ledger:
         # Called, with the lock held, when changes were undone: what is remembered of them must be forgotten.
         # They may read, and not write.
         self.on_undo: list[Callable[[], object]] = []
+        # Called when the disk has failed: what it has is unknown then, so that only a new start may go on.
+        self.on_broken: Callable[[LedgerError], object] = lambda _error: None
         self._lock = threading.RLock()
         self._writing = False
         # SQLite calls a transaction over when its commit begins, which may fail.
         self._changed = False
         self._connection = self._open()
+        if sync == "full":
+            self._write_again()
         self._reading = threading.Lock()
         self._reader = self._open()
         self._committed = 0
@@ -189,8 +193,19 @@ class Ledger:
                 # The system may have dropped what it could not write, and says so once.
                 self._broken = error
             if self._broken is not None:
-                raise LedgerError(f"the disk of {self.path} fails: {self._broken}; start again")
+                broken = LedgerError(f"the disk of {self.path} fails: {self._broken}; start again")
+                self.on_broken(broken)
+                raise broken
             self._on_disk = reached
+
+    def _write_again(self) -> None:
+        """Empty the write-ahead log into the file. After a disk has failed, the log may be whole in memory
+        and have a hole on the disk, and what follows a hole is lost at a power cut."""
+        try:
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        except sqlite3.Error as error:
+            self._connection.close()
+            raise LedgerError(f"cannot write {self.path}: {error}") from error
 
     def _undo(self, error: sqlite3.Error) -> LedgerError:
         """Undo everything that is not committed. SQLite may have done so already."""

@@ -18,6 +18,7 @@ from yarl import URL
 from iort_contract.messages.requests.files import PART_BYTES, UPLOAD_URL_S
 from iort_station.page.background import BackgroundServer
 from local.certificates import ServerCertificate
+from local.network.addresses import client_of
 
 # "Authenticating Requests: Using Query Parameters (AWS Signature Version 4)", with a role's credentials.
 _SIGNED = {
@@ -38,8 +39,8 @@ _ANSWERED = re.compile(r"content-(length|type|range)|etag|last-modified|x-amz-[a
 _CHUNK_BYTES = 256 * 1024
 # A connection without a request is closed after this time.
 _IDLE_S = 30.0
-# Requests that pass at once, and those of one address.
-_MOST, _MOST_OF_ONE = 32, 8
+# Requests that pass at once, and those of one address. A share of the places is for addresses that have none.
+_MOST, _MOST_OF_ONE, _FIRST = 32, 8, 16
 
 
 class FileDoor(BackgroundServer):
@@ -64,20 +65,21 @@ class FileDoor(BackgroundServer):
         """Pass on one request for a file."""
         if not self._passes(request):
             return web.Response(status=403, text="only presigned requests for files pass here\n")
-        address = request.remote or ""
+        client = client_of(request.remote or "")
         length = request.content_length
         if request.method == "PUT" and (length is None or length > PART_BYTES):
             # The gateway holds a body in memory before it judges the signature.
             return web.Response(status=413, text=f"a part of a file must have up to {PART_BYTES} bytes\n")
-        if self._passing[address] >= _MOST_OF_ONE or self._passing.total() >= _MOST:
+        own, places = self._passing[client], _MOST - self._passing.total()
+        if own >= _MOST_OF_ONE or places <= (_FIRST if own else 0):
             return web.Response(status=503, text="too many files pass at once: try again\n")
-        self._passing[address] += 1
+        self._passing[client] += 1
         try:
             return await asyncio.wait_for(self._pass(request), UPLOAD_URL_S)
         except asyncio.TimeoutError:
             return web.Response(status=408, text=f"a part must be here within {UPLOAD_URL_S} s\n")
         finally:
-            self._passing -= Counter([address])
+            self._passing -= Counter([client])
 
     async def _pass(self, request: web.BaseRequest) -> web.StreamResponse:
         # The signature covers the Host that the robot sent, and path and query as they are.

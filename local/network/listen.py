@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from local.certificates import is_address, spelled
 from local.errors import LocalError
+from local.network.addresses import is_ipv6
 
 HTTPS_PORT = 443
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
@@ -68,8 +69,3 @@ class Listen:
 
     def __str__(self) -> str:
         return ",".join(self.hosts)
-
-
-def is_ipv6(host: str) -> bool:
-    """Whether a host is an IPv6 address."""
-    return ":" in host

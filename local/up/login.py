@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import secrets
 import time
 from collections import OrderedDict
@@ -14,15 +13,18 @@ from argon2.exceptions import InvalidHashError, VerificationError
 
 from local.certificates import write_private
 from local.errors import LocalError
+from local.network.addresses import client_of
 
 LEAST_CHARACTERS = 10
 _MOST_CHARACTERS = 1_000
 # A session ends after this time without a request, and the oldest one if there are too many.
 SESSION_S = 12 * 3600.0
 _MOST_SESSIONS = 1_000
-# An address may try so often at once, and once more each time these seconds have passed. So may all together.
+# An address may try so often at once, and once more each time these seconds have passed. So may all together;
+# a share of these tries is for addresses that have not tried yet.
 TRIES, TRY_S = 5, 30.0
 ALL_TRIES, ALL_TRY_S = 30, 2.0
+FIRST_TRIES = ALL_TRIES // 2
 _MOST_ADDRESSES = 10_000
 _FILE = "page-password"
 
@@ -106,14 +108,15 @@ class Tries:
 
     def wait_s(self, address: str) -> float:
         """Count a try; returns 0, or the seconds until the next one, and then it must not be made."""
-        now, network = self._now(), _network(address)
-        own = _filled(self._left.get(network, (float(TRIES), now)), now, TRIES, TRY_S)
+        now, client = self._now(), client_of(address)
+        own = _filled(self._left.get(client, (float(TRIES), now)), now, TRIES, TRY_S)
         of_all = _filled(self._of_all, now, ALL_TRIES, ALL_TRY_S)
-        wait_s = max((1 - own) * TRY_S, (1 - of_all) * ALL_TRY_S, 0.0)
+        kept = 0 if own == TRIES else FIRST_TRIES
+        wait_s = max((1 - own) * TRY_S, (1 + kept - of_all) * ALL_TRY_S, 0.0)
         if wait_s > 0:
             return wait_s
-        self._left[network], self._of_all = (own - 1, now), (of_all - 1, now)
-        self._left.move_to_end(network)
+        self._left[client], self._of_all = (own - 1, now), (of_all - 1, now)
+        self._left.move_to_end(client)
         if len(self._left) > _MOST_ADDRESSES:
             self._left.popitem(last=False)
         return 0.0
@@ -121,12 +124,3 @@ class Tries:
 
 def _filled(left: tuple[float, float], now: float, most: int, each_s: float) -> float:
     return min(float(most), left[0] + (now - left[1]) / each_s)
-
-
-def _network(address: str) -> str:
-    """An IPv4 address, or the network of an IPv6 address: whoever has one of it has them all."""
-    try:
-        found = ipaddress.ip_address(address.partition("%")[0])
-    except ValueError:
-        return address
-    return str(found) if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))

@@ -36,30 +36,41 @@ def owner(folder: Path) -> int | None:
     """The process that holds a folder's lock, if there is one."""
     try:
         with lock_of(folder).open() as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except OSError:
-                pid = int(lock.read())
-                return pid if _has_open(pid, lock.fileno()) else None
+            pid = int(lock.read())
+            opened = _has_open(pid, lock.fileno())
+            # To try the lock would hinder a start at the same moment, so it is done only where nothing else
+            # tells.
+            return pid if opened or (opened is None and _is_locked(lock.fileno())) else None
     except (FileNotFoundError, ValueError):
-        pass
-    return None
+        return None
 
 
-def _has_open(pid: int, file: int) -> bool:
-    """Whether a process has this file open; the number in it may be that of an earlier owner."""
+def _has_open(pid: int, file: int) -> bool | None:
+    """Whether a process has this file open, as an owner has; None where nothing tells. The number in the file
+    may be that of an earlier owner."""
     ours = os.fstat(file)
-    with suppress(FileNotFoundError):
-        try:
-            opened = list(Path(f"/proc/{pid}/fd").iterdir())
-        except PermissionError:
-            # Another user's: nothing tells.
-            return True
-        for one in opened:
-            with suppress(FileNotFoundError):
-                if os.path.samestat(one.stat(), ours):
-                    return True
-    return not Path("/proc/self/fd").is_dir()
+    if pid == os.getpid() or not Path("/proc/self/fd").is_dir():
+        return None
+    try:
+        opened = list(Path(f"/proc/{pid}/fd").iterdir())
+    except FileNotFoundError:
+        return False
+    except PermissionError:
+        # Another user's.
+        return None
+    for one in opened:
+        with suppress(FileNotFoundError):
+            if os.path.samestat(one.stat(), ours):
+                return True
+    return False
+
+
+def _is_locked(file: int) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +89,10 @@ class Up:
     after a kill its processes are gone.
 
     ``version`` is that of the state folder, ``versions`` those of the programs. ``pids`` has ``up``, the
-    process that started the others, and ``emulator``. ``ports`` are by name: ``gateway``, ``relay`` and
-    ``page`` on loopback, ``mqtt`` and ``files`` on the first host of ``listen``, if there is one, and
-    ``network page`` on that of ``page``. ``ledger`` is the path of its SQLite file. With ``power_cut`` it
-    survives that, too.
+    process that started the others, and ``emulator``. ``ports`` are by name: ``gateway``, ``relay``,
+    ``page`` and ``mqtt`` on loopback; ``mqtt`` and ``files`` on the first host of ``listen``, if there is
+    one, and ``network page`` on that of ``page``. ``ledger`` is the path of its SQLite file. With
+    ``power_cut`` it survives that, too.
     """
 
     version: int

@@ -7,6 +7,7 @@ from typing import Any, Iterator, Mapping
 
 from iort_agent.common.log_lines import neutral
 from iort_agent.common.state import Files, LiveLane, Queue, RecordLane, Status
+from iort_contract.catalog.streams import OWN_STREAMS
 
 # A stream that is silent for longer is marked.
 _SILENT_S = 5
@@ -60,7 +61,9 @@ def _lanes(status: Status) -> Iterator[str]:
     )
     for name, stream in status.streams.items():
         fields = f", only {', '.join(stream.fields)}" if stream.fields else ""
-        silent = f", SILENT for {_duration(stream.silent_s)}" if stream.silent_s >= _SILENT_S else ""
+        # The agent's own streams have their own pace.
+        marked = stream.silent_s >= _SILENT_S and name not in OWN_STREAMS
+        silent = f", SILENT for {_duration(stream.silent_s)}" if marked else ""
         yield (
             f"stream    {name}: {stream.per_s:g}/s, live {stream.live_hz:g}/s, "
             f"{stream.samples} samples, {stream.refused} refused{silent}{fields}"

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import io
 import json
 import os
 import shutil
 import tarfile
-import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -52,7 +53,6 @@ class Manifest:
 
     @property
     def size(self) -> int:
-        """The bytes of all files."""
         return sum(entry.size for entry in self.files.values())
 
 
@@ -64,11 +64,9 @@ class Hashing(io.RawIOBase):
         self.size, self._hash = 0, hashlib.sha256()
 
     def readable(self) -> bool:
-        """Always."""
         return True
 
     def readinto(self, buffer: ReadableBuffer, /) -> int:
-        """Read, and count."""
         view = memoryview(buffer)
         data = self._file.read(len(view))
         view[: len(data)] = data
@@ -95,10 +93,12 @@ def back_up(
     if out.exists() and not force:
         raise StationError(f"{out} exists: name another file, or overwrite it with --force")
     made_s = time.time()
+    _remove_left(out)
     with (
         whole(out, force=True) as part,
-        _copied(folder, out, progress) as files,
         os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT, 0o600), "wb") as archive,
+        _locked(archive),
+        _copied(folder, part, progress) as files,
     ):
         manifest = _write(archive, files, made_s, progress)
         archive.flush()
@@ -116,22 +116,45 @@ def size_of(folder: Path) -> int:
 
 
 @contextmanager
-def _copied(folder: Path, out: Path, progress: Progress) -> Iterator[dict[str, Path]]:
+def _locked(archive: IO[bytes]) -> Iterator[None]:
+    """Hold a part's lock, so that nobody takes it for one that was left; where there are no locks, do not."""
+    with suppress(OSError):
+        fcntl.flock(archive, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    yield
+
+
+def _remove_left(out: Path) -> None:
+    """Remove what a backup to the same file has left that was killed."""
+    for part in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
+        # Another backup may be writing it.
+        with suppress(OSError), part.open("rb") as left:
+            fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(_beside(part), ignore_errors=True)
+            part.unlink()
+
+
+def _beside(part: Path) -> Path:
+    """The folder for copies of databases."""
+    return part.with_suffix(".copies")
+
+
+@contextmanager
+def _copied(folder: Path, part: Path, progress: Progress) -> Iterator[dict[str, Path]]:
     """The files of the archive; of databases, copies beside the archive."""
-    with (
-        snapshot(folder) as found,
-        tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside,
-    ):
+    with snapshot(folder) as found, ExitStack() as stack:
         needed = found.size() + _database_bytes(found) + _LEFT_BYTES
-        free = shutil.disk_usage(out.parent).free
+        free = shutil.disk_usage(part.parent).free
         if free < needed:
             raise StationError(
-                f"{out.parent} must have {needed / 1e9:.1f} GB free for this, got {free / 1e9:.1f} GB: "
+                f"{part.parent} must have {needed / 1e9:.1f} GB free for this, got {free / 1e9:.1f} GB: "
                 "write the backup to another disk"
             )
+        beside = _beside(part)
+        beside.mkdir(mode=0o700)
+        stack.callback(shutil.rmtree, beside, ignore_errors=True)
         files = dict(found.files)
         for number, name in enumerate(found.databases):
-            files[name] = Path(beside, str(number))
+            files[name] = beside / str(number)
             found.copy_database(name, files[name], progress)
         # The databases are copied, so the cloud may shorten its write-ahead log again.
         for database in found.databases.values():

@@ -27,7 +27,7 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data.analysis import notes
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.stored.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry, robots, tags
 from iort_station.fleet.control import shadow

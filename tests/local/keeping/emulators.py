@@ -28,6 +28,8 @@ _POLL_S = 0.05
 class Emulator:
     """The emulator's process and its clients; `kill` and `start` as often as wanted."""
 
+    sync, arguments = "normal", ("-m", "local.emulator")
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.ledger = folder / "ledger.db"
@@ -43,7 +45,7 @@ class Emulator:
             "STATE_DIR": str(self.folder / "state"),
             "S3_DATA_DIR": str(self.folder / "s3"),
             "IORT_LEDGER": str(self.ledger),
-            "IORT_LEDGER_SYNC": "normal",
+            "IORT_LEDGER_SYNC": self.sync,
             "AUTH": "true",
             "BIND_HOST": "127.0.0.1",
             "MINISTACK_HOST": "127.0.0.1",
@@ -59,7 +61,7 @@ class Emulator:
         }
         self.process = Child(
             "the emulator",
-            [sys.executable, "-m", "local.emulator"],
+            [sys.executable, *self.arguments],
             environment=environment,
             cwd=ROOT,
             log=self.folder / "emulator.log",

@@ -126,7 +126,7 @@ def test_an_invocation_that_a_kill_interrupts_begins_again(emulator, tmp_path):
 
 
 def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
-    s3, ssm, sqs = (emulator.client(name) for name in ("s3", "ssm", "sqs"))
+    s3, ssm, sqs, iam, cloudwatch = map(emulator.client, ("s3", "ssm", "sqs", "iam", "cloudwatch"))
     s3.create_bucket(Bucket="full", CreateBucketConfiguration={"LocationConstraint": REGION})
     s3.put_object(Bucket="full", Key="key", Body=b"before")
     ssm.put_parameter(Name="/parameter", Value="before", Type="String")
@@ -140,6 +140,20 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
             ssm.put_parameter(Name="/parameter", Value="x" * 4096, Type="String", Overwrite=True)
         with pytest.raises(ClientError, match=r"ServiceUnavailable|InternalError"):
             sqs.send_message(QueueUrl=queue, MessageBody="x" * 10_000)
+        # As their clients read it: these do not speak JSON.
+        with pytest.raises(ClientError, match="ServiceUnavailable"):
+            iam.create_role(RoleName="full", AssumeRolePolicyDocument=json.dumps(_TRUST))
+        with pytest.raises(ClientError, match="ServiceUnavailable"):
+            cloudwatch.put_metric_alarm(
+                AlarmName="full",
+                Namespace="iort",
+                MetricName="full",
+                Statistic="Sum",
+                Period=60,
+                EvaluationPeriods=1,
+                Threshold=1,
+                ComparisonOperator="GreaterThanThreshold",
+            )
     finally:
         resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)
     assert s3.get_object(Bucket="full", Key="key")["Body"].read() == b"before"

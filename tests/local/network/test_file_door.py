@@ -46,8 +46,10 @@ def door(embedded, tmp_path_factory) -> Iterator[FileDoor]:
 def send(embedded, door) -> Callable[..., tuple[int, str]]:
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
 
-    def request(method: str, path: str, **headers: str) -> tuple[int, str]:
-        connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=30)
+    def request(method: str, path: str, own: str = "127.0.0.1", **headers: str) -> tuple[int, str]:
+        connection = http.client.HTTPSConnection(
+            HOST, door.port, context=trusts, timeout=30, source_address=(own, 0)
+        )
         connection.request(method, path, body=BODY if method == "PUT" else None, headers=headers)
         answer = connection.getresponse()
         told = answer.status, answer.read().decode()
@@ -138,17 +140,23 @@ def test_no_body_passes_that_is_larger_than_a_part_of_a_file(door, presigned, em
     connection.close()
 
 
-def test_one_address_cannot_take_every_place(door, presigned, embedded, send):
+def test_addresses_with_many_requests_leave_places_to_others(door, presigned, embedded, send):
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
     with ExitStack() as stack:
-        for _ in range(file_door._MOST_OF_ONE):
-            raw = stack.enter_context(socket.create_connection((HOST, door.port), timeout=30))
+        # One address takes all that one may have, and two take all that are for requests after the first.
+        for number in range(2 * file_door._MOST_OF_ONE):
+            own = ("127.0.0.8", 0) if number < file_door._MOST_OF_ONE else ("127.0.0.9", 0)
+            raw = stack.enter_context(
+                socket.create_connection((HOST, door.port), timeout=30, source_address=own)
+            )
             slow = stack.enter_context(trusts.wrap_socket(raw, server_hostname=HOST))
             head = f"PUT {presigned()} HTTP/1.1\r\nHost: {HOST}:{door.port}\r\nContent-Length: 9\r\n\r\n"
             slow.sendall(head.encode())
-        until(lambda: door._passing.total() == file_door._MOST_OF_ONE)
-        assert send("PUT", presigned())[0] == 503
-    until(lambda: send("PUT", presigned())[0] == 200)
+        until(lambda: door._passing.total() == file_door._MOST - file_door._FIRST)
+        assert send("PUT", presigned(), own="127.0.0.8")[0] == 503
+        # The first request of another address.
+        assert send("PUT", presigned(), own="127.0.0.7")[0] == 200
+    until(lambda: send("PUT", presigned(), own="127.0.0.8")[0] == 200)
 
 
 def test_a_connection_that_never_asks_is_closed(tmp_path, monkeypatch):

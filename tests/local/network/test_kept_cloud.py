@@ -43,7 +43,7 @@ def test_a_kept_folder_keeps_its_ports_and_a_second_cloud_is_refused(state):
         again.take(stack)
     with (
         socket.create_server(("127.0.0.1", port)),
-        pytest.raises(LocalError, match=r"is in use .*stop that one .*settings\.json, .*car\.yaml"),
+        pytest.raises(LocalError, match=r"is in use .*'sport = :.*`make down .*settings\.json, .*car\.yaml"),
     ):
         again.port("mqtt", "127.0.0.1")
 
@@ -119,6 +119,16 @@ def test_a_port_is_free_on_each_of_its_addresses(state):
         port = taken.getsockname()[1]
         with pytest.raises(LocalError, match="is in use"):
             state.port("mqtt", "127.0.0.1", "127.0.0.2", wanted=port)
+
+
+@pytest.mark.parametrize(
+    ("given", "least", "most"),
+    [("32768\t60999", 20_000, 32_767), ("1024 60999", 61_000, 65_535), ("1024 65535", 1024, 65_535)],
+)
+def test_a_kept_port_is_none_that_the_system_gives_to_others(state, monkeypatch, given, least, most):
+    (state.path / "range").write_text(given)
+    monkeypatch.setattr("local.state._EPHEMERAL", state.path / "range")
+    assert least <= state.port("gateway", "127.0.0.1") <= most
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from iort_contract.cloud import IOT
-from local.certificates import ServerCertificate
+from local.certificates import LASTS_S, ServerCertificate
 from local.network.listen import Listen
 from local.up import network_page
 from local.up.login import TRIES, Password
@@ -117,6 +117,18 @@ def test_pages_elsewhere_can_neither_log_in_nor_listen(page, ask, log_in):
     assert ask("GET", "/config.json", Cookie=cookie, Host="elsewhere.example")[0].status == 403
     # A name of the certificate leads to the one address that the cookie is for.
     assert ask("GET", "/", Host="iort.lab")[0].headers["Location"] == page.url
+
+
+def test_the_page_takes_over_a_renewed_certificate(page, embedded, tmp_path):
+    shown = [ssl.get_server_certificate((ADDRESS.host, page.port)).strip()]
+    # As after two months.
+    certificate = ServerCertificate(
+        embedded.authority, tmp_path / "page.pem", ADDRESS.hosts, renewed_s=LASTS_S
+    )
+    assert certificate.renew()
+    # The first connection after the change tells the server.
+    shown += [ssl.get_server_certificate((ADDRESS.host, page.port)).strip() for _ in range(2)]
+    assert [one in certificate.path.read_text() for one in shown] == [False, False, True]
 
 
 def test_guesses_come_to_an_end(ask, log_in):

@@ -383,6 +383,12 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "robot     car1" in text
     assert "stream    vesc: " in text
     assert "500 samples" in text
+    # A stream of the agent's own has its own pace.
+    streams = {name: {**state["streams"]["vesc"], "silent_s": 60} for name in ("vesc", "account")}
+    marked = [
+        line for line in render(read(Status, {**state, "streams": streams})).splitlines() if "SILENT" in line
+    ]
+    assert [line.split()[1] for line in marked] == ["vesc:"]
     assert "source    script: played" in text
     assert "NOT connected" in text
     assert "files " not in text

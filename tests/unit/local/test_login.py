@@ -57,6 +57,15 @@ def test_the_addresses_of_one_ipv6_network_share_their_tries():
     assert tries.wait_s("2001:db8::ffff") > 0.0
 
 
+def test_some_addresses_together_leave_tries_to_others():
+    tries = Tries(Now())
+    busy = [f"192.0.2.{i}" for i in range(10)]
+    made = sum(tries.wait_s(address) == 0.0 for address in busy for _ in range(login.TRIES))
+    assert made < login.ALL_TRIES < len(busy) * login.TRIES
+    assert tries.wait_s(busy[0]) > 0.0
+    assert tries.wait_s("198.51.100.1") == 0.0
+
+
 def test_all_addresses_together_have_an_end_too():
     tries = Tries(Now())
     waits = [tries.wait_s(f"192.0.2.{i}") for i in range(login.ALL_TRIES + 1)]
