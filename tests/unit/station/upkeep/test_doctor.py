@@ -141,6 +141,29 @@ def test_a_disk_that_fills_up_is_told_before_it_is_full(folder, monkeypatch, fre
     assert f"{free / 1e9:.1f} GB free" in disk.text
 
 
+@pytest.mark.parametrize(("robots", "level"), [(200, OK), (275, OK), (325, WARN), (375, WARN)])
+def test_a_load_is_told_before_summaries_fall_behind(monkeypatch, robots, level):
+    # As measured: of 3.7 ms of a processor for a batch, the emulator takes 2.15 ms; 375 robots keep up.
+    spent_s = {1: 0.00215 * robots, 2: 0.00155 * robots}
+    passed = iter([0.0, 1.0])
+    monkeypatch.setattr(doctor.time, "monotonic", lambda: next(passed))
+    monkeypatch.setattr(doctor.time, "sleep", lambda _s: None)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    told = {pid: iter([0.0, seconds]) for pid, seconds in spent_s.items()}
+    monkeypatch.setattr(
+        doctor,
+        "machine",
+        SimpleNamespace(
+            family=lambda _pid: [1, 2],
+            memory=lambda: SimpleNamespace(total=24e9, available=20e9),
+            resident_bytes=lambda _pid: 1e8,
+            processor_s=lambda pid: next(told[pid]),
+        ),
+    )
+    found = looked(doctor._emulator(1))
+    assert found["load"].level == level
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux' /proc")
 def test_the_facts_of_a_process_and_of_its_children():
     # It is busy until its processor time shows.
