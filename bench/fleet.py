@@ -22,8 +22,8 @@ from rich.console import Console
 
 from bench.command import made, parser, write
 from bench.errors import BenchError
-from bench.load.fleet_figures import Fleet, limits, table
-from bench.load.fleet_run import measure
+from bench.load.fleet.figures import Fleet, limits, table
+from bench.load.fleet.run import measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 

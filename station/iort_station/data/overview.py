@@ -11,8 +11,8 @@ from iort_contract.messages.analysis.insights import Extent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import has_fraction
-from iort_station.data.recorded import Origin
 from iort_station.data.runs import runs
+from iort_station.data.stored.recorded import Origin
 from iort_station.data.units import unit
 
 

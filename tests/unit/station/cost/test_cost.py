@@ -15,8 +15,9 @@ from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
 from iort_contract.catalog.metrics import METRICS
 from iort_station.cli.main import app
-from iort_station.cost import line_items, model, report, scale
-from iort_station.cost.fixed_costs import (
+from iort_station.cost import report, scale
+from iort_station.cost.bill import line_items, model
+from iort_station.cost.bill.fixed_costs import (
     FREE_ALARMS,
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from bench import message_sizes
 from iort_station.cli.main import app
-from iort_station.cost import analysing, archiving, model, sizes
+from iort_station.cost import sizes
+from iort_station.cost.bill import analysing, archiving, model
 from iort_station.cost.prices import MONTH_DAYS, PRICES
 from iort_station.cost.usage import Usage
 from stacks import analysis, archive, storage

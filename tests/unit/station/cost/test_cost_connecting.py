@@ -16,7 +16,8 @@ from iort_agent.mqtt.reconnect import SHORTEST_S
 from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import SHADOW
-from iort_station.cost import model, scale
+from iort_station.cost import scale
+from iort_station.cost.bill import model
 from iort_station.cost.prices import QUOTAS
 from iort_station.cost.usage import Usage
 from tests.agent_fakes import Loopback, ManualClock

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
+from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.deployed import watching
-from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.usage import Usage
 
 ROWS = [["AWS/IoT", "TopicMatch", "RuleName", "a"], ["...", "b"]]

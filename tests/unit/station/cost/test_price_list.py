@@ -12,8 +12,9 @@ from botocore.stub import Stubber
 from typer.testing import CliRunner
 
 from iort_station.cli.main import app
-from iort_station.cost import line_items, model, report
-from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost import report
+from iort_station.cost.bill import line_items, model
+from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import API_REGION, PRODUCTS, Listed, keep, kept_at, load, read
 from iort_station.cost.prices import PRICES
 from iort_station.cost.usage import Usage

@@ -23,10 +23,10 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station import data
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.data import archive as station_archive
 from iort_station.data.overview import overview
-from iort_station.data.recorded import Origin
 from iort_station.data.runs import runs
+from iort_station.data.stored import archive as station_archive
+from iort_station.data.stored.recorded import Origin
 from iort_station.errors import StationError
 from iort_station.operations.delivery import accounts, audit
 from iort_station.page.answers.downloads import downloads

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from iort_station.cost.line_items import PLATFORM_LINES, READ, LineItem
+from iort_station.cost.bill.line_items import PLATFORM_LINES, READ, LineItem
 from iort_station.cost.sizes import sizes_of
 from iort_station.cost.usage import Usage
 

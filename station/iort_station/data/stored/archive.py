@@ -115,7 +115,6 @@ class HourFile:
         return list(self._file.pages(self._hour, wanted, keys=keys, messages=messages))
 
     def batches(self, wanted: Wanted, keys: Keys) -> list[Batches]:
-        """The batches with these keys."""
         if self._row.batches and self._file.has_messages(self._hour):
             # Values that were not finite are counted as messages are decoded.
             return [batches_of(within(self.items(), keys), wanted)]

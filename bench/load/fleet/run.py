@@ -18,14 +18,14 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import ROOT
 from bench.errors import BenchError
-from bench.load.fleet_figures import Fleet
-from bench.load.fleet_load import Load
+from bench.load.fleet.figures import Fleet
+from bench.load.fleet.generator import Load
 from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.batches import summary_table, topic_of
+from iort_station.data.stored.batches import summary_table, topic_of
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from iort_station.operations.delivery.audit import headers
@@ -106,7 +106,7 @@ def measure(
 @contextmanager
 def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
     """Run the process that drives the robots; yield its output, a dictionary for each line."""
-    command = [sys.executable, "-m", "bench.load.fleet_load", str(load)]
+    command = [sys.executable, "-m", "bench.load.fleet.generator", str(load)]
 
     def said() -> Iterator[dict[str, Any]]:
         yield from map(json.loads, process.stdout or ())

@@ -1,7 +1,7 @@
 """Many simulated robots in one process, each with its own certificate, session and record lane.
 
 Its argument is a file with a `Load` as JSON. Writes one JSON object a line to standard output: progress, and
-at the end a `Sent`. Run by `bench.load.fleet_run`.
+at the end a `Sent`. Run by `bench.load.fleet.run`.
 """
 
 from __future__ import annotations

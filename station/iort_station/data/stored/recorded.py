@@ -25,8 +25,8 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.archive import Archive, HourFile, is_expiring, key_of, within
-from iort_station.data.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
+from iort_station.data.stored.archive import Archive, HourFile, is_expiring, key_of, within
+from iort_station.data.stored.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
 
 if TYPE_CHECKING:
     from iort_contract.messages.page import Archived
@@ -203,7 +203,6 @@ class Recorded:
                 yield row
 
     def _pages(self, keys: Keys, attributes: Sequence[str], *, scan: bool) -> Iterator[Sequence[Item]]:
-        """The table's pages."""
         if not self.reads_table:
             return
         pages = self._table.pages(self._topic, keys, attributes=attributes, scan=scan)
@@ -247,7 +246,6 @@ class Recorded:
         return batch
 
     def _ids(self, row: ArchivedHour) -> list[BatchId]:
-        """The batches of an hour."""
         if row.hour not in self._known:
             self._known[row.hour] = list(_batch_ids(self._archive.read(row, HourFile.ids)))
         return self._known[row.hour]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from iort_station.cost.line_items import ITEM_OVERHEAD, READ, LineItem, function
+from iort_station.cost.bill.line_items import ITEM_OVERHEAD, READ, LineItem, function
 from iort_station.cost.prices import MONTH_DAYS, PRICES, Price
 from iort_station.cost.sizes import ARCHIVED_SHARE, OWN_ITEM_BYTES, sizes_of
 from iort_station.cost.usage import Usage

@@ -12,8 +12,8 @@ from typing import Any
 
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.cloud import IOT, PUBNUB
-from iort_station.cost import analysing, archiving
-from iort_station.cost.line_items import (
+from iort_station.cost.bill import analysing, archiving
+from iort_station.cost.bill.line_items import (
     METER,
     PUBNUB_UNIT,
     READ,
