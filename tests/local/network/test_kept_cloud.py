@@ -17,9 +17,9 @@ import pytest
 from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.kept import owner
-from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT
 from local.errors import LocalError
+from local.network.certificates import Authority, ServerCertificate
 from local.network.listen import Listen
 from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
