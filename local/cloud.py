@@ -240,7 +240,6 @@ class EmbeddedCloud:
             "MINISTACK_SSL_CERT": str(certificate),
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(certificate),
-            "PYTHONDONTWRITEBYTECODE": "1",
             # Its threads hold the interpreter's lock, and each arena of its own would keep what it once had.
             "MALLOC_ARENA_MAX": "2",
             "PYTHONPATH": str(patched.folder()),

@@ -121,7 +121,6 @@ class Driver:
         raise BenchError("the car does not move")
 
     def release(self) -> None:
-        """Let go of all keys."""
         for key in ("ArrowUp", "Space"):
             self.page.keyboard.up(key)
         self.course.quiet(_PAUSE_S)

@@ -106,7 +106,6 @@ class Course:
             return one
 
     def last_motion(self) -> Heard:
-        """The newest command that moves the car."""
         return next(one for one in reversed(self.heard) if one.speed != 0)
 
     def quiet(self, seconds: float) -> None:

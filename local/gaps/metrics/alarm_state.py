@@ -5,7 +5,7 @@ AWS: evaluates the metric with the alarm's own dimensions. All the evaluation pe
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/AlarmThatSendsEmail.html).
 ministack: takes the points of every dimension together, over all periods at once, and keeps the last state
   when no data comes.
-Test: tests/local/data/test_metrics.py::test_an_alarm_needs_all_periods_and_its_own_dimensions
+Test: tests/local/operations/test_metrics.py::test_an_alarm_needs_all_periods_and_its_own_dimensions
 Patch: none; a patch would have to know every value of TreatMissingData, where ours know one
 """
 
