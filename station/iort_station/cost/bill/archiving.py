@@ -101,10 +101,10 @@ def _making(usage: Usage, hour: Recorded) -> list[LineItem]:
             LANE,
             "archive",
             tasks + runs,
+            usage,
             memory_mb=MEMORY_MB,
             billed_ms=1000 * computing_s / (tasks + runs),
             logged=_LINE * (tasks + runs),
-            all_lines=usage.function_logs == "all",
         ),
         # An hour's object is written and read once; the day's is written, and moved if it is not too small.
         LineItem("S3", LANE, "PUT", "s3_put", streams * (1 + days)),

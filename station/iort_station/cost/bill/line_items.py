@@ -87,15 +87,15 @@ def function(
     lane: str,
     name: str,
     calls: float,
+    usage: Usage,
     *,
     memory_mb: int,
     billed_ms: float,
     logged: float,
-    all_lines: bool = True,
     compute: str = "compute_arm",
 ) -> list[LineItem]:
     """A function's invocations; ``logged`` counts the bytes of its own log lines in an hour."""
-    if all_lines:
+    if usage.function_logs == "all":
         logged += calls * len(PLATFORM_LINES)
     return [
         LineItem("Lambda", lane, f"{name} invoked", "invocation", calls),

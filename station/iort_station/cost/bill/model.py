@@ -7,6 +7,7 @@ of the thesis that this project started from: each sample is one message, two it
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import ceil
 from typing import Any
 
@@ -97,8 +98,8 @@ def _bill(usage: Usage) -> list[LineItem]:
         LineItem("IoT Core", "ping", "clock ping rule", "rule", clock),
         LineItem("IoT Core", "ping", "action", "action", clock),
     ]
-    items += _question_items(usage.questions_per_hour, all_lines=usage.function_logs == "all")
-    items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
+    items += _question_items(usage)
+    items += _ping_items(usage, sizes)
     writes = batches * units(sizes.telemetry_item, WRITE)
     # The batches of one stream in an event; one query reads them and those of the second before.
     of_stream = usage.stream_batches_per_s
@@ -127,24 +128,23 @@ def _bill(usage: Usage) -> list[LineItem]:
     if usage.recoverable:
         items += [item._replace(what=f"{item.what}, recoverable", price="recovery") for item in kept]
     calls = summarize_calls_per_s(usage) * hour / usage.robots
-    all_lines = usage.function_logs == "all"
     items += function(
         "record",
         "Lambda 2",
         calls,
+        usage,
         memory_mb=usage.summarize_memory_mb,
         billed_ms=usage.summarize_ms + usage.summarize_batch_ms * (batches + own) / calls,
         logged=calls * _SUMMARIZE_LINE + (batches / found + own) * _HEALTH_LINE,
-        all_lines=all_lines,
     )
     items += function(
         "live",
         "Lambda 1",
         by_pubnub,
+        usage,
         memory_mb=usage.live_memory_mb,
         billed_ms=usage.live_ms,
         logged=_live_lines_per_s(usage) * hour / usage.robots * _LIVE_LINE + by_pubnub * _LIVE_VALUES,
-        all_lines=all_lines,
     )
     return [*items, *archiving.items(usage), *analysing.items(usage)]
 
@@ -156,7 +156,7 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Line
     Lambda 1. Functions have 128 MB on x86. Prices, retention and billed milliseconds are the same as ours.
     The layout has no pings, no metrics of the agent, and no alarms.
     """
-    usage.check()
+    usage = replace(usage, function_logs="all").check()
     sizes = sizes_of(usage.rate_hz, usage.batch_s)
     samples = usage.samples_per_s * 3600
     per_s = usage.robots * usage.samples_per_s
@@ -164,8 +164,8 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Line
     calls = min(per_s, polls) * 3600 / usage.robots
     written = samples * units(sizes.sample_item, WRITE)
     functions: dict[str, Any] = {"memory_mb": 128, "logged": 0.0, "compute": "compute_x86"}
-    live = function("live", "Lambda 1", samples, billed_ms=usage.live_ms, **functions)
-    second = function("record", "Lambda 2", calls, billed_ms=usage.summarize_ms, **functions)
+    live = function("live", "Lambda 1", samples, usage, billed_ms=usage.live_ms, **functions)
+    second = function("record", "Lambda 2", calls, usage, billed_ms=usage.summarize_ms, **functions)
     items = [
         LineItem("IoT Core", "connection", "minutes", "connection", 60),
         LineItem("IoT Core", "connection", "CONNECT", "message", usage.connects_per_hour),
@@ -253,17 +253,18 @@ def _connecting(usage: Usage) -> list[LineItem]:
             lane,
             "presence",
             events,
+            usage,
             memory_mb=_PRESENCE_MB,
             billed_ms=_PRESENCE_MS,
             logged=events * _PRESENCE_LINE,
-            all_lines=usage.function_logs == "all",
         ),
         LineItem("DynamoDB", lane, "robot's row written", "write", events),
     ]
 
 
-def _question_items(asked: float, *, all_lines: bool) -> list[LineItem]:
+def _question_items(usage: Usage) -> list[LineItem]:
     """Questions that fit into a message, with their answers."""
+    asked = usage.questions_per_hour
     if not asked:
         return []
     lane = "questions"
@@ -275,18 +276,19 @@ def _question_items(asked: float, *, all_lines: bool) -> list[LineItem]:
             lane,
             "answer",
             asked,
+            usage,
             memory_mb=max(question.memory_mb for question in QUESTIONS.values()),
             billed_ms=_QUESTION_MS,
             logged=asked * _ANSWER_LINE,
-            all_lines=all_lines,
         ),
         LineItem("DynamoDB", lane, "counted in the robot's row", "write", asked),
         LineItem("DynamoDB", lane, "parameters read", "read", asked * _QUESTION_READS),
     ]
 
 
-def _ping_items(pings: float, sizes: Sizes, *, all_lines: bool) -> list[LineItem]:
+def _ping_items(usage: Usage, sizes: Sizes) -> list[LineItem]:
     """Ping and pong on each path; two of the three paths pass a rule, and one passes a function."""
+    pings = usage.ping_hz * 3600
     if not pings:
         return []
     return [
@@ -297,9 +299,9 @@ def _ping_items(pings: float, sizes: Sizes, *, all_lines: bool) -> list[LineItem
             "ping",
             "echo",
             pings,
+            usage,
             memory_mb=256,
             billed_ms=5.0,
             logged=pings * _PONG_LINE,
-            all_lines=all_lines,
         ),
     ]
