@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from bench.command import made, parser, progress, write
+from bench.command import made, parser, progress, steps, write
 from bench.errors import BenchError
 from bench.proof.cars import drive_of
 from bench.proof.speed import HOUR_S
@@ -61,11 +61,8 @@ def main() -> None:
     given = arguments.parse_args()
     console = Console()
 
-    def say(step: str) -> None:
-        console.print(f"  {step}", style="dim", highlight=False)
-
     try:
-        with TemporaryDirectory() as folder, EmbeddedCloud(Path(folder), progress=say) as embedded:
+        with TemporaryDirectory() as folder, EmbeddedCloud(Path(folder), progress=steps(console)) as embedded:
             figures = measure(embedded, given.hours, console)
     except (BenchError, LocalError, StationError) as error:
         sys.exit(f"bench-analysis-cloud: {error}")

@@ -46,6 +46,11 @@ def write(path: Path | None, figures: Any) -> None:
         path.write_text(json.dumps(figures, indent=2) + "\n")
 
 
+def steps(console: Console) -> Callable[[str], None]:
+    """Tells each step of the work in a dim line."""
+    return lambda step: console.print(f"  {step}", style="dim", highlight=False)
+
+
 def progress(console: Console) -> Progress:
     """Bars of what is done, how long it took and how long the rest takes."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

@@ -20,10 +20,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, write
+from bench.command import made, parser, steps, write
 from bench.errors import BenchError
-from bench.load.fleet_figures import Fleet, limits, table
-from bench.load.fleet_run import measure
+from bench.load.fleet.figures import Fleet, limits, table
+from bench.load.fleet.run import measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 
@@ -37,11 +37,8 @@ def main() -> None:
     arguments.add_argument("--limit", action="store_true", help="look for the largest number that keeps up")
     options = arguments.parse_args()
     console = Console()
+    say = steps(console)
     runs: list[Fleet] = []
-
-    def say(step: str) -> None:
-        console.print(f"  {step}", style="dim", highlight=False)
-
     try:
         with (
             tempfile.TemporaryDirectory() as folder,

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, write
+from bench.command import made, parser, steps, write
 from bench.errors import BenchError
 from bench.keeping import disk, kills, report, week
 from iort_station.errors import StationError
@@ -37,10 +37,7 @@ def main() -> None:
     given = arguments.parse_args()
     disk.enter("bench.kept")
     console = Console()
-
-    def say(step: str) -> None:
-        console.print(f"  {step}", style="dim", highlight=False)
-
+    say = steps(console)
     killed = soaked = None
     try:
         with tempfile.TemporaryDirectory() as folder:

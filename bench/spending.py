@@ -10,8 +10,8 @@ from bench.sections import dashboard, outage, query, round_trips, utilisation, v
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
-from iort_station.cost import line_items, model
-from iort_station.cost.line_items import LineItem
+from iort_station.cost.bill import line_items, model
+from iort_station.cost.bill.line_items import LineItem
 from iort_station.cost.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where

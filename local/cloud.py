@@ -32,15 +32,15 @@ from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.kept import LEDGER
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
-from local import first_calls, patched
-from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT, deploy
+from local.emulator import first_calls, patched
 from local.errors import LocalError
+from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
 from local.network.listen import Listen
+from local.network.relay import Relay
 from local.processes import Child
 from local.pubnub.standin import PubNubStandIn
-from local.relay import Relay
 from local.state import StateFolder
 
 FOLDER = ROOT / EMBEDDED.parent
@@ -240,17 +240,20 @@ class EmbeddedCloud:
             "MINISTACK_SSL_CERT": str(certificate),
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(certificate),
-            "PYTHONDONTWRITEBYTECODE": "1",
             # Its threads hold the interpreter's lock, and each arena of its own would keep what it once had.
             "MALLOC_ARENA_MAX": "2",
             "PYTHONPATH": str(patched.folder()),
         }
+        log = self.folder / "emulator.log"
+        if self.kept and log.exists():
+            # It may tell why the last one ended.
+            log.replace(f"{log}.1")
         self.emulator = Child(
             "the emulator",
-            [sys.executable, "-m", "local.emulator"],
+            [sys.executable, "-m", "local.emulator.run"],
             environment=environment,
             cwd=ROOT,
-            log=None if self._journal else self.folder / "emulator.log",
+            log=None if self._journal else log,
             # What it must not lose is on the disk already, and its workers end with it.
             orphaned=signal.SIGKILL,
         )

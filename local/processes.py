@@ -74,8 +74,13 @@ class Child:
 
     def check(self) -> None:
         """Raise `LocalError` with the end of its log if it has stopped."""
-        if (status := self.poll()) is not None:
-            raise LocalError(f"{self.name} stopped with status {status}:\n{self.tail()}")
+        if self.poll() is not None:
+            raise LocalError(f"{self.name} {self.ended()}:\n{self.tail()}")
+
+    def ended(self) -> str:
+        """How it has ended, in words."""
+        status = self._process.returncode
+        return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
 
     def tail(self) -> str:
         """The last lines of its log."""

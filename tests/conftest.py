@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from local import patched
+from local.emulator import patched
 from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
 # The duration of an example depends only on the machine.
@@ -29,6 +29,8 @@ GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
     "tests/local/data/": "cloud of the data",
+    "tests/local/operations/": "cloud of the data",
+    "tests/local/page/": "cloud of the data",
     "tests/ros/test_two_robots.py": "cloud of the data",
     "tests/local/faults/": "cloud of the faults",
     "tests/ros/mixed/test_mixed_robot.py": "cloud of the faults",
@@ -36,6 +38,7 @@ GROUPS = {
     "tests/local/gaps/": "cloud of the robots",
     "tests/local/network/test_network.py": "kept cloud",
     "tests/local/network/": "cloud of the robots",
+    "tests/local/identity/": "cloud of the robots",
     "tests/local/robots/": "cloud of the robots",
     "tests/web/": "page",
     "tests/stacks/": "app",

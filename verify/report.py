@@ -80,7 +80,6 @@ def write(folder: Path, run: Run, answers: Sequence[Answer]) -> None:
 
 
 def _as_json(run: Run, answers: Sequence[Answer]) -> str:
-    """The form that `load` reads."""
     told = [
         {
             "name": answer.question.name,

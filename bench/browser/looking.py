@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from bench import command
 from bench.errors import BenchError
 from bench.load.agent_process import AgentProcess
 from bench.meters import chromium
+from bench.meters.waiting import wait_for
 from iort_contract.cloud import VIEWER
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.viewing import VIEW_LEASE_MS
@@ -39,7 +40,7 @@ from iort_station.page.answers import socket
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 
 _STREAM = "vesc"
 _WATCHED = "car1"
@@ -132,7 +133,7 @@ def _looked(options: argparse.Namespace, console: Console) -> list[Look]:
         stack.enter_context(counted.broker)
         server = stack.enter_context(_served(embedded.cloud))
         looking = _Looking(browser, server.url, counted, options.cars, options.pictures)
-        _until(lambda: len(counted.over(1.0)) > 0, "a car", 60)
+        wait_for(lambda: len(counted.over(1.0)) > 0, "a car", 60)
         return [
             looking.at("nobody looks", None),
             looking.at("the fleet", "#/"),
@@ -161,11 +162,11 @@ class _Looking:
     def one_car(self) -> Iterator[Look]:
         """Look at one car, with a second viewer, and go one after the other."""
         with self._page("#/alarms") as first:
-            _until(lambda: first.evaluate(f"iort.robots.{_WATCHED} !== undefined"), "the car", 30)
+            wait_for(lambda: first.evaluate(f"iort.robots.{_WATCHED} !== undefined"), "the car", 30)
             _sleeps(self._counted)
             before, began = self._counted.silent_s(_WATCHED), time.monotonic()
             first.goto(f"{self._url}#/car/{_WATCHED}")
-            _until(lambda: self._counted.silent_s(_WATCHED) < before, "the car to wake", 10)
+            wait_for(lambda: self._counted.silent_s(_WATCHED) < before, "the car to wake", 10, poll_s=0.01)
             woke_ms = (time.monotonic() - began) * 1000
             yield self._count("one car", first, f"awake after {woke_ms:.0f} ms")
             with self._page(f"#/car/{_WATCHED}") as second:
@@ -193,7 +194,7 @@ class _Looking:
         context = self._browser.new_context(viewport=_LAPTOP)
         page = context.new_page()
         page.goto(f"{self._url}{view}")
-        _until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect", 30)
+        wait_for(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect", 30)
         try:
             yield page
         finally:
@@ -219,7 +220,7 @@ def _far(browser: Any, cloud: Cloud) -> Look:
         with _served(far) as server:
             page = browser.new_page(viewport=_LAPTOP)
             page.goto(f"{server.url}#/car/{_WATCHED}")
-            _until(lambda: page.evaluate(f"iort.robots.{_WATCHED}?.state") == "live", "the car", 30)
+            wait_for(lambda: page.evaluate(f"iort.robots.{_WATCHED}?.state") == "live", "the car", 30)
             proxy.reset_every(_DROPS_S)
             end, longest_s, began = time.monotonic() + _FAR_S, 0.0, page.evaluate("iort.received")
             while time.monotonic() < end:
@@ -235,16 +236,8 @@ def _far(browser: Any, cloud: Cloud) -> Look:
 def _sleeps(counted: Counted) -> float:
     """Wait until the watched car sends no more than an idle one; return how long it went on, in seconds."""
     began = time.monotonic()
-    _until(lambda: counted.silent_s(_WATCHED) > _SILENT_S, "the car to sleep", 60)
+    wait_for(lambda: counted.silent_s(_WATCHED) > _SILENT_S, "the car to sleep", 60, poll_s=0.01)
     return max(0.0, time.monotonic() - began - counted.silent_s(_WATCHED))
-
-
-def _until(true: Callable[[], bool], what: str, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > end:
-            raise BenchError(f"waited {seconds:.0f} s for {what}")
-        threading.Event().wait(0.01)
 
 
 def _served(cloud: Cloud) -> PageServer:

@@ -70,7 +70,6 @@ class Kills:
         return there and all(one <= OPEN_MOST_S for each in self.open_s.values() for one in each)
 
     def as_json(self) -> dict[str, Any]:
-        """All figures."""
         return asdict(self)
 
     def table(self) -> Table:

@@ -19,12 +19,12 @@ from typing import Any
 from bench.errors import BenchError
 from bench.keeping.clock import Clock, inherited
 from bench.keeping.counted import count
-from bench.load.fleet_load import Columns, Load, Robot, laps
+from bench.load.fleet.generator import Columns, Load, Robot, laps
 from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.batches import summary_table, topic_of
+from iort_station.data.stored.batches import summary_table, topic_of
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 

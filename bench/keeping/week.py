@@ -47,7 +47,6 @@ class Soak:
         return not lost and self.growth < MOST_GROWTH
 
     def as_json(self) -> dict[str, Any]:
-        """All figures."""
         return {**asdict(self), "growth": round(self.growth, 4)}
 
     def table(self) -> Table:

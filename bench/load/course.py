@@ -24,7 +24,7 @@ from iort_station.page.answers import control, socket
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 
 ROBOT, TOPIC = "driven", "/cmd_vel"
 LEASE_S = 0.5
@@ -106,7 +106,6 @@ class Course:
             return one
 
     def last_motion(self) -> Heard:
-        """The newest command that moves the car."""
         return next(one for one in reversed(self.heard) if one.speed != 0)
 
     def quiet(self, seconds: float) -> None:

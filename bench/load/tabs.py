@@ -61,11 +61,9 @@ class Tabs:
         self._ask("GET", f"/json/close/{tab}")
 
     def processes(self) -> list[int]:
-        """Every process of the browser."""
         return [self._process.pid, *usage.descendants(self._process.pid)]
 
     def signal(self, number: int) -> None:
-        """Send a signal to every process of the browser."""
         for pid in self.processes():
             os.kill(pid, number)
 

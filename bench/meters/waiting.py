@@ -19,7 +19,7 @@ def reached(true: Callable[[], object], *, within_s: float, poll_s: float = 0.1)
     return True
 
 
-def wait_for(true: Callable[[], object], what: str, within_s: float = 30.0) -> None:
+def wait_for(true: Callable[[], object], what: str, within_s: float = 30.0, *, poll_s: float = 0.1) -> None:
     """Ask until the answer is true. Raises `BenchError` with ``what`` if it never was in this time."""
-    if not reached(true, within_s=within_s):
+    if not reached(true, within_s=within_s, poll_s=poll_s):
         raise BenchError(f"waited {within_s:.0f} s for {what}")

@@ -74,7 +74,6 @@ class ProbeFixture:
         return RawClient(self._bundles[index].folder)
 
     def topic(self, lane: str, robot: str, name: str) -> str:
-        """Return a topic of this deployment."""
         return build_topic(lane, robot, name, self.namespace)
 
     def pong(self, path: str) -> dict[str, Any]:

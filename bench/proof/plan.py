@@ -48,7 +48,6 @@ class Plan:
         return [drive_of(car, 0, seconds=self.seconds, cars=ANY_CARS) for car in cars]
 
     def all_drives(self) -> Iterator[DriveSpec]:
-        """Every drive."""
         for car in range(self.cars):
             yield from self.baselines(car)
             yield from self.healthy_drives(car)

@@ -21,7 +21,7 @@ from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
-from iort_station.cost.analysing import Function, drive_items
+from iort_station.cost.bill.analysing import Function, drive_items
 from iort_station.cost.usage import Usage
 
 HOUR_S = 3600.0

@@ -21,8 +21,8 @@ _HEIGHT = 3.4
 Draw = Callable[[str], str]
 
 
-def cdf(curves: Mapping[str, Sequence[float]], *, unit: str = "ms") -> Draw:
-    """The share of values up to each value, on a logarithmic axis."""
+def cdf(curves: Mapping[str, Sequence[float]]) -> Draw:
+    """The share of values up to each value in ms, on a logarithmic axis."""
 
     def fill(axes: mpl.axes.Axes) -> None:
         for i, (name, values) in enumerate((name, values) for name, values in curves.items() if values):
@@ -35,7 +35,7 @@ def cdf(curves: Mapping[str, Sequence[float]], *, unit: str = "ms") -> Draw:
         axes.grid(visible=True, which="both", linewidth=0.3)
         axes.legend(fontsize=8, loc="lower right")
 
-    return _picture(fill, unit, "share of messages")
+    return _picture(fill, "ms", "share of messages")
 
 
 def bars(values: Mapping[str, float], *, unit: str, log: bool = False) -> Draw:

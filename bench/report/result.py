@@ -30,7 +30,6 @@ class Table:
         )
 
     def show(self, console: Console) -> None:
-        """Print the table on a terminal."""
         shown = rich.table.Table(title=self.title, title_justify="left", title_style="bold")
         for i, name in enumerate(self.head):
             shown.add_column(name, justify="right" if i else "left")
@@ -97,7 +96,6 @@ class Section:
     seconds: float = 0.0
 
     def table(self, title: str, head: Row, rows: Iterable[Row]) -> None:
-        """Add a table."""
         self.tables.append(Table(title, list(head), [list(row) for row in rows]))
 
     def ratio(self, name: str, value: float | None, target: float | None, **settings: Any) -> None:

@@ -99,7 +99,6 @@ class RosGraph:
         return Publisher(self.start("bench.ros.publisher", node, seconds, subscribers, *rate))
 
     def run(self, command: list[str]) -> subprocess.Popen[str]:
-        """Run a command in the graph."""
         with (self._folder / f"{len(self._processes)}.log").open("w") as log:
             process = subprocess.Popen(
                 command,
@@ -125,13 +124,11 @@ class Publisher:
         self._hear()
 
     def go(self) -> None:
-        """Start to publish."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
     def publish_for(self, seconds: float) -> None:
-        """Let it publish for ``seconds``."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:

@@ -34,7 +34,6 @@ class Line:
         )
 
     def publish(self) -> None:
-        """Publish the next message."""
         self.topic.fill(self._message, self._classes, self.sent)
         if self.topic.time == HEADER:
             self._message.header.stamp = genpy.Time.from_sec(time.time())

@@ -8,7 +8,8 @@ from bench.report import plots
 from bench.report.fleet_costs import fleets
 from bench.report.result import Section
 from bench.target import Say, Target
-from iort_station.cost import line_items, model, report
+from iort_station.cost import report
+from iort_station.cost.bill import line_items, model
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 

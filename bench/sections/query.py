@@ -67,7 +67,6 @@ class Way:
     read: int = 0
 
     def row(self, name: str) -> list[str]:
-        """Return the table's row."""
         waiting = median(self.wall_s) - median(self.client_cpu_s)
         server = f"{median(self.server_cpu_s):.3f} s" if self.server_cpu_s else NOT_MEASURED
         theirs = THESIS_S[name] if self.read == POINTS else NOT_MEASURED

@@ -5,8 +5,8 @@ It runs only on the embedded cloud, which shares this machine's cores. The secti
 
 from __future__ import annotations
 
-from bench.load.fleet_figures import table
-from bench.load.fleet_run import measure
+from bench.load.fleet.figures import table
+from bench.load.fleet.run import measure
 from bench.report import plots
 from bench.report.result import Section
 from bench.target import Say, Target

@@ -20,7 +20,7 @@ from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import LiveSample, decode_live, decode_live_update
 from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_contract.topics import LIVE
-from iort_station.cost import line_items, model
+from iort_station.cost.bill import line_items, model
 from iort_station.cost.usage import Usage
 from iort_station.fleet import viewing
 from iort_station.fleet.broker import Broker

@@ -56,7 +56,6 @@ class Hour(NamedTuple):
 
     @property
     def start_us(self) -> int:
-        """Its first microsecond."""
         return self.number * HOUR_US
 
     @property
@@ -131,7 +130,6 @@ class ArchivedHour:
     first_expires_s: int
 
     def item(self) -> Item:
-        """The row as DynamoDB's item."""
         return {
             name: {"S": value} if isinstance(value, str) else {"N": str(value)}
             for name, value in vars(self).items()
@@ -207,7 +205,6 @@ class Pending(NamedTuple):
 
     @property
     def is_day(self) -> bool:
-        """Whether it is a day."""
         return len(self.period) == len("2026-11-22")
 
     def due_ms(self, now_ms: int) -> int:

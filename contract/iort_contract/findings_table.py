@@ -36,7 +36,6 @@ class FindingsTable:
         yield from _decoded(decode_finding, self._content(robot, first, last, newest_first=True))
 
     def of_drive(self, drive: DriveKey) -> list[Finding]:
-        """The findings about one drive."""
         return list(_decoded(decode_finding, self._content(drive.robot, f"{drive}-", f"{drive}-~")))
 
     def drives(
@@ -74,7 +73,6 @@ class FindingsTable:
         self._put(analysed.drive.robot, key, encode_analysed(analysed))
 
     def put_note(self, note: Note) -> None:
-        """Write a note."""
         self._put(note.robot, f"{NOTE_PREFIX}{note.id}", encode_note(note))
 
     def remove(self, finding: Finding) -> None:
@@ -82,7 +80,6 @@ class FindingsTable:
         self._delete(finding.drive.robot, finding.id)
 
     def remove_drive(self, drive: DriveKey) -> None:
-        """Remove the row of an analysed drive."""
         self._delete(drive.robot, f"{PARAMETERS_PREFIX}{drive}")
 
     def remove_note(self, robot: str, note_id: str) -> bool:

@@ -9,15 +9,17 @@ that it can still be stopped. MQTT 3.1.1 has no such PUBACK, and its connection 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import wraps
 from typing import Any
+from urllib.parse import parse_qs
 
 from ministack import app
+from ministack.core.iam_actions import access_denied_response
+from ministack.core.router import detect_service
 from ministack.services import iot
 
 from local.keeping.ledger import Ledger, LedgerError
@@ -87,7 +89,7 @@ class Gate:
                         await self.passed(since)
                     except LedgerError as error:
                         refused = True
-                        await _refuse(send, error)
+                        await _refuse(scope, send, error)
                 if not refused:
                     await send(message)
 
@@ -167,9 +169,23 @@ def _telling(handle: Callable[..., Awaitable[bool]]) -> Callable[..., Awaitable[
     return tell
 
 
-async def _refuse(send: Send, error: LedgerError) -> None:
+async def _refuse(scope: Message, send: Send, error: LedgerError) -> None:
+    """Answer 503 in the form that the clients of the called service read; so they try again by themselves."""
     _log.warning("a call is refused: %s", error)
-    body = json.dumps({"__type": "ServiceUnavailable", "message": str(error)}).encode()
-    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-    await send({"type": "http.response.start", "status": 503, "headers": headers})
+    headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+    query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
+    service = detect_service(scope["method"], scope["path"], headers, query)
+    # Of the data plane of IoT it knows one answer, that something is forbidden. The form is that of IoT.
+    _, told, body = access_denied_response(
+        "iot" if service == "iot-data" else service,
+        "",
+        "",
+        "",
+        error_code="ServiceUnavailable",
+        message=str(error),
+        headers=headers,
+    )
+    fields = [(name.lower().encode(), value.encode()) for name, value in told.items()]
+    fields.append((b"content-length", str(len(body)).encode()))
+    await send({"type": "http.response.start", "status": 503, "headers": fields})
     await send({"type": "http.response.body", "body": body})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from iort_station.kept import owner
 from local.errors import LocalError
-from local.up.run import add_state
+from local.up import options
 
 _ENDS_S = 60.0
 _POLL_S = 0.1
@@ -20,13 +19,7 @@ _POLL_S = 0.1
 
 def main() -> None:
     """Stop it. The exit status is 0 if it has ended, and 1 otherwise."""
-    parser = argparse.ArgumentParser(
-        prog="make down",
-        usage="make down [STATE=folder]",
-        description="Stop the cloud of `make up`; it is kept.",
-    )
-    add_state(parser)
-    folder = parser.parse_args().state
+    folder = options.parser("down", "Stop the cloud of `make up`; it is kept.").parse_args().state
     try:
         stopped = stop(folder)
     except LocalError as error:

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import getpass
 import sys
 from pathlib import Path
 
 from local.errors import LocalError
 from local.state import StateFolder
+from local.up import options
 from local.up.login import LEAST_CHARACTERS, Password
-from local.up.run import add_state
 
 
 def main() -> None:
     """Ask for a password twice, and keep its hash."""
-    parser = argparse.ArgumentParser(
-        prog="make up-password",
-        usage="make up-password [STATE=folder]",
-        description="Set the password of the page in the network.",
-    )
-    add_state(parser)
-    folder = parser.parse_args().state
+    folder = options.parser("up-password", "Set the password of the page in the network.").parse_args().state
     try:
         _change(folder)
     except (LocalError, EOFError) as error:

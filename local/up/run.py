@@ -15,7 +15,6 @@ import threading
 import time
 from contextlib import ExitStack
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NoReturn
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -24,17 +23,16 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
-from local.certificates import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from local.network.addresses import is_ipv6
+from local.network.certificates import write_private
 from local.network.listen import Listen
 from local.state import VERSION, StateFolder
-from local.up import notify
+from local.up import notify, options
+from local.up.options import NO
 from local.up.pages import Pages
 
-# Closes again what an earlier start has opened.
-NO = "no"
 _PAGE = "PAGE"
 _LOOK_S = 1.0
 _RENEW_S = 3600.0
@@ -49,7 +47,8 @@ class _EmulatorError(LocalError):
 
 def main() -> None:
     """Run until SIGINT, SIGTERM or SIGHUP. The exit status is 0 then, and 1 if the cloud cannot run."""
-    options, stopped = _options(), threading.Event()
+    parser = options.parser("up", "Run the stacks in a cloud of your own, which is kept.", remembered=True)
+    given, stopped = parser.parse_args(), threading.Event()
 
     def stop(_signal: int, _frame: object) -> NoReturn:
         # Python drops an exception that is raised while it forks, so the event is set too.
@@ -62,7 +61,7 @@ def main() -> None:
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     try:
-        _Kept(options, stopped).run()
+        _Kept(given, stopped).run()
     except (LocalError, StationError) as error:
         sys.exit(f"up: {error}")
     except (BotoCoreError, ClientError) as error:
@@ -71,52 +70,10 @@ def main() -> None:
         _say("stopped; everything is kept")
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="make up",
-        usage=(
-            "make up [STATE=folder] [LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1] "
-            "[PORTS=any]"
-        ),
-        description="Run the stacks in a cloud of your own, which is kept.",
-    )
-    add_state(parser)
-    add_network(parser)
-    return parser.parse_args()
-
-
-def add_state(parser: argparse.ArgumentParser) -> None:
-    """The option of every command: the folder."""
-    parser.add_argument(
-        "--state",
-        type=lambda text: Path(text).expanduser().absolute(),
-        default=kept.folder(),
-        metavar="FOLDER",
-        help="where the cloud is kept (default: %(default)s)",
-    )
-
-
-def add_network(parser: argparse.ArgumentParser) -> None:
-    """The options that a start remembers for the next one."""
-    network = f"an address of this machine, and names for it; remembered, until {NO}"
-    parser.add_argument("--listen", metavar="HOSTS", help=f"open broker and files to a network: {network}")
-    parser.add_argument("--page", metavar="HOSTS", help=f"open the page, with a password: {network}")
-    parser.add_argument(
-        "--power-cut",
-        choices=["0", "1"],
-        help="let what was acknowledged survive a power cut, too; remembered",
-    )
-    parser.add_argument(
-        "--ports",
-        choices=["any"],
-        help="at the first start take any free ports and leave the usual ones to another cloud; remembered",
-    )
-
-
 class _Kept:
-    def __init__(self, options: argparse.Namespace, stopped: threading.Event) -> None:
-        self._options, self._stopped = options, stopped
-        self._state = StateFolder(options.state, kept=True)
+    def __init__(self, given: argparse.Namespace, stopped: threading.Event) -> None:
+        self._given, self._stopped = given, stopped
+        self._state = StateFolder(given.state, kept=True)
         # Of this start, and of the first one.
         self._began, self._started_s = time.monotonic(), time.time()
 
@@ -159,7 +116,7 @@ class _Kept:
         renewed = time.monotonic()
         while not self._stopped.is_set():
             if embedded.emulator.wait(_LOOK_S) is not None:
-                raise _EmulatorError(f"the emulator has ended:\n{embedded.emulator.tail()}")
+                raise _EmulatorError(f"the emulator {embedded.emulator.ended()}:\n{embedded.emulator.tail()}")
             embedded.emulator.shorten_log(_MOST_LOG_BYTES)
             if time.monotonic() - renewed > _RENEW_S:
                 renewed = time.monotonic()
@@ -175,11 +132,11 @@ class _Kept:
 
     def _settings(self) -> dict[str, Any]:
         """The options, and what an earlier start remembers where they say nothing."""
-        options, known = self._options, self._state.settings()
-        given = {"listen": options.listen, "page": options.page}
-        found = {name: known.get(name, NO) if text is None else text for name, text in given.items()}
-        power_cut = known.get("power_cut", False) if options.power_cut is None else options.power_cut == "1"
-        any_ports = known.get("any_ports", False) or options.ports == "any"
+        given, known = self._given, self._state.settings()
+        hosts = {"listen": given.listen, "page": given.page}
+        found = {name: known.get(name, NO) if text is None else text for name, text in hosts.items()}
+        power_cut = known.get("power_cut", False) if given.power_cut is None else given.power_cut == "1"
+        any_ports = known.get("any_ports", False) or given.ports == "any"
         return {**found, "power_cut": power_cut, "any_ports": any_ports}
 
     def _write(self, embedded: EmbeddedCloud, page: Listen | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import getpass
 import os
 import subprocess
@@ -13,8 +12,9 @@ from string import Template
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.state import StateFolder
+from local.up import options
 from local.up.login import Password
-from local.up.run import NO, add_network, add_state
+from local.up.options import NO
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -47,40 +47,32 @@ WantedBy=$wanted
 
 def main() -> None:
     """Write the unit, and start it: a service of the machine for root, and of the user for others."""
-    parser = argparse.ArgumentParser(
-        prog="make up-service",
-        usage="make up-service [STATE=folder] [LISTEN=...] [PAGE=...] [POWER_CUT=1] [PORTS=any] [REMOVE=1]",
-        description="Run `make up` as a service of systemd.",
+    parser = options.parser(
+        "up-service", "Run `make up` as a service of systemd.", remembered=True, more="[REMOVE=1]"
     )
-    add_state(parser)
-    add_network(parser)
     parser.add_argument(
         "--remove", action="store_true", help="stop the service and remove it; the cloud is kept"
     )
     parser.add_argument("--print", action="store_true", help="print the unit, and change nothing")
-    options = parser.parse_args()
-    given = ["--state", str(options.state)]
-    for name in ("listen", "page", "power_cut", "ports"):
-        if getattr(options, name) is not None:
-            given += [f"--{name.replace('_', '-')}", getattr(options, name)]
+    given = parser.parse_args()
     of_machine = os.geteuid() == 0
-    text = unit(given, of_machine=of_machine)
+    text = unit(options.flags(given), of_machine=of_machine)
     try:
-        if options.print:
+        if given.print:
             _say(text)
-        elif options.remove:
+        elif given.remove:
             _remove(of_machine=of_machine)
         else:
             _check()
-            _make_password(options.state, options.page)
+            _make_password(given.state, given.page)
             _install(text, of_machine=of_machine)
     except LocalError as error:
         sys.exit(f"up-service: {error}")
 
 
-def unit(options: list[str], *, of_machine: bool) -> str:
+def unit(flags: list[str], *, of_machine: bool) -> str:
     """The text of the unit."""
-    command = [sys.executable, "-m", "local.up.run", *options]
+    command = [sys.executable, "-m", "local.up.run", *flags]
     return _UNIT.substitute(
         root=_quoted(str(ROOT), inner=True),
         command=" ".join(_quoted(one) for one in command),

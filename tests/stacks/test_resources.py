@@ -12,7 +12,7 @@ from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
-from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
+from iort_station.cost.bill.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import layers, name
 
 

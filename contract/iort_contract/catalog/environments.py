@@ -19,7 +19,6 @@ class Environment:
     namespace: str
 
     def variables(self) -> dict[str, str]:
-        """The variables as text."""
         return {one.name.upper(): _text(getattr(self, one.name)) for one in fields(self)}
 
     @classmethod
@@ -160,7 +159,6 @@ def _text(value: Any) -> str:
 
 
 def _value(kind: str, text: str) -> Any:
-    """The value of a field, by its annotation."""
     if kind == "bool":
         return text == "true"
     plain = {"str": str, "int": int, "float": float}.get(kind)

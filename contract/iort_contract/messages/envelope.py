@@ -15,13 +15,19 @@ M = TypeVar("M")
 _ENTRIES = {"t_us": T_US}
 
 
-def read(kind: type[M], envelope: Mapping[str, Any]) -> M:
-    """The message in an envelope; raises `ContractError`. A missing entry has its field's default."""
+def read(kind: type[M], envelope: Mapping[str, Any], **nested: Callable[[Any], Any]) -> M:
+    """The message in an envelope; raises `ContractError`. A missing entry has its field's default.
+
+    ``nested`` has the decoders of the fields that are messages themselves.
+    """
     found = {}
     for field in fields(kind):  # type: ignore[arg-type]  # a dataclass
         entry = _ENTRIES.get(field.name, field.name)
         if entry in envelope or (field.default is MISSING and field.default_factory is MISSING):
-            found[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
+            if field.name in nested:
+                found[field.name] = nested[field.name](envelope[entry])
+            else:
+                found[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
     return kind(**found)
 
 
@@ -34,7 +40,8 @@ def entries(message: Any) -> dict[str, Any]:
     }
 
 
-def _number(envelope: Mapping[str, Any], key: str) -> float:
+def number(envelope: Mapping[str, Any], key: str) -> float:
+    """An entry that is a number; raises `ContractError`."""
     value = envelope.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ContractError(f"{key} must be a number, got {shown(value)}")
@@ -55,7 +62,8 @@ def _names(envelope: Mapping[str, Any], key: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _object(envelope: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def mapping(envelope: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """An entry that is an object; raises `ContractError`."""
     value = envelope.get(key)
     if not isinstance(value, Mapping):
         raise ContractError(f"{key} must be an object, got {shown(value)}")
@@ -71,11 +79,11 @@ def _bytes(envelope: Mapping[str, Any], key: str) -> bytes:
 
 _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "int": integer,
-    "float": _number,
+    "float": number,
     "str": text,
     "bool": _flag,
     "bytes": _bytes,
     "tuple[str, ...]": _names,
-    "Mapping[str, Any]": _object,
-    "Mapping[str, int]": _object,
+    "Mapping[str, Any]": mapping,
+    "Mapping[str, int]": mapping,
 }

@@ -90,6 +90,7 @@ class RecordLane:
         self._sent_id = 0
         self._epoch = 0
         self._failures = 0
+        self._refusal = ""
         self._failed = False
         self._hold_until = 0.0
         self._acked = Rate(0, 0)
@@ -190,6 +191,7 @@ class RecordLane:
         """Wait longer after each failure in a row, with full jitter above a floor."""
         ceiling = min(_MAX_RETRY_S, _MIN_RETRY_S * 2 ** min(self._failures, _MAX_DOUBLINGS))
         self._failures += 1
+        self._refusal = str(error)
         delay = _MIN_RETRY_S + self._chance.random() * (ceiling - _MIN_RETRY_S)
         self._hold_until = self._clock.monotonic() + delay
         _log.warning(
@@ -199,7 +201,9 @@ class RecordLane:
 
     def _alarm(self, left: int) -> str:
         made, sent, limit = self._production.made, self._production.sent, Rate(*self._rate_limiter.rates)
-        if made.batches > limit.batches or made.payload_bytes > limit.payload_bytes:
+        if self._failures:
+            todo = self._refusal
+        elif made.batches > limit.batches or made.payload_bytes > limit.payload_bytes:
             todo = f"the limit allows {_text(limit)}: {TODO}"
         else:
             todo = f"the limit would allow {_text(limit)}: the network is too slow or loses messages"

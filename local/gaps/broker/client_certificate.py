@@ -3,7 +3,7 @@
 AWS: authenticates a client on port 8883 by its certificate
   (https://docs.aws.amazon.com/iot/latest/developerguide/x509-client-certs.html).
 ministack: serves a client without a certificate as its own account, without policies.
-Test: tests/local/robots/test_isolation.py::test_a_client_without_a_certificate_cannot_connect
+Test: tests/local/identity/test_isolation.py::test_a_client_without_a_certificate_cannot_connect
 Patch: none; ministack serves such clients on purpose, so upstream would have to agree on a switch first
 """
 

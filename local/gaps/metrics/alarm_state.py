@@ -5,7 +5,7 @@ AWS: evaluates the metric with the alarm's own dimensions. All the evaluation pe
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/AlarmThatSendsEmail.html).
 ministack: takes the points of every dimension together, over all periods at once, and keeps the last state
   when no data comes.
-Test: tests/local/data/test_metrics.py::test_an_alarm_needs_all_periods_and_its_own_dimensions
+Test: tests/local/operations/test_metrics.py::test_an_alarm_needs_all_periods_and_its_own_dimensions
 Patch: none; a patch would have to know every value of TreatMissingData, where ours know one
 """
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from ministack.services import cloudwatch
@@ -25,7 +26,7 @@ _BELOW = {"LessThanThreshold": False, "LessThanOrEqualToThreshold": True}
 
 def install() -> None:
     """Close the gap in this process."""
-    cloudwatch._evaluate_alarm = evaluate
+    cloudwatch._evaluate_alarm = partial(evaluate, since_s=time.time())
 
 
 def is_open() -> bool:
@@ -47,11 +48,18 @@ def is_open() -> bool:
     return alarm["StateValue"] != "OK"
 
 
-def evaluate(alarm: dict[str, Any]) -> None:
-    """Set the state of an alarm by the periods up to now, and run its actions if it has changed."""
-    before = alarm["StateValue"]
-    after = "ALARM" if breaching(alarm, time.time()) else "OK"
+def evaluate(alarm: dict[str, Any], *, since_s: float = 0.0) -> None:
+    """Set the state of an alarm by the periods up to now, and run its actions if it has changed.
+
+    Points from before ``since_s`` are lost: an alarm that was raised before stays for as long as they could
+    have kept it.
+    """
+    before, now_s = alarm["StateValue"], time.time()
+    after = "ALARM" if breaching(alarm, now_s) else "OK"
     if before == after:
+        return
+    period, count = _periods(alarm)
+    if before == "ALARM" and alarm["StateUpdatedTimestamp"] < since_s and now_s < since_s + period * count:
         return
     reason = f"{alarm['MetricName']} {alarm['ComparisonOperator']} {alarm['Threshold']}: {after}"
     alarm |= {"StateValue": after, "StateReason": reason, "StateUpdatedTimestamp": int(time.time())}
@@ -61,7 +69,7 @@ def evaluate(alarm: dict[str, Any]) -> None:
 
 def breaching(alarm: Mapping[str, Any], now_s: float) -> bool:
     """Whether all of the last periods are beyond the threshold, with or without the current one."""
-    period, count = int(alarm.get("Period") or 60), int(alarm.get("EvaluationPeriods") or 1)
+    period, count = _periods(alarm)
     dimensions = {d["Name"]: d["Value"] for d in alarm.get("Dimensions") or []}
     key = (alarm.get("Namespace"), alarm.get("MetricName"), cloudwatch._dims_key(dimensions))
     buckets: dict[int, list[Any]] = defaultdict(list)
@@ -82,3 +90,8 @@ def breaching(alarm: Mapping[str, Any], now_s: float) -> bool:
 
     now = int(now_s // period)
     return any(all(over(last - i) for i in range(count)) for last in (now, now - 1))
+
+
+def _periods(alarm: Mapping[str, Any]) -> tuple[int, int]:
+    """The seconds of a period, and how many are evaluated."""
+    return int(alarm.get("Period") or 60), int(alarm.get("EvaluationPeriods") or 1)

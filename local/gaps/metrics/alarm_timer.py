@@ -3,7 +3,7 @@
 AWS: evaluates an alarm once a period, whether data comes or not
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/AlarmThatSendsEmail.html).
 ministack: evaluates alarms only when somebody puts data, changes or describes one.
-Test: tests/local/data/test_eyes.py::test_a_fault_reaches_a_human_and_the_dashboards
+Test: tests/local/operations/test_eyes.py::test_a_fault_reaches_a_human_and_the_dashboards
 Patch: none; ministack has no clock of its own
 """
 

@@ -3,7 +3,7 @@
 AWS: makes metrics of log lines in the embedded metric format
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/CloudWatch_Embedded_Metric_Format_Specification.html).
 ministack: stores the lines as text only.
-Test: tests/local/data/test_metrics.py::test_a_printed_metric_line_is_recorded
+Test: tests/local/operations/test_metrics.py::test_a_printed_metric_line_is_recorded
 Patch: none; it needs ministack's own store to merge the values of a minute, or memory grows with every line
 """
 

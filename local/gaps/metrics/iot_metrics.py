@@ -3,7 +3,7 @@
 AWS: counts connections, messages, and the matches and actions of rules
   (https://docs.aws.amazon.com/iot/latest/developerguide/metrics_dimensions.html).
 ministack: counts none of them.
-Test: tests/local/data/test_eyes.py::test_a_fault_reaches_a_human_and_the_dashboards
+Test: tests/local/operations/test_eyes.py::test_a_fault_reaches_a_human_and_the_dashboards
 Patch: none; it needs ministack's own store to merge the values of a minute, or memory grows with every
   message
 """

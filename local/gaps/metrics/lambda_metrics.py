@@ -3,7 +3,7 @@
 AWS: counts every invocation, for each function and for the account
   (https://docs.aws.amazon.com/lambda/latest/dg/monitoring-metrics-types.html).
 ministack: counts synchronous invocations only, and has neither concurrency nor the age of a stream's records.
-Test: tests/local/data/test_metrics.py::test_an_invocation_is_counted
+Test: tests/local/operations/test_metrics.py::test_an_invocation_is_counted
 Patch: none; it needs ministack's own store to merge the values of a minute, or memory grows with every
   invocation
 """

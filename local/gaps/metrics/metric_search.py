@@ -3,7 +3,7 @@
 AWS: finds the metrics that match, and answers each
   (https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/search-expression-syntax.html).
 ministack: answers that expressions are not implemented.
-Test: tests/local/data/test_metrics.py::test_a_search_finds_a_metric_of_any_action_type
+Test: tests/local/operations/test_metrics.py::test_a_search_finds_a_metric_of_any_action_type
 Patch: none; only the form of SEARCH that our dashboards use is understood here
 """
 

@@ -3,7 +3,7 @@
 AWS: counts the messages that wait in each queue, every minute
   (https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-available-cloudwatch-metrics.html).
 ministack: does not count them.
-Test: tests/local/data/test_metrics.py::test_waiting_messages_are_counted
+Test: tests/local/operations/test_metrics.py::test_waiting_messages_are_counted
 Patch: none; ministack has no clock that could count
 """
 

@@ -52,11 +52,9 @@ class Keys:
         return True
 
     def let_go(self) -> None:
-        """Let go of all keys."""
         self._until_us = 0
 
     def held(self, now_us: int) -> bool:
-        """Whether a key is held."""
         return now_us < self._until_us
 
     def stick(self, now_us: int) -> Stick:

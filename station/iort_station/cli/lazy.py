@@ -22,7 +22,6 @@ class Verb(TyperCommand):
         self._module = f"{verbs.__name__}.{file}"
 
     def load(self) -> Any:
-        """Import the command."""
         # A group of its own gives the command its name, and no options for completion.
         group = typer.Typer(add_completion=False, rich_markup_mode=None)
         group.add_typer(import_module(self._module).commands)

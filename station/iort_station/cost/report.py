@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from iort_station.cost import analysing, archiving, line_items, model
-from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost.bill import analysing, archiving, line_items, model
+from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import PRODUCTS, Listed
 from iort_station.cost.prices import AS_OF, PRICES, REGION, Price
 from iort_station.cost.scale import Scale

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from iort_contract.cloud import PUBNUB
-from iort_station.cost.line_items import dollars_per_month, total
-from iort_station.cost.model import SUBSCRIPTIONS, bill, pubnub_bill
+from iort_station.cost.bill.line_items import dollars_per_month, total
+from iort_station.cost.bill.model import SUBSCRIPTIONS, bill, pubnub_bill
 from iort_station.cost.prices import PRICES, QUOTAS, Price, Quota
 from iort_station.cost.sizes import sizes_of
 from iort_station.cost.usage import Usage

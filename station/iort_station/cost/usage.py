@@ -94,17 +94,14 @@ class Usage:
 
     @property
     def batches_per_s(self) -> float:
-        """Batches a second of a robot's sources."""
         return self.streams * self.stream_batches_per_s
 
     @property
     def samples_per_s(self) -> float:
-        """Samples a second of a robot's sources."""
         return self.streams * self.rate_hz
 
     @property
     def stream_batches_per_s(self) -> float:
-        """Batches a second of one stream."""
         return min(self.rate_hz, max(1.0, 1 / self.batch_s)) if self.batch_s else self.rate_hz
 
     @property
@@ -116,7 +113,6 @@ class Usage:
 
     @property
     def own_streams(self) -> int:
-        """The agent's own streams."""
         return bool(self.agent_every_s) + 1 + bool(self.ping_hz)
 
     @property

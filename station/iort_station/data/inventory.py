@@ -16,9 +16,9 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.tables import STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Recorded
 from iort_station.data.reports import last_reports
 from iort_station.data.selection import Selection
+from iort_station.data.stored.recorded import Recorded
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import registry

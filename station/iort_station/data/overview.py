@@ -11,9 +11,11 @@ from iort_contract.messages.analysis.insights import Extent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import has_fraction
-from iort_station.data.recorded import Origin
 from iort_station.data.runs import runs
+from iort_station.data.stored.recorded import Origin
 from iort_station.data.units import unit
+
+_MOST_RUNS = 100
 
 
 @dataclass(frozen=True)
@@ -30,16 +32,14 @@ class StreamOverview:
     fields: Mapping[str, str]
 
 
-def overview(
-    cloud: Cloud, robot: str, *, count: int = 100, origin: Origin | None = None
-) -> list[StreamOverview]:
-    """The robot's streams, the agent's own ones last; at most ``count`` runs are counted.
+def overview(cloud: Cloud, robot: str, *, origin: Origin | None = None) -> list[StreamOverview]:
+    """The robot's streams, the agent's own ones last; at most `_MOST_RUNS` runs are counted.
 
     It reads the newest batch of each stream, and for each run what `runs` reads. ``origin`` learns
     which hours of the archive that was. Raises `StationError` for an unknown robot.
     """
     streams = sorted(inventory.check_recorded(cloud, robot), key=lambda name: (name in OWN_STREAMS, name))
-    found = runs(cloud, robot, streams=streams, count=count, origin=origin)
+    found = runs(cloud, robot, streams=streams, count=_MOST_RUNS, origin=origin)
     kinds = {kind.stream: kind for _, kind in inventory.types_of(cloud, robot)}
     told = []
     for stream in streams:

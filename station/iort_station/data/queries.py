@@ -20,10 +20,10 @@ from iort_contract.messages.message_type import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
-from iort_station.data.batches import PageProgress
 from iort_station.data.conditions import derive, holds
-from iort_station.data.recorded import AUTO, TABLE, Origin, Recorded, Source
 from iort_station.data.selection import Selection, select
+from iort_station.data.stored.batches import PageProgress
+from iort_station.data.stored.recorded import AUTO, TABLE, Origin, Recorded, Source
 from iort_station.data.summary import in_column_order, seconds
 from iort_station.data.units import unit
 from iort_station.errors import StationError

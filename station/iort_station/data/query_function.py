@@ -25,8 +25,8 @@ from iort_contract.messages.requests.query import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress
 from iort_station.data.selection import Selection
+from iort_station.data.stored.batches import PageProgress
 from iort_station.errors import StationError
 
 _DOWNLOAD_S = 60

@@ -12,7 +12,7 @@ from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Recorded
+from iort_station.data.stored.recorded import Recorded
 
 
 def last_reports(cloud: Cloud, robot: str) -> Iterator[Item]:

@@ -26,7 +26,7 @@ from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.recorded import Origin, Recorded
+from iort_station.data.stored.recorded import Origin, Recorded
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
@@ -42,7 +42,6 @@ class Part(NamedTuple):
 
     @property
     def extent(self) -> Extent:
-        """Its times."""
         return {"from_us": self.first.t_us, "to_us": self.to_us}
 
 

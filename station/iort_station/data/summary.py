@@ -30,10 +30,10 @@ from iort_contract.tables import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress, Pages, ahead, summary_table, topic_of
 from iort_station.data.conditions import derive, holds
-from iort_station.data.recorded import AUTO, Origin, Recorded, Source, only
 from iort_station.data.selection import Selection
+from iort_station.data.stored.batches import PageProgress, Pages, ahead, summary_table, topic_of
+from iort_station.data.stored.recorded import AUTO, Origin, Recorded, Source, only
 from iort_station.errors import unknown
 
 _SECOND_US = 1_000_000

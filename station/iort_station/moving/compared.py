@@ -14,8 +14,8 @@ from iort_contract.archive import content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
-from iort_station.data.archive import key_of
-from iort_station.data.recorded import HEADER, Recorded
+from iort_station.data.stored.archive import key_of
+from iort_station.data.stored.recorded import HEADER, Recorded
 from iort_station.moving.recorded import BatchProgress
 from iort_station.operations.delivery.audit import Audit, audit
 

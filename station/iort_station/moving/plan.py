@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from iort_contract.tables import MOVED_FROM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.archive import Archive
-from iort_station.data.batches import topic_of
+from iort_station.data.stored.archive import Archive
+from iort_station.data.stored.batches import topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
@@ -64,9 +64,8 @@ def _place(cloud: Cloud) -> tuple[str, ...]:
 
 
 def origin(cloud: Cloud) -> str:
-    """The name of a deployment in the rows of robots that came from it."""
-    who = cloud.access_key_id or _place(cloud)[0]
-    return f"{who} {cloud.output('storage', 'RobotsTable')}"
+    """The name of a deployment in the rows of robots that came from it: no two buckets have one name."""
+    return cloud.output("storage", "FilesBucket")
 
 
 def plan(source: Cloud, target: Cloud, names: Sequence[str], *, same_robots: bool = False) -> list[Plan]:

@@ -9,8 +9,8 @@ from iort_analysis.samples.batches import Item
 from iort_contract.dynamodb import WRITE_ITEMS, Keys
 from iort_contract.tables import BATCH, EXPIRES_S
 from iort_station.cloud import Cloud
-from iort_station.data.archive import key_of
-from iort_station.data.batches import ahead, telemetry_table
+from iort_station.data.stored.archive import key_of
+from iort_station.data.stored.batches import ahead, telemetry_table
 from iort_station.recordings.adopt import UNITS_PER_S, write
 
 # Receives the number of batches read.

@@ -31,8 +31,8 @@ from iort_contract.tables import BATCH, SAMPLES, TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.archive import Archive
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.stored.archive import Archive
+from iort_station.data.stored.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 

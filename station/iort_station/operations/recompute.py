@@ -23,9 +23,9 @@ from iort_contract.tables import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
-from iort_station.data.batches import PageProgress
-from iort_station.data.recorded import TABLE, Recorded
 from iort_station.data.selection import Selection
+from iort_station.data.stored.batches import PageProgress
+from iort_station.data.stored.recorded import TABLE, Recorded
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
 

@@ -33,7 +33,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import RECORD
 from iort_station.cloud import Cloud
-from iort_station.data.batches import telemetry_table
+from iort_station.data.stored.batches import telemetry_table
 from iort_station.errors import StationError
 from iort_station.operations.quarantine import DeadLetter, key, load
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item

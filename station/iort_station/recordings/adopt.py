@@ -20,7 +20,7 @@ from iort_contract.messages.batch import Batch, decode_item
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, T_US, TOPIC
 from iort_contract.topics import RECORD, Topic, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.batches import ahead
+from iort_station.data.stored.batches import ahead
 from iort_station.errors import StationError
 from iort_station.recordings.old_batches import is_old, upgraded_item
 

@@ -10,9 +10,9 @@ from iort_contract.messages.message_type import MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress
-from iort_station.data.recorded import Origin
 from iort_station.data.selection import Selection
+from iort_station.data.stored.batches import PageProgress
+from iort_station.data.stored.recorded import Origin
 from iort_station.fleet import files
 from iort_station.recordings import messages
 from iort_station.recordings.published import Export

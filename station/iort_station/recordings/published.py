@@ -14,9 +14,9 @@ from iort_contract.messages.message_type import MessageType
 from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data.batches import PageProgress
-from iort_station.data.recorded import Origin, Recorded
 from iort_station.data.selection import Selection
+from iort_station.data.stored.batches import PageProgress
+from iort_station.data.stored.recorded import Origin, Recorded
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
 Content = Callable[[str], "bytes | None"]

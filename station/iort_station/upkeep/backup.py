@@ -53,7 +53,6 @@ class Manifest:
 
     @property
     def size(self) -> int:
-        """The bytes of all files."""
         return sum(entry.size for entry in self.files.values())
 
 
@@ -65,11 +64,9 @@ class Hashing(io.RawIOBase):
         self.size, self._hash = 0, hashlib.sha256()
 
     def readable(self) -> bool:
-        """Always."""
         return True
 
     def readinto(self, buffer: ReadableBuffer, /) -> int:
-        """Read, and count."""
         view = memoryview(buffer)
         data = self._file.read(len(view))
         view[: len(data)] = data

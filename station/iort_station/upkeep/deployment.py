@@ -36,7 +36,7 @@ class Load(NamedTuple):
 def findings(cloud: Cloud, busy: float | None = None) -> Iterator[Finding]:
     """Look at everything; ends at stacks that cannot be read.
 
-    ``busy`` is the share of its time in which the busiest part of an embedded cloud is busy.
+    ``busy`` is the share of what an embedded cloud's machine takes that it has to do now.
     """
     try:
         function = cloud.output("processing", "SummarizeFunction")

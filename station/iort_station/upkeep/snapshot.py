@@ -36,7 +36,6 @@ class Snapshot(NamedTuple):
     databases: dict[str, sqlite3.Connection]
 
     def size(self) -> int:
-        """The bytes of everything."""
         sizes = (_pragma(one, "page_count") * _pragma(one, "page_size") for one in self.databases.values())
         return sum(path.stat().st_size for path in self.files.values()) + sum(sizes)
 

@@ -17,7 +17,7 @@ from iort_station import data
 from iort_station.operations import quarantine
 from iort_station.operations.delivery import counts
 from tests.local.conftest import until
-from tests.unit.station.old_messages import old_envelope, old_message
+from tests.unit.station.recordings.old_messages import old_envelope, old_message
 from verify.tools.robot import Robot
 
 RUN = "0badcafe"

@@ -13,7 +13,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.stored.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
 from iort_station.operations.delivery import audit

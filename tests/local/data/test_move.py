@@ -9,8 +9,9 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -26,7 +27,7 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data.analysis import notes
-from iort_station.data.batches import telemetry_table, topic_of
+from iort_station.data.stored.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry, robots, tags
 from iort_station.fleet.control import shadow
@@ -37,7 +38,7 @@ from iort_station.operations import archive, quarantine
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.proxy import REFUSE, Proxy
+from local.network.proxy import REFUSE, Proxy
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
 from tests.local.data.test_archive import HOUR_US, START, stored
@@ -55,7 +56,34 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedCloud]:
         yield cloud
 
 
-def iort(cloud: EmbeddedCloud, *arguments: str) -> Any:
+class Side(NamedTuple):
+    """A cloud as somebody sees it who has only the rights that docs/how-to/move.md lists."""
+
+    folder: Path
+    user: str
+
+
+@pytest.fixture(scope="module")
+def movers(
+    embedded: EmbeddedCloud, other: EmbeddedCloud, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Side, Side]:
+    """The source and the target."""
+    folders = [tmp_path_factory.mktemp(name) for name in ("source", "target")]
+    return limited(embedded, "source", folders[0]), limited(other, "target", folders[1])
+
+
+def limited(side: EmbeddedCloud, name: str, folder: Path) -> Side:
+    iam, user = side.cloud.client("iam"), f"mover-{name}"
+    iam.create_user(UserName=user)
+    policy = (ROOT / "docs/examples" / f"move-{name}.json").read_text()
+    iam.put_user_policy(UserName=user, PolicyName="move", PolicyDocument=policy)
+    key = iam.create_access_key(UserName=user)["AccessKey"]
+    whose = {"access_key_id": key["AccessKeyId"], "secret_access_key": key["SecretAccessKey"]}
+    replace(side.cloud, **whose).save(folder / EMBEDDED.name)
+    return Side(folder, user)
+
+
+def iort(cloud: EmbeddedCloud | Side, *arguments: str) -> Any:
     where = ["--local", "--embedded", str(cloud.folder / EMBEDDED.name)]
     return CliRunner().invoke(app, [*where, *arguments])
 
@@ -82,7 +110,11 @@ def upload(cloud: Cloud, content: bytes) -> str:
 
 
 def test_a_robot_moves_with_everything_that_it_has_recorded(
-    embedded: EmbeddedCloud, other: EmbeddedCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    embedded: EmbeddedCloud,
+    other: EmbeddedCloud,
+    movers: tuple[Side, Side],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     source, target = embedded.cloud, other.cloud
     robots.add(source, ROBOT, out=tmp_path / "source", vehicle=VEHICLE)
@@ -103,7 +135,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     assert len(before) == 61 * 50
 
     def moved(*options: str) -> tuple[int, dict[str, Any]]:
-        done = iort(embedded, "move", ROBOT, "--to", str(other.folder), "--json", *options)
+        done = iort(movers[0], "move", ROBOT, "--to", str(movers[1].folder), "--json", *options)
         told = {one["stream"]: one for one in json.loads(done.stdout)["streams"]}
         return done.exit_code, told[STREAM]
 
@@ -128,7 +160,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     for module, name, instead in parts:
         with monkeypatch.context() as patch:
             patch.setattr(module, name, instead)
-            done = iort(embedded, "move", ROBOT, "--to", str(other.folder), *bundles)
+            done = iort(movers[0], "move", ROBOT, "--to", str(movers[1].folder), *bundles)
             assert (done.exit_code, str(done.exception)) == (1, "the network is gone")
     exit_code, told = moved(*bundles)
     assert (exit_code, told["problem"], told["copied_hours"], told["copied_batches"]) == (0, "", 0, 0)
@@ -152,7 +184,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
 
 
 def test_a_robot_moves_with_everything_that_is_known_of_it(
-    embedded: EmbeddedCloud, other: EmbeddedCloud, tmp_path: Path
+    embedded: EmbeddedCloud, other: EmbeddedCloud, movers: tuple[Side, Side], tmp_path: Path
 ) -> None:
     robot, source, target = "known", embedded.cloud, other.cloud
     robots.add(source, robot, out=tmp_path / "source", vehicle=VEHICLE)
@@ -163,7 +195,9 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     source.client("dynamodb").put_item(TableName=source.output("storage", "QuarantineTable"), Item=letter)
 
     def move() -> None:
-        done = iort(embedded, "move", robot, "--to", str(other.folder), "--bundles", str(tmp_path / "new"))
+        done = iort(
+            movers[0], "move", robot, "--to", str(movers[1].folder), "--bundles", str(tmp_path / "new")
+        )
         assert done.exit_code == 0, done.stdout
 
     def desired() -> dict[str, Any]:
@@ -274,3 +308,13 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     first = {batch.seq for batch in counts.batches(target, robot, STREAM) if batch.boot in boots}
     assert first == set(range(len(first)))
     assert len(first) > len(there)
+
+
+def test_who_lacks_a_right_is_told_where_they_are_listed(
+    embedded: EmbeddedCloud, other: EmbeddedCloud, tmp_path: Path
+) -> None:
+    robots.add(embedded.cloud, "kept-out", out=tmp_path / "car")
+    reader = limited(other, "source", tmp_path)
+    refused = str(iort(embedded, "move", "kept-out", "--to", str(reader.folder)).exception)
+    assert "dynamodb:PutItem" in refused
+    assert "docs/how-to/move.md lists the rights" in refused

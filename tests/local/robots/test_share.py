@@ -15,7 +15,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
-from iort_station.data.batches import summary_table, topic_of
+from iort_station.data.stored.batches import summary_table, topic_of
 from iort_station.fleet.control import shadow
 from iort_station.operations.delivery import counts
 from tests.local.conftest import until

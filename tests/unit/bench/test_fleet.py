@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from bench.fleet import look_for
-from bench.load.fleet_load import laps
+from bench.load.fleet.generator import laps
 
 
 @pytest.mark.parametrize(("limit", "first"), [(137, 200), (640, 50), (1, 50), (0, 4)])

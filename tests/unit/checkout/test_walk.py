@@ -23,7 +23,7 @@ from iort_station.page.answers.history import history
 from tests.fakes import TELEMETRY, item_of_message, record_of
 from tests.ros1_types import Message, header
 from tests.unit.functions.summary.summarizing import Stream
-from tests.unit.station.test_data import cloud_of
+from tests.unit.station.data.test_data import cloud_of
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDERS = ("contract", "device", "analysis", "functions", "station")

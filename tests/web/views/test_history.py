@@ -21,7 +21,7 @@ from iort_station.page.server import PageServer
 from tests.archived import FakeS3, archive, expire
 from tests.browser import plain, until
 from tests.fakes import TELEMETRY, item_of
-from tests.unit.station.test_data import START, cloud_of
+from tests.unit.station.data.test_data import START, cloud_of
 from tests.web.cars import GAIN, SUBSCRIBE_KEY
 
 if TYPE_CHECKING:

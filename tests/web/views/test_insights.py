@@ -9,8 +9,8 @@ import pytest
 from iort_station.page.answers import laps
 from iort_station.page.server import PageServer
 from tests.browser import plain, until
-from tests.unit.station.test_data import START
-from tests.unit.station.test_laps import driven_cloud
+from tests.unit.station.analysis.test_laps import driven_cloud
+from tests.unit.station.data.test_data import START
 from tests.web.cars import SUBSCRIBE_KEY
 from tests.web.insights import insights
 from tests.web.lab import Lab

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Mapping, NamedTuple
 
-from iort_contract.checks import integer, shown, text
+from iort_contract.checks import shown, text
 from iort_contract.limits import ContractError
+from iort_contract.messages.envelope import number, read
 
 # The share of repetitions in which an estimate's interval holds the truth.
 INTERVAL = 0.9
@@ -77,23 +79,12 @@ def encode_finding(finding: Finding) -> dict[str, Any]:
 
 def decode_finding(content: Mapping[str, Any]) -> Finding:
     """Decode a finding; raises `ContractError`."""
-    fields = content.get("fields")
-    if not isinstance(fields, list) or not all(isinstance(name, str) for name in fields):
-        raise ContractError(f"fields must be a list of names, got {shown(fields)}")
-    return Finding(
-        drive=DriveKey(text(content, "robot"), integer(content, "start_us"), text(content, "run")),
-        kind=text(content, "kind"),
-        severity=text(content, "severity"),
-        subject=text(content, "subject"),
-        from_us=integer(content, "from_us"),
-        to_us=integer(content, "to_us"),
-        stream=text(content, "stream"),
-        fields=tuple(fields),
-        text=text(content, "text"),
-        effect=decode_estimate(content["effect"]) if "effect" in content else None,
-        baseline=decode_estimate(content["baseline"]) if "baseline" in content else None,
-        p=_number(content, "p") if "p" in content else None,
-        q=_number(content, "q") if "q" in content else None,
+    return read(
+        Finding,
+        {**content, "drive": content},
+        drive=partial(read, DriveKey),
+        effect=decode_estimate,
+        baseline=decode_estimate,
     )
 
 
@@ -106,12 +97,5 @@ def decode_estimate(content: Any) -> Estimate:
     """Decode an estimate; raises `ContractError`."""
     if not isinstance(content, Mapping):
         raise ContractError(f"estimate must be an object, got {shown(content)}")
-    value, low, high = (_number(content, name) for name in ("value", "low", "high"))
+    value, low, high = (float(number(content, name)) for name in ("value", "low", "high"))
     return Estimate(value, low, high, text(content, "unit"))
-
-
-def _number(content: Mapping[str, Any], name: str) -> float:
-    value = content.get(name)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ContractError(f"{name} must be a number, got {shown(value)}")
-    return float(value)

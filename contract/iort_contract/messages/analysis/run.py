@@ -8,6 +8,7 @@ from typing import Any, Mapping
 from iort_contract.checks import integer, shown, text
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.findings import DriveKey, Estimate, decode_estimate, encode_estimate
+from iort_contract.messages.envelope import mapping, read
 from iort_contract.topics import check_robot, check_stream
 
 # The longest range of one run.
@@ -103,15 +104,10 @@ def encode_planned(planned: PlannedDrive) -> dict[str, Any]:
 
 def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
     """Decode a drive to analyse; raises `ContractError`."""
-    streams = content.get("streams")
-    if not isinstance(streams, list):
-        raise ContractError(f"streams must be a list of names, got {shown(streams)}")
-    return PlannedDrive(
-        _drive(content),
-        integer(content, "end_us"),
-        tuple(map(check_stream, streams)),
-        text(content, "motion"),
-    )
+    planned = read(PlannedDrive, {**content, "drive": content}, drive=_drive)
+    for stream in planned.streams:
+        check_stream(stream)
+    return planned
 
 
 def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
@@ -131,19 +127,13 @@ def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
         end_us=integer(content, "end_us"),
         job=text(content, "job"),
         samples=integer(content, "samples"),
-        estimates={name: decode_estimate(one) for name, one in _object(content, "estimates").items()},
-        missing={name: str(reason) for name, reason in _object(content, "missing").items()},
-        repairs={name: integer(_object(content, "repairs"), name) for name in _object(content, "repairs")},
+        estimates={name: decode_estimate(one) for name, one in mapping(content, "estimates").items()},
+        missing={name: str(reason) for name, reason in mapping(content, "missing").items()},
+        repairs={name: integer(mapping(content, "repairs"), name) for name in mapping(content, "repairs")},
         analysed_us=integer(content, "analysed_us") if "analysed_us" in content else 0,
     )
 
 
 def _drive(content: Mapping[str, Any]) -> DriveKey:
-    return DriveKey(check_robot(text(content, "robot")), integer(content, "start_us"), text(content, "run"))
-
-
-def _object(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = content.get(name)
-    if not isinstance(value, Mapping):
-        raise ContractError(f"{name} must be an object, got {shown(value)}")
-    return value
+    check_robot(text(content, "robot"))
+    return read(DriveKey, content)

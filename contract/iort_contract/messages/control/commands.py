@@ -54,7 +54,6 @@ class Command:
 
     @property
     def order(self) -> tuple[int, str, int]:
-        """The key by which commands are ordered."""
         return (self.started_us, self.session, self.seq)
 
 

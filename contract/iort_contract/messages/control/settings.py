@@ -27,11 +27,9 @@ class Flag:
 
     @property
     def allowed(self) -> str:
-        """The values in words."""
         return "true or false"
 
     def accepts(self, value: Any) -> bool:
-        """Whether this is one of them."""
         return isinstance(value, bool)
 
 
@@ -45,11 +43,9 @@ class Number:
 
     @property
     def allowed(self) -> str:
-        """The values in words."""
         return f"a number from {self.low:g} to {self.high:g} ({self.unit})"
 
     def accepts(self, value: Any) -> bool:
-        """Whether this is one of them."""
         return (
             not isinstance(value, bool) and isinstance(value, (int, float)) and self.low <= value <= self.high
         )
@@ -63,11 +59,9 @@ class Choice:
 
     @property
     def allowed(self) -> str:
-        """The values in words."""
         return f"one of {', '.join(self.names)}"
 
     def accepts(self, value: Any) -> bool:
-        """Whether this is one of them."""
         return value in self.names
 
 

@@ -15,9 +15,9 @@ from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.analysis.findings import DriveKey
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.batches import PageProgress
 from iort_station.data.queries import query
 from iort_station.data.runs import runs
+from iort_station.data.stored.batches import PageProgress
 
 
 class RunLaps(NamedTuple):

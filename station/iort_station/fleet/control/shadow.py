@@ -79,7 +79,6 @@ class Shadow:
         self.data = cloud.client("iot-data")
 
     def read(self) -> State:
-        """The shadow's current state."""
         return read(self.data, self.robot)
 
     def desire(self, wanted: Mapping[str, Any]) -> None:

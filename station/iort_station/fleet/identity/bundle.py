@@ -23,7 +23,6 @@ class Bundle:
 
     @property
     def config(self) -> Path:
-        """The agent's configuration."""
         return self.folder / "car.yaml"
 
 

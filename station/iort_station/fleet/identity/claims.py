@@ -38,14 +38,13 @@ def claim(
     robot: str | None,
     *,
     out: Path,
-    vehicle: Mapping[str, float] = F1TENTH,
     lasting: bool = False,
 ) -> Path:
     """Write a claim into ``out``, which `iort-agent provision` or `renew` exchanges for a certificate.
 
-    It is valid for five minutes and for ``robot``. A new robot is registered with its ``vehicle`` parameters;
-    a registered one is opened for another certificate. A ``lasting`` claim is valid until it is revoked, for
-    many robots (``robot`` None) with the names of `register`.
+    It is valid for five minutes and for ``robot``. A new robot is registered as an F1TENTH car; a registered
+    one is opened for another certificate. A ``lasting`` claim is valid until it is revoked, for many robots
+    (``robot`` None) with the names of `register`.
 
     Raises `StationError` for an invalid name, and for a deployment without the template.
     """
@@ -54,7 +53,7 @@ def claim(
     if robot is not None:
         settings["robot"] = registry.checked(robot)
         if registry.find(cloud, robot) is None:
-            registry.enter(cloud, robot, vehicle)
+            registry.enter(cloud, robot, F1TENTH)
         settings.update(_serial_of(iot, robot))
     try:
         if lasting:

@@ -18,7 +18,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Origin, Recorded, only
+from iort_station.data.stored.recorded import Origin, Recorded, only
 
 # A batch is late if it took this much longer to arrive than the run's fastest one. It spans a second, and
 # arrives within milliseconds if nothing delays it.
@@ -44,7 +44,6 @@ class Missing(NamedTuple):
 
     @property
     def batches(self) -> int:
-        """The number of batches."""
         return self.last - self.first + 1
 
 

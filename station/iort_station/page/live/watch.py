@@ -39,7 +39,6 @@ class Car:
         return "stale" if now_us - self.taken_us > (self.silent_s + STALE_S) * 1e6 else "online"
 
     def age_s(self, now_us: int) -> float:
-        """The age of the newest value."""
         return max(0.0, (now_us - self.taken_us) / 1e6)
 
     def number(self, name: str) -> float | None:

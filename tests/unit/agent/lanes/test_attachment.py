@@ -29,7 +29,7 @@ from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import Messages, RosMessage, RosType, filled
 from tests.agent_fakes import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
-from tests.unit.contract.ros1_messages import text, u32
+from tests.unit.contract.ros1.ros1_messages import text, u32
 
 T_US = 1_700_000_000_123_456
 PICTURE = jpeg()

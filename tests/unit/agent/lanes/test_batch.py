@@ -19,7 +19,7 @@ from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_o
 from iort_contract.ros1.message import RosMessage, RosType
 from tests.agent_fakes import ManualClock
 from tests.examples import examples
-from tests.unit.contract.ros1_messages import text
+from tests.unit.contract.ros1.ros1_messages import text
 
 T0 = 1_700_000_000_000_000
 BOOT = "0123456789abcdef"

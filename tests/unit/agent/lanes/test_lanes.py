@@ -324,6 +324,14 @@ def test_too_much_for_one_connection_raises_an_alarm_with_advice(caplog: pytest.
     assert drive.status()["alarms"] == []
 
 
+def test_the_alarm_has_the_reason_of_a_broker_that_refuses() -> None:
+    drive = Drive(topics(10, 20))
+    drive.uplink.verdict = lambda message: "the broker says quota exceeded" if message.qos else None
+    drive.run(30)
+    (alarm,) = drive.status()["alarms"]
+    assert alarm.endswith("; the broker says quota exceeded")
+
+
 def test_the_alarm_tells_a_slow_network_from_the_limit() -> None:
     drive = Drive(topics(10, 20))
     drive.rtt_s = 20

@@ -14,7 +14,7 @@ from iort_agent.ros1.json_message import Writer, decode
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
 from tests.rosbridge_json import as_rosbridge
-from tests.unit.contract.ros1_values import HEADER, by_rosbags, definitions, values
+from tests.unit.contract.ros1.ros1_values import HEADER, by_rosbags, definitions, values
 
 pytest.importorskip("rosbags")
 

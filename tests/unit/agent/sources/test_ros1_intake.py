@@ -17,7 +17,7 @@ from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.message import RosMessage
 from tests.agent_fakes import ManualClock
-from tests.unit.contract.ros1_messages import LINE, STAMPED, header, u32
+from tests.unit.contract.ros1.ros1_messages import LINE, STAMPED, header, u32
 
 T0 = 1_700_000_000_000_000
 CONNECTION = {"type": "a_msgs/A", "md5sum": "1", "message_definition": STAMPED + "uint8 u"}

@@ -12,7 +12,7 @@ from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, md5sum, parse
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.control.downlink_rig import POSE
-from tests.unit.contract.ros1_values import HEADER, definitions, text_of
+from tests.unit.contract.ros1.ros1_values import HEADER, definitions, text_of
 
 RULE = "=" * 80
 STATUS = """# what it is

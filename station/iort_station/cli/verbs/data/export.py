@@ -37,8 +37,8 @@ def export(
     """
     # numpy takes longer to load than most commands to run.
     from iort_station.data.inventory import check_there  # noqa: PLC0415 - see above
-    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.data.selection import select  # noqa: PLC0415 - as above
+    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
     from iort_station.recordings.export import write  # noqa: PLC0415 - as above
 

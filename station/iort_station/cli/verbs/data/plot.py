@@ -73,7 +73,7 @@ def plot(
     """
     # Together they take longer to load than most commands to run.
     from iort_station.cli import plots  # noqa: PLC0415 - see above
-    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
+    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
 
     plots.check_ending(out)
     check_free(out, force=force)

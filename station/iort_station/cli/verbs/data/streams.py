@@ -27,7 +27,7 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
     """
     # numpy takes longer to load than TAB may take.
     from iort_station.data.overview import overview  # noqa: PLC0415 - see above
-    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
+    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
 
     cloud, origin = context.obj.cloud(), Origin()
     with errors.status("reading"):

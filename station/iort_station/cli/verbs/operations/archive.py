@@ -12,7 +12,7 @@ from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson
 from iort_station.cli.progress import bar
 from iort_station.cli.words import examples, say
-from iort_station.data.archive import Archive
+from iort_station.data.stored.archive import Archive
 from iort_station.errors import StationError
 from iort_station.operations import archive
 

@@ -135,7 +135,7 @@ def _audit(
 ) -> _Audited:
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.data.recorded import Origin  # noqa: PLC0415 - as above
+    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.operations.delivery import accounts, audit  # noqa: PLC0415 - as above
 
     try:

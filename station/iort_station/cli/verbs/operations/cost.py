@@ -16,10 +16,11 @@ from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples
-from iort_station.cost import archiving, line_items, model, report, scale
+from iort_station.cost import report, scale
+from iort_station.cost.bill import archiving, line_items, model
+from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.car import as_configured
 from iort_station.cost.deployed import as_deployed
-from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
 from iort_station.cost.prices import AS_OF, PRICES, REGION
 from iort_station.cost.usage import TRANSPORTS, Usage

@@ -144,7 +144,7 @@ class _Moving:
             self._problem(f"{robot}: the target lacks {len(lacking):,} quarantined messages: move again")
 
     def _stream(self, robot: str, stream: str) -> None:
-        from iort_station.data.batches import topic_of  # noqa: PLC0415 - as above
+        from iort_station.data.stored.batches import topic_of  # noqa: PLC0415 - as above
         from iort_station.moving import archived, compared, recorded  # noqa: PLC0415 - as above
 
         source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)
@@ -209,7 +209,11 @@ class _Reading:
 
 def _target(source: Cloud, to: str, profile: str | None, region: str | None) -> Cloud:
     if to == AWS:
-        return Cloud(namespace=source.namespace, profile=profile, region=region).check()
+        try:
+            return Cloud(namespace=source.namespace, profile=profile, region=region).check()
+        except StationError as error:
+            here = str(error).replace("--region", "--to-region").replace("--profile", "--to-profile")
+            raise StationError(f"the target: {here}") from error
     path = Path(to).expanduser()
     path = path / EMBEDDED.name if path.is_dir() else path
     return CloudOptions(source.namespace, None, None, local=True, embedded=path).cloud()
@@ -230,12 +234,12 @@ def _as_json(robot: str, stream: str, found: Compared, problem: str) -> dict[str
 
 def _show_plan(plan: Plan, *, with_files: bool) -> None:
     """A line for a robot: what there is to do."""
-    parts = [f"{len(plan.streams)} streams", f"{plan.hours:,} archived hours"]
+    parts = [_number(len(plan.streams), "stream"), _number(plan.hours, "archived hour")]
     if plan.files:
-        what = f"{len(plan.files):,} files of {decimal(plan.files_bytes)}"
-        parts.append(what if with_files else f"{what} stay, by --no-files")
+        what = f"{_number(len(plan.files), 'file')} of {decimal(plan.files_bytes)}"
+        parts.append(what if with_files else f"{what} stay here, by --no-files")
     if plan.files_there:
-        parts.append(f"{plan.files_there:,} files are there")
+        parts.append(f"{_number(plan.files_there, 'file')} there already")
     new = "new in the target" if plan.new else "is in the target"
     out.print(f"{plan.robot}: {new}; {', '.join(parts)}", soft_wrap=True)
 
@@ -255,11 +259,15 @@ def _show(one: dict[str, Any]) -> None:
 def _show_end(moving: _Moving, plans: list[Plan]) -> None:
     counts = moving.counts
     out.print(
-        f"{len(plans)} robots, {counts['registered']} of them new in the target; "
-        f"{len(moving.streams)} streams; copied {counts['findings']:,} findings, analysed drives and notes, "
-        f"{counts['quarantined']:,} quarantined messages, {counts['files']:,} files of "
-        f"{decimal(counts['files_bytes'])}; {counts['bundles']} bundles",
+        f"{_number(len(plans), 'robot')}, {counts['registered']} new in the target; "
+        f"{_number(len(moving.streams), 'stream')}; copied {_number(counts['findings'], 'finding or note')}, "
+        f"{_number(counts['quarantined'], 'quarantined message')}, {_number(counts['files'], 'file')} of "
+        f"{decimal(counts['files_bytes'])}; {_number(counts['bundles'], 'bundle')} made",
         soft_wrap=True,
     )
     if moving.problems:
-        out.print(f"{len(moving.problems)} problems", style="red")
+        out.print(_number(len(moving.problems), "problem"), style="red")
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count:,} {what if count == 1 else what.replace(' or', 's or') + 's'}"

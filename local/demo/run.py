@@ -1,0 +1,256 @@
+"""`make demo`: a car drives through the embedded cloud, and the demo counts the samples that arrive.
+
+python -m local.demo.run --duration 20 --bag drive.bag --report report.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+from botocore.exceptions import BotoCoreError, ClientError
+from rich.console import Console
+
+from iort_agent.sources.sim.circuit import HALL
+from iort_agent.sources.sim.graph import DRIVE_TYPE
+from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT
+from iort_contract.topics import PING_PATHS
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.fleet.viewing import Viewer
+from iort_station.operations.delivery import counts
+from iort_station.page.answers import control
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import actions, answers
+from iort_station.page.answers.socket import reaching
+from iort_station.page.live.listening import Listening, listening
+from iort_station.page.server import PageServer
+from local.cloud import EmbeddedCloud
+from local.demo import options
+from local.deployment import ROOT
+from local.errors import LocalError
+from local.figures import Figures, Spread, round_trips
+from local.processes import Child
+
+ROBOT = "car1"
+_SOURCE_RATE_HZ = 50
+# Ten pings a second of half a kilobyte over each path.
+_PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
+# `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`, and the stick of page and terminal.
+# Nobody is hurt by a long lease.
+DOWNLINK = {
+    "cmd": {
+        "drive": {
+            "topic": "/drive",
+            "type": DRIVE_TYPE,
+            "partial": True,
+            "motion": {"lease_s": 10.0, "stop": {"drive": {"speed": 0.0}}},
+        }
+    },
+    "drive": {"max_speed_mps": 2.0, "max_steering_rad": 0.4},
+}
+_CATCH_UP_S = 30.0
+_STATUS_S = 1.0
+_LOOK_S = 1.0
+
+
+def main() -> None:
+    """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
+    given = options.read()
+    stopped = threading.Event()
+
+    def interrupt(_signal: int, _frame: object) -> NoReturn:
+        # Python drops an exception that is raised while it forks, so the event is set too.
+        stopped.set()
+        raise KeyboardInterrupt
+
+    # Every signal that stops the demo stops the processes that it started.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)
+    console = Console()
+    try:
+        figures = _Demo(given, console, stopped).run()
+    except (LocalError, StationError) as error:
+        console.print(f"demo: {error}", style="red", markup=False, highlight=False)
+        sys.exit(2)
+    except (BotoCoreError, ClientError) as error:
+        console.print(f"demo: the embedded cloud refused a call: {error}", style="red", markup=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped; nothing is left running")
+        sys.exit(130)
+    if stopped.is_set():
+        console.print("stopped; nothing is left running")
+    sys.exit(1 if figures.samples_lost else 0)
+
+
+class _Demo:
+    def __init__(self, given: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
+        self._options, self._console, self._stopped = given, console, stopped
+        self._began = time.monotonic()
+
+    def run(self) -> Figures:
+        with ExitStack() as stack:
+            live = self._options.live
+            embedded = stack.enter_context(
+                EmbeddedCloud(self._options.folder, live=live, progress=self._step)
+            )
+            vehicles = {ROBOT: dict(robots.F1TENTH)}
+            page = stack.enter_context(
+                PageServer(
+                    namespace=embedded.namespace,
+                    **reaching(embedded.cloud, live),
+                    vehicles=vehicles,
+                    answers=answers(embedded.cloud),
+                    downloads=downloads(embedded.cloud),
+                    track=HALL if self._options.bag is None else None,
+                    open_actions=actions(embedded.cloud),
+                    actions=control.actions(embedded.cloud),
+                    port=self._options.port,
+                )
+            )
+            listener = stack.enter_context(listening(embedded.cloud, live, robot=ROBOT))
+            self._step("car")
+            bundle = robots.add(
+                embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
+            )
+            self._console.print(
+                f"\n[bold]Watch the car:[/bold] {page.invitation(f'#/car/{ROBOT}')}",
+                highlight=False,
+                soft_wrap=True,
+            )
+            ports = (page.port, *embedded.page_ports)
+            forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+            self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", highlight=False)
+            report = self._drive(embedded, bundle, listener)
+            figures = self._count(embedded, report, listener)
+            self._console.print(figures.as_table())
+            if self._options.report is not None:
+                self._options.report.write_text(json.dumps(figures.as_json(), indent=2) + "\n")
+            if sys.stdin.isatty() and sys.stdout.isatty():
+                # Ctrl-C after the figures is no failure.
+                with suppress(KeyboardInterrupt):
+                    self._stay(embedded, bundle, page.invitation())
+            return figures
+
+    def _step(self, name: str) -> None:
+        self._console.print(f"{time.monotonic() - self._began:5.1f} s  {name}", highlight=False)
+
+    def _settings(self) -> dict[str, Any]:
+        source: dict[str, Any]
+        if self._options.bag is not None:
+            source = {"type": "bag", "path": str(self._options.bag.resolve())}
+        else:
+            faults = {"faults": self._options.faults} if self._options.faults else {}
+            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ, **faults}
+        duration_s = self._options.duration
+        if duration_s is None and self._options.bag is None:
+            duration_s = 60.0
+        if duration_s is not None:
+            source["duration_s"] = duration_s
+        settings = {"sources": [source], "ping": _PING}
+        return settings if self._options.bag is not None else {**settings, "downlink": DOWNLINK}
+
+    def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
+        report = embedded.folder / "agent-report.json"
+        # The figures are of a car that somebody looks at from its start.
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=embedded.live == IOT)
+        with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
+            began = time.monotonic()
+            with self._console.status("starting the agent") as status:
+                while self._running(agent):
+                    embedded.emulator.check()
+                    status.update(self._status_line(embedded, listener, time.monotonic() - began))
+            if not report.exists():
+                raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+            if agent.poll():
+                self._console.print(
+                    f"the agent reports a failure:\n{agent.tail()}", style="red", markup=False
+                )
+        written: dict[str, Any] = json.loads(report.read_text())
+        return written
+
+    def _running(self, agent: Child) -> bool:
+        """Wait a second; whether the agent still runs. Raises KeyboardInterrupt if the demo was stopped."""
+        if self._stopped.is_set():
+            raise KeyboardInterrupt
+        return agent.wait(_STATUS_S) is None
+
+    def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
+        stored = sum(len(b.times_us) for b in counts.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        heard = list(listener.heard)
+        delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
+        return (
+            f"driving {seconds:3.0f} s, stored {stored:,} samples, live {len(heard):,} updates, delay {delay}"
+        )
+
+    def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:
+        """Read the tables until Lambda 2 has summarised every sample, for at most 30 s."""
+        streams = [name for name in report["streams"] if name not in OWN_STREAMS]
+        sent = sum(report["streams"][name]["samples"] for name in streams)
+        deadline = time.monotonic() + _CATCH_UP_S
+        while True:
+            found = [counts.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            summarized = sum(one.samples_summarized for one in found)
+            stored = sum(one.samples_stored for one in found)
+            if summarized >= sent or time.monotonic() > deadline:
+                break
+            # No event tells that the stream of Lambda 2 is empty.
+            threading.Event().wait(0.2)
+        return Figures(
+            samples_sent=sent,
+            samples_stored=stored,
+            samples_summarized=summarized,
+            live_published=report["live_published"],
+            live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
+            rtt_ms=round_trips(counts.batches(embedded.cloud, ROBOT, RTT_STREAM)),
+            car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),
+        )
+
+    def _stay(self, embedded: EmbeddedCloud, bundle: robots.Bundle, url: str) -> None:
+        """Let the car drive on until Ctrl-C, for the page."""
+        settings = self._settings()
+        settings["sources"][0].pop("duration_s", None)
+        if self._options.bag is not None:
+            settings["sources"][0]["loop"] = True
+        robots.configure(bundle, settings)
+        self._console.print(
+            f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False, soft_wrap=True
+        )
+        with _agent(embedded, bundle) as agent:
+            while self._running(agent):
+                embedded.emulator.check()
+            raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+
+
+@contextmanager
+def _agent(embedded: EmbeddedCloud, bundle: robots.Bundle, *arguments: str) -> Iterator[Child]:
+    command = [str(Path(sys.executable).parent / "iort-agent"), "--config", str(bundle.config), *arguments]
+    agent = Child(
+        "the agent",
+        command,
+        environment={"PATH": "", "HOME": str(embedded.folder)},
+        cwd=ROOT,
+        log=embedded.folder / "agent.log",
+    )
+    try:
+        yield agent
+    finally:
+        agent.interrupt()
+        agent.wait(15.0)
+        agent.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""The emulator's process: ministack with its gaps closed, configured by ministack's own environment.
+
+The file `IORT_LEDGER` keeps its state, as safely as `IORT_LEDGER_SYNC` says (off, normal or full). Without
+them the state ends with the process.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import NoReturn, cast
+
+from ministack import app
+
+from local import gaps
+from local.gaps.functions.async_invocations import AsyncInvocations
+from local.gaps.metrics import alarm_timer
+from local.keeping import kept, presence, streams
+from local.keeping.gate import Gate
+from local.keeping.ledger import Ledger, LedgerError, Sync
+
+
+def main() -> None:
+    """Serve until SIGTERM or SIGINT."""
+    path = os.environ.get("IORT_LEDGER")
+    sync = cast(Sync, os.environ.get("IORT_LEDGER_SYNC", "normal") if path else "off")
+    try:
+        ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
+    except LedgerError as error:
+        sys.exit(f"{error}; `iort restore` brings a backup back")
+    ledger.on_broken = _end
+    # Before the gaps, which read streams.
+    streams.install(ledger)
+    gaps.install()
+    if path:
+        kept.install(ledger, AsyncInvocations().queue)
+        presence.install()
+    Gate(ledger).install()
+    alarm_timer.start(os.environ["MINISTACK_REGION"])
+    app.main()
+
+
+def _end(error: LedgerError) -> NoReturn:
+    """End at once: nothing may be acknowledged any more. `make up` starts the emulator again."""
+    print(error, file=sys.stderr, flush=True)  # noqa: T201 - the process' last words
+    os._exit(os.EX_IOERR)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""A stream's batches as they are stored: in the tables, in the archive, or in both."""

@@ -1,0 +1,270 @@
+"""Messages that cannot be processed are in quarantine with their bytes, and are put back once the cause is
+gone.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+
+import pytest
+from typer.testing import CliRunner
+
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
+from iort_station.cli.main import app
+from iort_station.cloud import EMBEDDED
+from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.operations import quarantine
+from iort_station.operations.delivery import counts
+from tests.local.conftest import until
+from verify.tools.robot import Robot
+
+RUN = "0badcafe"
+
+
+@pytest.fixture
+def iort(embedded):
+    def run(*arguments: str):
+        description = embedded.folder / EMBEDDED.name
+        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
+
+    return run
+
+
+@pytest.fixture
+def entry_of(embedded):
+    """Wait for a robot's only entry; return it with its bytes."""
+
+    def wait(robot):
+        (listed,) = until(lambda: list(quarantine.entries(embedded.cloud, robot=robot)), seconds=60)
+        return quarantine.load(embedded.cloud, listed)
+
+    return wait
+
+
+def send(car, *messages, stream=VESC_STREAM, namespace="iort"):
+    topic = record_topic(car.robot, VESC_STREAM, namespace)
+    topic = topic.removesuffix(VESC_STREAM) + stream
+    with Robot(car.folder) as robot:
+        robot.online()
+        for message in messages:
+            assert robot.publish(topic, message) == "SUCCESS"
+
+
+def batch(seq=0, **changes):
+    """Make the message of a current batch, with changes to its envelope."""
+    t_us = (int(time.time()) + seq) * 1_000_000
+    envelope = json.loads(encode_batch(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
+    return json.dumps({**envelope, **changes}).encode()
+
+
+# --- messages in quarantine, and their origin ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"not json",
+        b"\xff\xfe\x00",
+        b'{"v": 1}',
+        b"[]",
+        b'{"batch": 5}',
+        b"",
+        b'{"batch": "1", "a": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
+        b'{"batch": "1", "a": ' + b"9" * 5_000 + b"}",
+    ],
+    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested", "digits"],
+)
+def test_a_message_that_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
+    car = bundle()
+    send(car, payload)
+    entry = entry_of(car.robot)
+    assert entry.payload == payload
+    assert entry.source == "rule iort_record"
+    assert entry.topic == f"dt/iort/{car.robot}/{VESC_STREAM}"
+    assert "DynamoDBv2Action" in entry.reason
+
+
+@pytest.mark.parametrize(
+    ("changes", "stream", "reason"),
+    [
+        ({"v": 1}, "vesc", "schema version must be 2, got 1"),
+        ({"codec": "later"}, "vesc", "codec must be steps"),
+        ({"samples": "AAAA"}, "vesc", "samples must be base64 of zlib"),
+        ({"batch": "yesterday"}, "vesc", "must be <16 digits of microseconds>-<run>-<number>"),
+        ({"batch": "4000000000000000-0badcafe-0"}, "vesc", "clock is wrong"),
+        ({}, "b ad", "stream name must be 1 to 64 of A-Z a-z 0-9 _ -, got 'b ad'"),
+        ({}, "a/b", "must be <lane>/<namespace>/<robot>/<name>"),
+    ],
+    ids=["version", "codec", "samples", "no-id", "years-ahead", "stream", "levels"],
+)
+def test_a_stored_batch_that_lambda_2_cannot_read_is_kept(bundle, entry_of, changes, stream, reason):
+    car = bundle()
+    message = batch(**changes)
+    send(car, message, stream=stream)
+    entry = entry_of(car.robot)
+    assert entry.source == BY_STREAM
+    assert reason in entry.reason
+    kept = json.loads(entry.payload)
+    for name, value in json.loads(message).items():
+        assert kept[name] in ({"S": value}, {"N": str(value)})
+
+
+def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, entry_of):
+    car = bundle()
+    send(car, batch(0), batch(1, samples="AAAA"), batch(2))
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2, seconds=60)
+    assert json.loads(entry_of(car.robot).payload)["batch"]["S"].endswith("-1")
+
+
+@pytest.mark.parametrize("message", [b'{"speed": 99}', b"\xff\x00 no JSON"], ids=["JSON", "bytes"])
+def test_a_foreign_live_message_is_kept_byte_by_byte(bundle, entry_of, message):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), message)
+    entry = entry_of(car.robot)
+    assert entry.payload == message
+    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-Live")
+    assert entry.reason.startswith("Refused: ContractError: ")
+
+
+@pytest.mark.parametrize("path", [LAMBDA, FILE])
+def test_a_ping_without_json_is_kept_byte_by_byte(bundle, entry_of, path):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online().publish(build_topic(PING, car.robot, path), b"\xff\x00 no JSON")
+    entry = entry_of(car.robot)
+    assert entry.payload == b"\xff\x00 no JSON"
+    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-")
+    assert "not JSON" in entry.reason
+
+
+# --- the operator's commands ---------------------------------------------------------------------------
+
+
+def rejected(embedded, robot, message):
+    """Make the message that the record rule's error action sends when the table is throttled."""
+    document = {
+        "ruleName": rule_name("record"),
+        "topic": f"dt/iort/{robot}/{VESC_STREAM}",
+        "base64OriginalPayload": base64.b64encode(message).decode(),
+        "failures": [{"failedAction": "DynamoDBv2Action", "errorMessage": "throttled"}],
+    }
+    queue = embedded.cloud.output("quarantine", "RejectedQueue")
+    embedded.cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=json.dumps(document))
+
+
+def test_errors_are_listed_and_shown(bundle, iort, entry_of):
+    car = bundle()
+    send(car, b"\xff\x00" + b"[bold]no markup[/bold]\x1b[2J")
+    entry = entry_of(car.robot)
+    listed = json.loads(iort("errors", "--robot", car.robot, "--last", "10m", "--json").stdout)
+    assert [(one[ENTRY], one["seen"]) for one in listed["entries"]] == [(entry.id, 1)]
+    assert json.loads(iort("errors", "--to", "2020-01-01Z", "--json").stdout)["entries"] == []
+    assert car.robot in iort("errors").stdout
+    shown = iort("errors", entry.id)
+    assert shown.exit_code == 0
+    assert "000000  ff 00 5b 62" in shown.stdout
+    assert "\x1b[2J" not in shown.stdout
+    as_json = json.loads(iort("errors", entry.id, "--json").stdout)
+    assert base64.b64decode(as_json["payload_base64"]) == entry.payload
+    assert "no dead letter has the id" in str(iort("errors", "0" * 16).exception)
+
+
+def test_a_throttled_batch_is_put_back_once_and_then_deleted(embedded, bundle, iort, entry_of):
+    car = bundle()
+    rejected(embedded, car.robot, batch(0))
+    entry_of(car.robot)
+    dry = iort("replay-errors", "--robot", car.robot, "--dry-run")
+    assert "1 would be replayed" in dry.stdout
+    assert counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 0
+    done = iort("replay-errors", "--robot", car.robot)
+    assert (done.exit_code, "1 replayed" in done.stdout) == (0, True), done.output
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1, seconds=60)
+    assert list(quarantine.entries(embedded.cloud, robot=car.robot)) == []
+    assert "nothing in quarantine" in iort("replay-errors", "--robot", car.robot).stdout
+
+
+def test_a_message_that_is_still_invalid_stays_in_quarantine(embedded, bundle, iort, entry_of):
+    car = bundle()
+    send(car, b"not json")
+    before = entry_of(car.robot)
+    done = iort("replay-errors", "--robot", car.robot)
+    assert "1 still refused" in done.stdout
+    assert entry_of(car.robot) == before
+
+
+def test_a_batch_that_fails_in_lambda_2_is_quarantined_and_put_back(embedded, bundle, iort, entry_of):
+    """The summary table's name is wrong for a while: every attempt fails, and the stream continues."""
+    cloud, car = embedded.cloud, bundle()
+    client, name = cloud.client("lambda"), cloud.output("processing", "SummarizeFunction")
+    right = client.get_function_configuration(FunctionName=name)["Environment"]["Variables"]
+    wrong = {**right, "SUMMARY_TABLE": "no-such-table"}
+    client.update_function_configuration(FunctionName=name, Environment={"Variables": wrong})
+    try:
+        send(car, batch(0))
+        entry = entry_of(car.robot)
+        assert "RetryAttemptsExhausted" in entry.reason
+        failed = iort("replay-errors", "--robot", car.robot)
+        assert failed.exit_code == 1
+        assert "failed again: Lambda 2 failed" in failed.stdout
+        assert entry_of(car.robot).replays == 1
+    finally:
+        client.update_function_configuration(FunctionName=name, Environment={"Variables": right})
+    assert counts.samples_summarized(cloud, car.robot, VESC_STREAM) == 0
+    done = iort("replay-errors", "--robot", car.robot)
+    assert "1 replayed" in done.stdout, done.output
+    assert counts.samples_summarized(cloud, car.robot, VESC_STREAM) == 1
+    assert list(quarantine.entries(cloud, robot=car.robot)) == []
+
+
+def test_a_message_that_quarantine_cannot_keep_is_put_back_from_the_last_queue(embedded, bundle, iort):
+    """The quarantine function is broken: after five attempts the message waits in the last queue."""
+    cloud, car = embedded.cloud, bundle()
+    sqs, last = cloud.client("sqs"), cloud.output("quarantine", "LastQueue")
+    document = {"ruleName": "iort_record", "topic": f"dt/iort/{car.robot}/vesc", "failures": []}
+    document["base64OriginalPayload"] = base64.b64encode(b"never kept so far").decode()
+    sqs.send_message(QueueUrl=last, MessageBody=json.dumps(document))
+    assert "did not take" in iort("errors").stderr
+    assert "on the way to it again" in iort("replay-errors", "--robot", car.robot).stderr
+    (entry,) = until(lambda: list(quarantine.entries(cloud, robot=car.robot)), seconds=60)
+    assert quarantine.load(cloud, entry).payload == b"never kept so far"
+
+
+# --- effects of one robot on the others ---------------------------------------------------------------
+
+
+def hostile_messages():
+    """Make messages that no agent sends; the record rule stores or rejects them."""
+    t_us = int(time.time()) * 1_000_000
+    far = {f"a{i}": 1e125 for i in range(1000)}
+    changes = [
+        {"batch": 10**124},
+        far,
+        {"batch": "x" * 3000},
+        {"batch": "-5"},
+        {"nonfinite": -1},
+        {"n": 10**9},
+        {"robot": "other"},
+    ]
+    changes += [{"samples": "x" * 100_000}, {"batch": "\ud800"}, {"x": [1] * 20_000}, {"codec": None}]
+    nested = b'{"v":2,"batch":"%d-0badcafe-0","a":' % t_us + b"[" * 900 + b"]" * 900 + b"}"
+    return [batch(i, **change) for i, change in enumerate(changes)] + [
+        nested,
+        b'{"batch":"5","n":1e400}',
+        b'{"":1,"batch":"7"}',
+    ]
+
+
+def test_invalid_messages_do_not_delay_other_robots_summaries(bundle, embedded):
+    cloud = embedded.cloud
+    send(bundle("bad"), *hostile_messages())
+    good = bundle("good")
+    send(good, batch())
+    table, topic = summary_table(cloud), topic_of(cloud, good.robot, VESC_STREAM)
+    (second,) = until(lambda: next(table.pages(topic)).items)
+    assert second[SAMPLES] == {"N": "1"}

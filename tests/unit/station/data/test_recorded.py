@@ -1,0 +1,338 @@
+"""What is read is the same before its batches are archived, after they have expired, and in between."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from functions.shared.summary.processing import recompute
+from iort_analysis.samples.blocks import values
+from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
+from iort_contract.messages.account import StreamAccount
+from iort_contract.messages.batch import Batch, RunEnd
+from iort_contract.messages.message_type import MessageType
+from iort_contract.ros1.message import Messages, RosType
+from iort_contract.tables import RECOMPUTE_FROM_S
+from iort_contract.topics import RECORD, build_topic
+from iort_station import data
+from iort_station.cli.cloud_options import CloudOptions
+from iort_station.cli.main import app
+from iort_station.data.overview import overview
+from iort_station.data.runs import runs
+from iort_station.data.stored import archive as station_archive
+from iort_station.data.stored.recorded import Origin
+from iort_station.errors import StationError
+from iort_station.operations.delivery import accounts, audit
+from iort_station.page.answers.downloads import downloads
+from iort_station.page.answers.index import answers
+from iort_station.recordings import tabular
+from tests import archived
+from tests.archived import FakeS3, archive, compact, expire
+from tests.fakes import ARCHIVE, TELEMETRY, item_of, item_of_message
+from tests.unit.contract.ros1.ros1_messages import text, u32
+from tests.unit.functions.summary.summarizing import Stream
+from tests.unit.station.data.test_data import FakeCloud, cloud_of
+
+HOUR = 3_600_000_000
+# Three minutes before a full hour, so that runs and batches cross it.
+START = 1_700_000_000_000_000 // HOUR * HOUR + 57 * 60_000_000
+S = 1_000_000
+CAR = {
+    stream: build_topic(RECORD, "car", stream) for stream in ("vesc", "scan", TYPES_STREAM, ACCOUNT_STREAM)
+}
+SCAN = RosType("/scan", "a_msgs/Names", "2", "string[] names")
+
+
+def drive() -> list[tuple[str, dict]]:
+    """Items of two runs: fields that come and go, flags, texts, sensors that are not fitted, two publishers
+    whose batches overlap, messages as published, numbers that lack, and an item that is no batch."""
+    items = []
+
+    def add(stream, batch):
+        items.append(item_of(batch, CAR[stream]))
+
+    for number, (boot, start, n) in enumerate([("0badcafe", START, 270), ("1badcafe", START + 2 * HOUR, 60)]):
+        for seq in range(n):
+            t = start + seq * S + 999_000 * (seq % 7 == 3)
+            if seq in {30, 31, 179}:
+                continue
+            times = [t + i * 50_000 for i in range(10)]
+            columns = {
+                "speed": [seq % 50 + i / 8 for i in range(10)],
+                "temp_motor": [20 - 293.15 * (seq == 5)] * 10,
+            }
+            if seq % 90 > 60:
+                columns |= {
+                    "armed": [i % 2 == 0 for i in range(10)],
+                    "mode": ["go" if seq % 2 else None] * 10,
+                }
+            if seq % 100 == 7:
+                columns["mode"] = [2**60 + 1, 1.5, None, True, "x", *[None] * 5]
+            previous = (RunEnd("0badcafe", 269),) if number else ()
+            add("vesc", Batch(boot, seq, times, columns, seq % 3, None, previous if seq < 3 else None))
+            if number:
+                again = Batch(
+                    "2badcafe", seq, [t + 200_000 + i * 70_000 for i in range(4)], {"speed": [1, 2, None, 4]}
+                )
+                add("vesc", again)
+        kind = MessageType("scan", "/scan", "a_msgs/Names", "2", "string[] names").sample()
+        done = StreamAccount("vesc", 2700, 2700, 0, 0, 0, n, ended=not number).sample()
+        add(ACCOUNT_STREAM, Batch(boot, 0, [start + n * S], {name: [value] for name, value in done.items()}))
+        add(TYPES_STREAM, Batch(boot, 0, [start], {name: [value] for name, value in kind.items()}))
+        for seq in range(8):
+            raws = [u32(1) + text(f"{boot}{seq}")] * 2
+            times = [start + seq * 30 * S, start + seq * 30 * S + 400_000]
+            add("scan", Batch(boot, seq, times, {}, 0, Messages(SCAN.id, SCAN.layout, raws)))
+    odd = json.dumps(
+        {"v": 2, "batch": f"{START + 40 * S:016d}-0badcafe-9999", "codec": "steps", "n": 1, "samples": "eJw="}
+    )
+    items.append(item_of_message(odd.encode(), CAR["vesc"]))
+    return items
+
+
+ITEMS = drive()
+
+
+def lab() -> FakeCloud:
+    """A cloud with the drive, and with its summary as Lambda 2 makes it."""
+    cloud = cloud_of(page_items=100)
+    cloud.bucket = FakeS3()
+    lambda_2 = Stream(cloud.table)
+    records = [lambda_2.store_item(item) for item in ITEMS]
+    recompute({"Records": records, RECOMPUTE_FROM_S: 0}, lambda_2.tables)
+    return cloud
+
+
+def later(state: str) -> FakeCloud:
+    """The cloud at a later time."""
+    cloud = lab()
+    cloud.state = state
+    if state == "late":
+        # They arrived after their hour had been archived, and the others have expired since.
+        all_items = dict(cloud.table.items[TELEMETRY])
+        for number, key in enumerate(sorted(all_items)):
+            if number % 5 == 0:
+                del cloud.table.items[TELEMETRY][key]
+        archive(cloud.table, cloud.bucket)
+        expire(cloud.table)
+        cloud.table.items[TELEMETRY] = {
+            key: all_items[key] for number, key in enumerate(sorted(all_items)) if number % 5 == 0
+        }
+        return cloud
+    archive(cloud.table, cloud.bucket, expires_s=archived.NEVER_S if state == "archived" else archived.PAST_S)
+    if state == "compacted":
+        compact(cloud.table, cloud.bucket)
+    if state in {"expired", "compacted"}:
+        expire(cloud.table)
+    if state == "half expired":
+        expire(cloud.table, every=lambda number: number % 2 == 0)
+    return cloud
+
+
+STATES = ("archived", "half expired", "expired", "compacted", "late")
+
+
+@pytest.fixture(scope="module")
+def before() -> FakeCloud:
+    return lab()
+
+
+@pytest.fixture(scope="module", params=STATES)
+def cloud(request) -> FakeCloud:
+    return later(request.param)
+
+
+def asked(found: data.Result) -> tuple:
+    """All that a result says but its origin, as files have it."""
+    csv, lines, parquet = io.StringIO(), io.StringIO(), io.BytesIO()
+    tabular.to_csv(found, csv)
+    tabular.to_json_lines(found, lines)
+    tabular.to_parquet(found, parquet)
+    told = (
+        found.refused,
+        found.reason,
+        found.ros2,
+        found.absent,
+        {n: c.dtype for n, c in found.columns.items()},
+    )
+    return csv.getvalue(), lines.getvalue(), parquet.getvalue(), *told
+
+
+QUESTIONS = {
+    "everything": {},
+    "a part of an hour": {"start": START + 60 * S, "end": START + 77 * S},
+    "over an hour's end": {
+        "start": START + 170 * S,
+        "end": START + 190 * S,
+        "fields": ["temp_motor", "speed"],
+    },
+    "a condition": {"where": "speed > 30 and mode is None", "fields": ["speed"]},
+    "combined": {"every": "10s", "fields": ["speed", "temp_motor"]},
+    "nothing": {"start": START + HOUR, "end": START + HOUR + 1},
+    "the summary": {"summary": True},
+    "a part of the summary": {"summary": True, "start": START + 170_500_000, "end": START + 2 * HOUR + 9 * S},
+    "a field of the summary": {"summary": True, "fields": ["speed", "absent"], "where": "n > 3"},
+    "a scan": {"scan": True, "fields": ["speed"]},
+}
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_a_query_has_the_same_answer(before, cloud, question):
+    given_ = QUESTIONS[question]
+    expected, found = (data.query(one, "car", "vesc", **given_) for one in (before, cloud))
+    assert asked(found) == asked(expected)
+
+
+@settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(start=st.integers(-2 * S, 280 * S), length=st.integers(1, 5 * S), summary=st.booleans())
+def test_any_range_has_the_same_answer(before, cloud, start, length, summary):
+    at = START + start
+    expected, found = (
+        data.query(one, "car", "vesc", at, at + length, summary=summary) for one in (before, cloud)
+    )
+    assert found.times_us.tolist() == expected.times_us.tolist()
+    assert list(found.columns) == list(expected.columns)
+    for name, column in found.columns.items():
+        assert values(column) == values(expected.columns[name]), name
+
+
+def test_a_field_that_is_not_in_the_range_is_the_same_error(before, cloud):
+    errors = []
+    for one in (before, cloud):
+        with pytest.raises(StationError, match="car has no mode in vesc in this range") as error:
+            data.query(one, "car", "vesc", START + 125 * S, START + 145 * S, fields=["mode"])
+        errors.append(str(error.value))
+    assert errors[0] == errors[1]
+
+
+def test_recordings_are_the_same(before, cloud, tmp_path):
+    for stream in ("scan", "vesc"):
+        asked_for = {"robot": "car", "stream": stream, "from_us": str(START), "to_us": str(START + 3 * HOUR)}
+        files = []
+        for number, one in enumerate((before, cloud)):
+            folder = tmp_path / f"{stream}{number}"
+            folder.mkdir()
+            made = {name: make(asked_for, folder).read_bytes() for name, make in downloads(one).items()}
+            files.append(made)
+        assert files[0].keys() == {"history.csv", "history.parquet", "history.mcap"}
+        assert files[0] == files[1]
+
+
+@pytest.mark.parametrize("stream", ["vesc", "scan", ACCOUNT_STREAM])
+def test_the_audit_is_the_same(before, cloud, stream):
+    for between in ((None, None), (START + 9 * S, START + HOUR)):
+        expected, found = (
+            audit.audit(stream, audit.headers(one, "car", stream, *between)) for one in (before, cloud)
+        )
+        assert found == expected
+    assert accounts.accounts(cloud, "car") == accounts.accounts(before, "car")
+    assert audit.last_figures(cloud, "car") == audit.last_figures(before, "car")
+
+
+def test_runs_and_streams_are_the_same_and_say_where_they_are_from(before, cloud):
+    for find in (runs, overview):
+        origins = Origin(), Origin()
+        expected, found = (
+            find(one, "car", origin=origin) for one, origin in zip((before, cloud), origins, strict=True)
+        )
+        assert found == expected
+        assert (origins[0].told(), bool(origins[1].told())) == (None, cloud.state != "archived")
+    for end_us in (START + HOUR, START + 100 * S):
+        assert runs(cloud, "car", end_us=end_us) == runs(before, "car", end_us=end_us)
+
+
+@pytest.mark.parametrize("verb", ["runs", "streams"])
+def test_the_verb_says_what_came_from_the_archive(verb, before, monkeypatch):
+    said = []
+    for one in (before, later("expired")):
+        monkeypatch.setattr(CloudOptions, "cloud", lambda _self, one=one: one)
+        done = CliRunner().invoke(app, [verb, "car"])
+        told = json.loads(CliRunner().invoke(app, [verb, "car", "--json"]).stdout)
+        said.append(("from the archive, 2023-11-14T22:00:00Z to" in done.stderr, told["archive"] is not None))
+    assert said == [(False, False), (True, True)]
+
+
+def test_the_page_gets_the_same_and_says_where_it_is_from(before, cloud):
+    for hours in (1, 3):
+        question = {
+            "robot": "car",
+            "stream": "vesc",
+            "from_us": str(START),
+            "to_us": str(START + hours * HOUR),
+            "rows": "50",
+        }
+        expected, found = (answers(one)["history"](question) for one in (before, cloud))
+        assert (expected.pop("archive"), bool(found.pop("archive"))) == (None, cloud.state != "archived")
+        assert found == expected
+
+
+def test_the_query_function_is_not_asked_for_what_has_expired():
+    """It reads the table only; half an answer would be wrong."""
+    cloud = later("expired")
+    with pytest.raises(StationError, match="3 hours of this range have expired, or soon"):
+        data.query(cloud, "car", "vesc", START, START + 4 * HOUR, on=data.LAMBDA)
+
+
+def test_one_of_the_two_alone_can_be_asked(before):
+    half = later("half expired")
+    counts = {}
+    for source in ("auto", "archive", "table"):
+        counts[source] = len(data.query(half, "car", "vesc", source=source))
+    assert counts["auto"] == counts["archive"] == len(data.query(before, "car", "vesc"))
+    assert 0 < counts["table"] < counts["auto"]
+    assert len(data.query(half, "car", "vesc", source="table").origin.hours) == 0
+
+
+def test_of_a_large_file_only_what_is_needed_is_read(monkeypatch):
+    chance = random.Random(1)
+    cloud = cloud_of(page_items=100)
+    cloud.bucket = FakeS3()
+    for hour in range(2):
+        times = [START + hour * HOUR + i * 1_000 for i in range(1_000)]
+        columns = {f"f{i}": [chance.random() for _ in times] for i in range(40)}
+        cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", hour, times, columns)))
+    expected = data.query(cloud, "car", "vesc", START + HOUR, fields=["f7"])
+    archive(cloud.table, cloud.bucket)
+    compact(cloud.table, cloud.bucket)
+    expire(cloud.table)
+    (size,) = map(len, cloud.bucket.objects.values())
+    monkeypatch.setattr(station_archive, "_END_BYTES", 70_000)
+    requests, read = [], []
+    # The whole file at once; its end and the hour; its end and some columns.
+    for most in (size, size - 100_000, 0):
+        monkeypatch.setattr(station_archive, "_AT_ONCE_BYTES", most)
+        del cloud.bucket.reads[:]
+        assert asked(data.query(cloud, "car", "vesc", START + HOUR, fields=["f7"])) == asked(expected)
+        requests.append(len(cloud.bucket.reads))
+        read.append(sum(end - start for start, end in cloud.bucket.reads))
+    assert requests[:2] == [1, 2]
+    assert requests[2] > 2
+    assert read[2] < read[1] < read[0] == size
+
+
+def test_a_file_that_moves_while_it_is_read_is_found_again(before):
+    cloud = later("expired")
+    rows = [dict(row) for row in cloud.table.items[ARCHIVE].values()]
+    compact(cloud.table, cloud.bucket)
+    moved = {key: dict(row) for key, row in cloud.table.items[ARCHIVE].items()}
+    get, stale = cloud.bucket.get_object, {row["key"]["S"] for row in rows}
+
+    def then(**asked):
+        # The first request comes with the old row; then the manifest has the new one.
+        if asked["Key"] in stale:
+            cloud.table.items[ARCHIVE] = moved
+        return get(**asked)
+
+    cloud.bucket.get_object = then
+    for row in rows:
+        cloud.table.put(ARCHIVE, row)
+    assert asked(data.query(cloud, "car", "vesc")) == asked(data.query(before, "car", "vesc"))
+    cloud.bucket.objects.clear()
+    with pytest.raises(StationError, match="the archive lacks archive/robot=car/"):
+        data.query(cloud, "car", "vesc")

@@ -1,0 +1,65 @@
+"""The registry's rows of the cars."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import pytest
+
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from tests.fakes import ROBOTS, serialize
+from tests.unit.station.data.test_data import FakeCloud, cloud_of
+
+
+def test_presence_has_its_start_time():
+    cloud = cloud_of(robot="new")
+    rows = [
+        {"robot": "on", "online": True, "connected_ms": Decimal(2000), "disconnected_ms": Decimal(1000)},
+        {"robot": "off", "online": False, "connected_ms": Decimal(2000), "disconnected_ms": Decimal(3000)},
+    ]
+    for row in rows:
+        cloud.table.put(ROBOTS, {name: serialize(value) for name, value in row.items()})
+    assert registry.presence(cloud) == {
+        "new": {"online": False, "since_ms": None},
+        "on": {"online": True, "since_ms": 2000},
+        "off": {"online": False, "since_ms": 3000},
+    }
+
+
+def test_vehicles_have_their_gain_and_offset():
+    cloud = cloud_of(robot="plain", gain="4614")
+    rows = [
+        {"robot": "shifted", "speed_to_erpm_gain": Decimal(4000), "speed_to_erpm_offset": Decimal("12.5")},
+        {"robot": "unknown"},
+    ]
+    for row in rows:
+        cloud.table.put(ROBOTS, {name: serialize(value) for name, value in row.items()})
+    assert registry.vehicles(cloud) == {
+        "plain": {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 0.0},
+        "shifted": {"speed_to_erpm_gain": 4000.0, "speed_to_erpm_offset": 12.5},
+    }
+
+
+@pytest.mark.parametrize("name", ["iort-viewer-1", "iort-driver-car", "iort-claim-1"])
+def test_a_robot_has_no_name_under_which_others_connect(dynamodb, name):
+    cloud = FakeCloud(dynamodb)
+    with pytest.raises(StationError, match="must not begin with iort-claim-, iort-viewer-, iort-driver-"):
+        registry.enter(cloud, name, {})
+    registry.enter(cloud, "iort-viewer", {})
+
+
+def test_set_vehicle_changes_only_the_given_parameters(dynamodb):
+    cloud = FakeCloud(dynamodb)
+    registry.enter(cloud, "car", {"speed_to_erpm_gain": 4614.0, "serial": "s"})
+    assert registry.set_vehicle(cloud, "car", {"speed_to_erpm_gain": 1060.5}) == {"speed_to_erpm_gain": 4614}
+    assert registry.set_vehicle(cloud, "car", {"speed_to_erpm_offset": -1e-05}) == {}
+    assert registry.get(cloud, "car") == {
+        "robot": "car",
+        "serial": "s",
+        "speed_to_erpm_gain": Decimal("1060.5"),
+        "speed_to_erpm_offset": Decimal("-0.00001"),
+    }
+    with pytest.raises(StationError, match="robot nobody is not registered"):
+        registry.set_vehicle(cloud, "nobody", {"speed_to_erpm_gain": 1.0})
+    assert registry.find(cloud, "nobody") is None

@@ -1,0 +1,156 @@
+"""A move replaces nothing that the target has of its own, nothing that was deleted comes back, and both sides
+are not one account.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.archive.writing import described, write_day
+from iort_analysis.samples.blocks import join, values
+from iort_contract.archive import ArchivedHour, archived_hour, parse_hour
+from iort_contract.findings_table import FindingsTable
+from iort_contract.messages.analysis.findings import Finding
+from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.topics import RECORD, build_topic
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.moving import archived, plan, written
+from tests.unit.analysis.archive.test_archive import batch_at, item_of
+from tests.unit.analysis.archive.test_archive import written as written_hour
+from tests.unit.contract.messages.test_findings import FINDING
+from tests.unit.contract.messages.test_notes import OneTable, note
+
+TOPIC = build_topic(RECORD, "car7", "vesc")
+DAY = "archive/robot=car7/stream=vesc/date=2026-11-22/day.parquet"
+
+
+def day(*hours: str) -> bytes:
+    """A day's object; each batch tells its hour."""
+    files = {}
+    for name in hours:
+        hour = parse_hour(f"2026-11-22T{name}")
+        files[hour] = written_hour([item_of(batch_at(hour, 0, {"speed": [float(name)] * 3}))], hour)[0]
+    into = io.BytesIO()
+    write_day(files, into, describe=described("vesc"))
+    return into.getvalue()
+
+
+class Account:
+    """The calls of a cloud that a move makes."""
+
+    endpoint_url, region_name = None, "eu-west-1"
+
+    def __init__(self, number: str, *hours: str) -> None:
+        self.number = number
+        self.content = {DAY: day(*hours)} if hours else {}
+        sha256 = hashlib.sha256(self.content.get(DAY, b"")).hexdigest()
+        self.rows = [
+            ArchivedHour(TOPIC, f"2026-11-22T{hour}", DAY, 1, 50, 0, "", sha256, 1, 0, 0) for hour in hours
+        ]
+        self.findings = FindingsTable(OneTable(), "findings")
+
+    def client(self, _service: str) -> Account:
+        return self
+
+    def output(self, *_: str) -> str:
+        return "name"
+
+    def get_caller_identity(self) -> dict[str, str]:
+        return {"Account": self.number}
+
+    def get_object(self, *, Bucket: str, Key: str) -> dict[str, Any]:
+        return {"Body": io.BytesIO(self.content[Key])}
+
+    def put_object(self, *, Bucket: str, Key: str, Body: bytes, IfNoneMatch: str = "") -> None:
+        if IfNoneMatch and Key in self.content:
+            raise ClientError({"Error": {"Code": "PreconditionFailed"}}, "PutObject")
+        self.content[Key] = Body
+
+    def put_item(self, *, TableName: str, Item: dict[str, Any]) -> None:
+        self.rows.append(archived_hour(Item))
+
+    def speeds(self) -> dict[str, list[Any]]:
+        """What the manifest leads to, by hour."""
+        found = {}
+        for row in self.rows:
+            file = ArchiveFile(self.content[row.key])
+            assert hashlib.sha256(self.content[row.key]).hexdigest() == row.sha256
+            parts = list(file.pages(parse_hour(row.hour)))
+            found[row.hour[-2:]] = values(join([part.block for part in parts]).columns["speed"])
+        return found
+
+
+@pytest.fixture(autouse=True)
+def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Rows:
+        def __init__(self, account: Account, _topic: str) -> None:
+            self.rows = account.rows.copy
+
+    monkeypatch.setattr(archived, "Archive", Rows)
+    monkeypatch.setattr(written.findings, "table", lambda account: account.findings)
+
+
+def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Cloud, "client", lambda cloud, _service: Account("1" if cloud.profile else "2"))
+    monkeypatch.setattr(Cloud, "region_name", property(lambda cloud: cloud.region))
+    monkeypatch.setattr(Cloud, "output", lambda *_: "name")
+    here, lab, other = (Cloud(profile=profile, region="eu-west-1") for profile in ("a", "b", None))
+    with pytest.raises(StationError, match="the source itself"):
+        plan.check(here, lab)
+    plan.check(here, other)
+    plan.check(here, replace(lab, region="us-east-1"))
+
+
+def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
+    source = Account("1", "07", "08")
+    new, other = Account("2"), Account("2", "08", "09")
+    assert archived.copy(source, new, TOPIC) == (2, 0)
+    assert (new.content, new.rows) == (source.content, source.rows)
+    own = other.content[DAY]
+    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert other.content[DAY] == own
+    assert other.speeds() == {"08": [8.0] * 3, "09": [9.0] * 3, "07": [7.0] * 3}
+    assert archived.copy(source, other, TOPIC) == (0, 0)
+    # Killed before the row was written; then the target's archive is about to write the same hour.
+    hour = other.rows.pop()
+    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert other.rows.pop() == hour
+    other.content[hour.key] = b"being written"
+    assert archived.copy(source, other, TOPIC) == (0, 1)
+    assert other.content[hour.key] == b"being written"
+
+
+def test_what_the_target_has_analysed_again_is_not_replaced() -> None:
+    source, target = Account("1"), Account("2")
+    finding: Finding = FINDING
+    robot = finding.drive.robot
+    source.findings.put_finding(finding)
+    source.findings.put_drive(AnalysedDrive(finding.drive, finding.drive.start_us + 1, "old", 1, {}, {}, {}))
+    source.findings.put_note(note(robot=robot))
+    assert [written.copy(source, target, robot) for _ in range(2)] == [3, 0]
+    again = AnalysedDrive(finding.drive, finding.drive.start_us + 1, "again", 1, {}, {}, {})
+    target.findings.put_drive(again)
+    target.findings.remove(finding)
+    assert written.copy(source, target, robot) == 0
+    assert (list(target.findings.drives(robot)), list(target.findings.findings(robot))) == ([again], [])
+
+
+def test_a_note_that_was_deleted_on_either_side_does_not_come_back() -> None:
+    source, target = Account("1"), Account("2")
+    notes = [note(seconds) for seconds in (0, 60, 120)]
+    for one in notes:
+        source.findings.put_note(one)
+    assert written.copy(source, target, "car7") == 3
+    assert source.findings.remove_note("car7", notes[0].id)
+    assert target.findings.remove_note("car7", notes[1].id)
+    assert written.copy(source, target, "car7") == 0
+    assert list(target.findings.notes("car7")) == [notes[2]]
+    assert list(source.findings.notes("car7")) == [notes[2], notes[1]]

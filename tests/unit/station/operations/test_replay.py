@@ -1,0 +1,164 @@
+"""Replays of unreadable dead letters: they do not stop the replay of other entries."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import pytest
+
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
+from iort_contract.topics import RECORD, build_topic
+from iort_station.operations.quarantine import DeadLetter
+from iort_station.operations.replay import Fate, replay
+from tests.fakes import item_of, item_of_message
+from tests.unit.station.recordings.old_messages import old_message
+
+TOPIC = build_topic(RECORD, "car", "vesc")
+NOW_MS = 1_700_000_000_000
+GOOD = Batch("0123abcd", 0, [1_700_000_000_000_000], {"speed": [1.5]})
+
+
+class FakeCloud:
+    """A fake cloud with these payloads in quarantine, by entry id, and an empty telemetry table."""
+
+    def __init__(self, payloads, topic=TOPIC):
+        self._payloads, self._topic = payloads, topic
+
+    def output(self, _stack, name):
+        return name
+
+    def client(self, service):
+        assert service == "dynamodb"
+        return self
+
+    def get_item(self, *, TableName, Key, ConsistentRead, **_):
+        assert ConsistentRead
+        if TableName == "TelemetryTable":
+            return {}
+        assert TableName == "QuarantineTable"
+        source, payload = self._payloads[Key["id"]["S"]]
+        texts = {"robot": "car", "source": source, "topic": self._topic, "reason": "some"}
+        item = {name: {"S": text} for name, text in texts.items()} | Key | {"payload": {"B": payload}}
+        return {"Item": item | {name: {"N": str(NOW_MS)} for name in ("first_ms", "last_ms", "seen")}}
+
+    def update_item(self, *, TableName, Key, **_):
+        assert (TableName, Key["id"]["S"] in self._payloads) == ("QuarantineTable", True)
+
+
+def replayed(*, dry_run=True, **payloads):
+    listed = [
+        DeadLetter("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()
+    ]
+    return list(replay(FakeCloud(payloads), listed, dry_run=dry_run))
+
+
+class Queues(FakeCloud):
+    """A fake cloud that also has the queue of deferred batches."""
+
+    def __init__(self, payloads):
+        super().__init__(payloads)
+        self.sent, self.deleted = [], []
+        self.exceptions = SimpleNamespace(ConditionalCheckFailedException=KeyError)
+
+    def client(self, service):
+        assert service in {"dynamodb", "sqs"}
+        return self
+
+    def send_message(self, **message):
+        self.sent.append(message)
+
+    def delete_item(self, *, Key, **_):
+        self.deleted.append(Key["id"]["S"])
+
+
+def test_deferred_batches_that_failed_are_queued_again():
+    body = json.dumps({PUT_OFF: [[TOPIC, str(GOOD.id)]]})
+    cloud = Queues({"late": (BY_LATER, body.encode())})
+    listed = [DeadLetter("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
+    assert [outcome.fate for outcome in replay(cloud, listed)] == [Fate.REPLAYED]
+    assert cloud.sent == [{"QueueUrl": "PutOffQueue", "MessageBody": body, "MessageGroupId": "car"}]
+    assert cloud.deleted == ["late"]
+
+
+def outcomes(**payloads):
+    return [outcome.fate for outcome in replayed(**payloads)]
+
+
+whole = json.dumps(item_of(GOOD, TOPIC)).encode()
+future = json.dumps(item_of(GOOD, TOPIC) | {"received_ms": {"N": "1"}}).encode()
+
+
+@pytest.mark.parametrize("source", [BY_STREAM, f"{BY_RULE} iort_record"])
+@pytest.mark.parametrize(
+    "odd",
+    [whole[:-100], b"", b"[]", b"\xff", b"[" * 100_000, future],
+    ids=["cut", "empty", "no object", "no text", "nested", "ahead"],
+)
+def test_an_unreadable_entry_is_refused_and_the_next_one_is_replayed(odd, source):
+    fates = outcomes(bad=(source, odd), good=(BY_STREAM, whole))
+    assert fates == [Fate.REFUSED, Fate.WOULD]
+
+
+# --- batches of version 1, before batches had ids ------------------------------------------------------
+
+
+def old_item(**changes):
+    return json.dumps(item_of_message(old_message(GOOD, **changes), TOPIC)).encode()
+
+
+@pytest.mark.parametrize(
+    ("source", "payload"),
+    [(f"{BY_RULE} iort_record", old_message(GOOD)), (BY_STREAM, old_item())],
+    ids=["rule", "stream"],
+)
+def test_a_batch_of_version_1_is_replayed(source, payload):
+    assert outcomes(old=(source, payload)) == [Fate.WOULD]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"t": -5}, "must be from 1970 on"),
+        ({"samples": "AAAA"}, "samples must be base64 of zlib"),
+        ({"v": 0}, ", got 0"),
+    ],
+    ids=["1970", "samples", "version"],
+)
+@pytest.mark.parametrize("source", [BY_STREAM, f"{BY_RULE} iort_record"])
+def test_an_invalid_batch_of_version_1_is_refused(source, changes, reason):
+    payload = old_item(**changes) if source == BY_STREAM else old_message(GOOD, **changes)
+    (outcome,) = replayed(old=(source, payload))
+    assert outcome.fate is Fate.REFUSED
+    assert reason in outcome.detail
+
+
+def test_an_entry_with_an_unstorable_number_does_not_stop_the_next():
+    odd = old_message(GOOD)[:-1] + b',"more":1e400}'
+    assert outcomes(odd=(f"{BY_RULE} iort_record", odd), good=(BY_STREAM, whole)) == [
+        Fate.REFUSED,
+        Fate.WOULD,
+    ]
+
+
+def test_a_batch_only_in_the_old_table_is_not_sent_to_lambda_2():
+    """Lambda 2 would find no batch, and the entry would be deleted."""
+    (outcome,) = replayed(old=(BY_STREAM, old_item()), dry_run=False)
+    assert (outcome.fate, "iort adopt" in outcome.detail) == (Fate.FAILED, True)
+
+
+@pytest.mark.parametrize("prefix", ["", "$aws/rules/iort_record/"])
+def test_a_batch_is_replayed_with_and_without_basic_ingests_prefix(prefix):
+    payload = encode_batch(GOOD)
+    cloud = FakeCloud({"a": (f"{BY_RULE} iort_record", payload)}, topic=prefix + TOPIC)
+    listed = DeadLetter(
+        "car", "a", f"{BY_RULE} iort_record", prefix + TOPIC, "some", 2_000_000_000_000, 1, 1, 0
+    )
+    (outcome,) = replay(cloud, [listed], dry_run=True)
+    assert (outcome.fate, outcome.letter.topic) == (Fate.WOULD, TOPIC), outcome.detail
+
+
+def test_keys_that_the_rule_ignores_do_not_stop_a_replay():
+    odd = {**json.loads(encode_batch(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
+    assert outcomes(odd=(f"{BY_RULE} iort_record", json.dumps(odd).encode())) == [Fate.WOULD]

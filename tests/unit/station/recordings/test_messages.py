@@ -1,0 +1,166 @@
+"""Samples become messages again, with messages of every shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from iort_analysis.samples.blocks import Block, column_of
+from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.topics import build_topic
+from iort_station.errors import StationError
+from iort_station.recordings.messages import Maker, made_of, types
+from tests.fakes import TELEMETRY, item_of
+from tests.flatten import flatten
+from tests.unit.station.data.test_data import cloud_of
+
+LINE = "=" * 80 + "\n"
+HEADER = LINE + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+STAMPED = "Header header\nB b\n" + HEADER + LINE + "MSG: a_msgs/B\nfloat64 x\nint32 code\n"
+RICH = (
+    "uint8 KIND=3\nbool on\nuint8 small\nint64 large\nstring name\ntime at\nduration took\n"
+    "float32[2] pair\nuint8[] bytes\nB[2] parts\nstring[] names\n" + LINE + "MSG: a_msgs/B\nfloat64 x\n"
+)
+T_US = 1_700_000_000_123_456
+
+
+def made(definition, sample, kind="a_msgs/A"):
+    maker = Maker(MessageType("s", "/t", kind, "", definition), list(sample))
+    block = Block(np.array([T_US]), {name: column_of([value]) for name, value in sample.items()})
+    ((t_ns, raw),) = maker.messages(block)
+    assert t_ns == T_US * 1000
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, "a_msgs/msg/A"))
+    return maker, store, store.deserialize_ros1(raw, "a_msgs/msg/A")
+
+
+def test_a_message_has_its_header_and_its_nested_fields():
+    maker, _, message = made(STAMPED, {"x": 1.5, "code": 7.0})
+    assert (message.b.x, message.b.code) == (1.5, 7)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 123_456_000)
+    assert maker.lacking == maker.foreign == []
+
+
+def test_a_ros_2_header_becomes_a_ros_1_header():
+    of_ros2 = STAMPED.replace("uint32 seq\n", "")
+    assert of_ros2 != STAMPED
+    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", of_ros2), ["x", "code"])
+    assert maker.definition == STAMPED
+    assert maker.md5sum == Maker(MessageType("s", "/t", "a_msgs/A", "", STAMPED), ["x", "code"]).md5sum
+    of_ros2_md5sum = get_typestore(Stores.EMPTY)
+    of_ros2_md5sum.register(get_types_from_msg(of_ros2, "a_msgs/msg/A"))
+    said = of_ros2_md5sum.generate_msgdef("a_msgs/msg/A")[1]
+    assert Maker(MessageType("s", "/t", "a_msgs/A", said, of_ros2), []).md5sum == maker.md5sum != said
+    block = Block(np.array([T_US]), {"x": column_of([1.5]), "code": column_of([7.0])})
+    ((_, raw),) = maker.messages(block)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(STAMPED, "a_msgs/msg/A"))
+    message = store.deserialize_ros1(raw, "a_msgs/msg/A")
+    assert (message.header.seq, message.b.x) == (0, 1.5)
+
+
+def test_headers_have_sequence_numbers_and_the_samples_time():
+    path = "Header header\nB[2] parts\n" + HEADER + LINE + "MSG: a_msgs/B\nHeader header\nfloat64 x\n"
+    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", path), ["parts.0.x", "parts.1.x"])
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(path, "a_msgs/msg/A"))
+    seen = []
+    for start in (T_US, T_US + 3):
+        block = Block(np.arange(start, start + 3), {"parts.0.x": column_of([1.0] * 3)})
+        for t_ns, raw in maker.messages(block):
+            message = store.deserialize_ros1(raw, "a_msgs/msg/A")
+            within = [part.header for part in message.parts]
+            seen.append((t_ns // 1000 - T_US, message.header.seq, message.header.frame_id))
+            assert [(header.seq, header.frame_id) for header in within] == [(message.header.seq, "")] * 2
+    assert seen == [(i, i, "") for i in range(6)]
+
+
+def test_a_flattened_message_is_restored():
+    sample = {
+        "on": True, "small": 7, "large": 2**60 + 1, "name": "ü", "at.sec": 5, "at.nanosec": 6,
+        "took.sec": -1, "took.nanosec": 2, "pair.0": 0.5, "pair.1": -2.0, "bytes.0": 1, "bytes.1": 255,
+        "parts.0.x": 1.25, "parts.1.x": 2.5, "names.0": "a", "names.1": "b",
+    }  # fmt: skip
+    maker, store, message = made(RICH, sample)
+    fields = {name: [field for field, _ in definition[1]] for name, definition in store.fielddefs.items()}
+
+    def members(value):
+        names = fields.get(getattr(value, "__msgtype__", ""))
+        return None if names is None else {name: getattr(value, name) for name in names}
+
+    assert flatten(message, members) == sample
+    assert maker.lacking == maker.foreign == []
+
+
+def test_fields_may_have_names_of_python_keywords():
+    _, _, message = made("float64 from\nB class\n" + LINE + "MSG: a_msgs/B\nint32 lambda\n",
+                         {"from": 1.5, "class.lambda": 3})  # fmt: skip
+    assert (message.from_, message.class_.lambda_) == (1.5, 3)
+
+
+def test_null_missing_and_unknown_fields_are_handled():
+    maker, _, message = made(STAMPED, {"x": None, "y": 1})
+    assert np.isnan(message.b.x)
+    assert message.b.code == 0
+    assert (maker.lacking, maker.foreign) == (["code"], ["y"])
+
+
+def has_said(*samples):
+    """A cloud with these message types of a robot, sent one a millisecond."""
+    cloud, topic = cloud_of(), build_topic("dt", "car", TYPES_STREAM)
+    for i, one in enumerate(samples):
+        columns = {name: [value] for name, value in one.sample().items()}
+        cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", i, [1000 * (i + 1)], columns), topic))
+    return cloud
+
+
+def test_the_types_that_a_robot_sent_are_read_with_their_times():
+    first = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
+    second, other = first._replace(md5sum="2" * 32), first._replace(stream="o", topic="/o")
+    elsewhere = first._replace(topic="/u")
+    cloud = has_said(first, other, second, elsewhere, first)
+    # Each type once, with its first time; batches refer to types by id.
+    assert types(cloud, "car", "s") == {
+        first.id: (1000, first),
+        second.id: (3000, second),
+        elsewhere.id: (4000, elsewhere),
+    }
+    assert len({first.id, second.id, elsewhere.id}) == 3
+    assert types(cloud, "car", "nothing") == {}
+
+
+def test_a_missing_definition_is_taken_from_another_publisher():
+    whole = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
+    cloud = has_said(whole._replace(definition=""), whole)
+    assert types(cloud, "car", "s") == {whole.id: (1000, whole)}
+
+
+def test_samples_without_a_type_get_a_generated_type():
+    columns = {"rule_ms": column_of([1.5]), "pose.x": column_of([2]), "ok": column_of([True])}
+    kind = made_of("rtt-2", columns)
+    maker = Maker(kind, list(columns), own=True)
+    assert maker.lacking == maker.foreign == []
+    assert kind.kind == "iort_msgs/Rtt_2"
+    assert "float64 pose_x" in kind.definition
+    ((_, raw),) = maker.messages(Block(np.array([T_US]), columns))
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(kind.definition, "iort_msgs/msg/Rtt_2"))
+    message = store.deserialize_ros1(raw, "iort_msgs/msg/Rtt_2")
+    assert (message.rule_ms, message.pose_x, message.ok) == (1.5, 2.0, True)
+
+
+def test_a_type_is_decoded_as_it_was_encoded_and_an_invalid_one_is_refused():
+    kind = MessageType("s", "/t", "a_msgs/A", "x" * 32, STAMPED + "# " + "ü" * 9000)
+    assert message_type(kind.sample()) == kind
+    with pytest.raises(ContractError, match="characters"):
+        kind._replace(definition="x" * 300_000).sample()
+    with pytest.raises(ContractError, match="must have 'topic'"):
+        message_type({"stream": "s"})
+    with pytest.raises(StationError, match=r"must be x+, got 2416"):
+        Maker(kind, ["x"])
+    with pytest.raises(StationError, match="cannot be made again"):
+        Maker(kind._replace(definition="nonsense nonsense nonsense"), ["x"])
