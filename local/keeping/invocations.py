@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from functools import partial, wraps
 from itertools import count
-from typing import Any, Protocol
+from typing import Any
 
 from ministack.core.responses import get_account_id, get_region
 from ministack.services import eventbridge, iot
@@ -27,31 +27,15 @@ CREATE TABLE IF NOT EXISTS invocations (
 # Messages of AWS IoT itself, of which ministack gives no QoS.
 _OWN = "$aws/"
 _acknowledged: ContextVar[bool] = ContextVar("acknowledged", default=True)
-
-
-class Events(Protocol):
-    """A queue of events for each function, in memory."""
-
-    def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
-        """Queue one event; raises `LookupError` for an unknown function."""
-
-    def queue(
-        self,
-        account: str,
-        region: str,
-        function_arn: str,
-        event: Any,
-        *,
-        done: Callable[[], object] = ...,
-    ) -> None:
-        """Queue one event, and call ``done`` when it needs no more attempts."""
+# Queues one event in memory by account, region, function and event, and calls ``done`` at its end.
+Queue = Callable[..., None]
 
 
 class Invocations:
     """A queue of events for each function, in the ledger; a function gets each event at least once."""
 
-    def __init__(self, ledger: Ledger, events: Events) -> None:
-        self._ledger, self._events = ledger, events
+    def __init__(self, ledger: Ledger, queue: Queue) -> None:
+        self._ledger, self._queue = ledger, queue
         ledger.define(_SCHEMA)
         ((last,),) = ledger.read("SELECT coalesce(max(number), 0) FROM invocations")
         # SQLite would give the number of an undone row again, while that event still runs.
@@ -70,7 +54,7 @@ class Invocations:
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for an unknown function, or `LedgerError`."""
         if not _acknowledged.get():
-            self._events.dispatch(account, region, function_arn, event)
+            self._queue(account, region, function_arn, event)
             return
         with self._ledger.write() as connection:
             number = next(self._numbers)
@@ -78,7 +62,7 @@ class Invocations:
                 "INSERT INTO invocations VALUES (?, ?, ?, ?, ?, ?)",
                 (number, account, region, function_arn, json.dumps(event), time.time()),
             )
-            self._events.queue(account, region, function_arn, event, done=partial(self._remove, number))
+            self._queue(account, region, function_arn, event, done=partial(self._remove, number))
 
     def go_on(self) -> None:
         """Queue again what was waiting, or running, when the emulator ended."""
@@ -87,7 +71,7 @@ class Invocations:
             done = partial(self._remove, number)
             try:
                 # Its age begins anew: it could not run while the emulator was off.
-                self._events.queue(account, region, function, json.loads(event), done=done)
+                self._queue(account, region, function, json.loads(event), done=done)
             except LookupError as error:
                 _log.warning("an event is given up: %s", error)
                 done()

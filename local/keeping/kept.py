@@ -10,7 +10,7 @@ from ministack import app
 from ministack.services import dynamodb
 
 from local.keeping import objects, queues
-from local.keeping.invocations import Events, Invocations
+from local.keeping.invocations import Invocations, Queue
 from local.keeping.ledger import Ledger
 from local.keeping.services.keeper import Services
 
@@ -18,11 +18,11 @@ from local.keeping.services.keeper import Services
 FIRST_S = 2 * 3600.0
 
 
-def install(ledger: Ledger, events: Events) -> None:
+def install(ledger: Ledger, queue: Queue) -> None:
     """Keep all but items and streams; call it after the gaps are closed and before the emulator starts."""
     objects.install(ledger)
     queues.install(ledger)
-    services, invocations = Services(ledger), Invocations(ledger, events)
+    services, invocations = Services(ledger), Invocations(ledger, queue)
     services.install()
     invocations.install()
     dynamodb._expire_items = not_at_first(dynamodb._expire_items)

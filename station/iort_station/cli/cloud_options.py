@@ -37,7 +37,7 @@ class CloudOptions:
         Raises `StationError` if none runs and AWS' credentials are missing.
         """
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
-        embedded = self.embedded or find_embedded(Path.cwd()) or _kept()
+        embedded = self.file()
         if self.local and embedded is None:
             raise StationError(
                 f"no embedded cloud is running: {Path.cwd()} and the folders above it have no {EMBEDDED}, "
@@ -57,6 +57,10 @@ class CloudOptions:
             raise StationError(
                 f"{error}. No embedded cloud runs here either; `make up` or `make demo` starts one"
             ) from error
+
+    def file(self) -> Path | None:
+        """The file of the embedded cloud that is named, or that runs here; None if there is none."""
+        return self.embedded or find_embedded(Path.cwd()) or _kept()
 
     def means_kept(self, folder: Path) -> bool:
         """Whether the cloud of `make up` in this folder is meant: it is up, or was killed."""

@@ -22,7 +22,6 @@ import typer
 
 from iort_contract.catalog.derived import DERIVED
 from iort_station.cli.cloud_options import CloudOptions
-from iort_station.cloud import find_embedded
 from iort_station.output import cache, whole
 
 if TYPE_CHECKING:
@@ -141,7 +140,7 @@ def _ask_in_background() -> subprocess.Popen[Any]:
 
 def _kept_at(options: CloudOptions, *key: str) -> Path:
     """The file of the names; another cloud has other ones."""
-    embedded = options.embedded or find_embedded(Path.cwd())
+    embedded = options.file()
     chosen = [os.environ.get(name) for name in ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION")]
     began = embedded.stat().st_mtime if embedded and embedded.exists() else None
     text = repr((options, embedded, began, chosen, key))

@@ -51,7 +51,10 @@ def _cloud_options(
         Path | None,
         typer.Option(
             envvar=EMBEDDED_VARIABLE,
-            help=f"The file of an embedded cloud. Default: {EMBEDDED}, in this folder or one above.",
+            help=(
+                f"The file of an embedded cloud. Default: {EMBEDDED} in this folder or one above, or else "
+                "that of `make up`."
+            ),
         ),
     ] = None,
     _version: Annotated[

@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+import resource
 import signal
 import ssl
 import sys
 import urllib.error
 import urllib.request
-from contextlib import suppress
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import boto3
 from botocore.config import Config
 
-from local import patched
-from local.certificates import Authority
 from local.deployment import ROOT
+from local.emulator import patched
+from local.network.certificates import Authority
 from local.processes import Child
 from tests.ports import free_port
 
 REGION, ACCOUNT = "eu-west-1", "000000000000"
+ROLE = f"arn:aws:iam::{ACCOUNT}:role/anybody"
 _POLL_S = 0.05
 
 
 class Emulator:
     """The emulator's process and its clients; `kill` and `start` as often as wanted."""
 
-    sync, arguments = "normal", ("-m", "local.emulator")
+    sync, arguments = "normal", ("-m", "local.emulator.run")
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -93,6 +99,47 @@ class Emulator:
             aws_session_token=given["SessionToken"],
             config=Config(retries={"total_max_attempts": 1}),
         )
+
+    def add_role(self) -> None:
+        """The role `ROLE`, which anybody may take."""
+        anybody = {"Effect": "Allow", "Principal": "*", "Action": "sts:AssumeRole"}
+        policy = json.dumps({"Version": "2012-10-17", "Statement": [anybody]})
+        self.client("iam").create_role(RoleName="anybody", AssumeRolePolicyDocument=policy)
+
+    def add_table(self, name: str) -> None:
+        """A table with a stream, whose items have a `key`."""
+        self.client("dynamodb").create_table(
+            TableName=name,
+            KeySchema=[{"AttributeName": "key", "KeyType": "HASH"}],
+            AttributeDefinitions=[{"AttributeName": "key", "AttributeType": "S"}],
+            BillingMode="PAY_PER_REQUEST",
+            StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
+        )
+
+    def add_function(self, name: str, code: str) -> str:
+        """A function; returns its ARN."""
+        package = io.BytesIO()
+        with zipfile.ZipFile(package, "w") as archive:
+            archive.writestr("module.py", code)
+        made = self.client("lambda").create_function(
+            FunctionName=name,
+            Runtime="python3.12",
+            Role=ROLE,
+            Handler="module.handler",
+            Timeout=900,
+            Code={"ZipFile": package.getvalue()},
+        )
+        return str(made["FunctionArn"])
+
+    @contextmanager
+    def full_disk(self) -> Iterator[None]:
+        """Let no file of the emulator grow beyond a page of the ledger."""
+        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+        try:
+            yield
+        finally:
+            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, unlimited)
 
     def _ready(self) -> bool:
         context = ssl.create_default_context(cafile=str(self.certificate))

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
-import resource
 import ssl
 import time
 import urllib.request
-import zipfile
 from contextlib import contextmanager, suppress
 
 import paho.mqtt.client as mqtt
 import pytest
 
 from tests.local.conftest import until
-from tests.local.keeping.emulators import ACCOUNT, Emulator
+from tests.local.keeping.emulators import ROLE, Emulator
 
 TABLE = "records"
-_ROLE = f"arn:aws:iam::{ACCOUNT}:role/anybody"
-_ANYBODY = {
-    "Version": "2012-10-17",
-    "Statement": [{"Effect": "Allow", "Principal": "*", "Action": "sts:AssumeRole"}],
-}
 _EVERYTHING = {
     "Version": "2012-10-17",
     "Statement": [{"Effect": "Allow", "Action": "iot:*", "Resource": "*"}],
@@ -45,15 +37,9 @@ def handler(event, context):
 def emulator(tmp_path_factory):
     made = Emulator(tmp_path_factory.mktemp("kept"))
     made.start()
-    made.client("iam").create_role(RoleName="anybody", AssumeRolePolicyDocument=json.dumps(_ANYBODY))
-    made.client("dynamodb").create_table(
-        TableName=TABLE,
-        KeySchema=[{"AttributeName": "key", "KeyType": "HASH"}],
-        AttributeDefinitions=[{"AttributeName": "key", "AttributeType": "S"}],
-        BillingMode="PAY_PER_REQUEST",
-        StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
-    )
-    put = {"dynamoDBv2": {"roleArn": _ROLE, "putItem": {"tableName": TABLE}}}
+    made.add_role()
+    made.add_table(TABLE)
+    put = {"dynamoDBv2": {"roleArn": ROLE, "putItem": {"tableName": TABLE}}}
     rule = {"sql": "SELECT * FROM 'record'", "actions": [put]}
     made.client("iot").create_topic_rule(ruleName="record", topicRulePayload=rule)
     yield made
@@ -98,23 +84,12 @@ def stored(emulator):
     return {item["key"]["S"] for item in emulator.client("dynamodb").scan(TableName=TABLE)["Items"]}
 
 
-@contextmanager
-def full_disk(emulator):
-    """Let no file of the emulator grow beyond a page of the ledger."""
-    limit, unlimited = (4096, resource.RLIM_INFINITY), (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
-    resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, limit)
-    try:
-        yield
-    finally:
-        resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)
-
-
 def test_a_robot_keeps_a_record_that_the_full_disk_refused(emulator, robot):
     with robot() as car:
         car.publish("record", b'{"key": "before"}', qos=1).wait_for_publish(60)
         lost = []
         car.on_disconnect = lambda *_: lost.append(time.monotonic())
-        with full_disk(emulator):
+        with emulator.full_disk():
             refused = car.publish("record", b'{"key": "refused"}', qos=1)
             until(lambda: len(lost) > 1)
             assert not refused.is_published()
@@ -131,7 +106,7 @@ def test_a_robot_of_mqtt_5_stays_connected_on_a_full_disk(emulator, robot):
         said, lost = [], []
         car.on_publish = lambda _client, _data, _number, reason, _properties: said.append(str(reason))
         car.on_disconnect = lambda *_: lost.append(time.monotonic())
-        with full_disk(emulator):
+        with emulator.full_disk():
             for n in (1, 2):
                 car.publish("record", b'{"key": "five"}', qos=1)
                 until(lambda n=n: len(said) == n)
@@ -144,21 +119,10 @@ def test_a_robot_of_mqtt_5_stays_connected_on_a_full_disk(emulator, robot):
 
 def test_a_mapping_goes_on_after_a_kill_with_what_it_had_not_finished(emulator, tmp_path):
     path = tmp_path / "lines"
-    code = io.BytesIO()
-    with zipfile.ZipFile(code, "w") as archive:
-        archive.writestr("module.py", _CODE.format(path=str(path)))
-    functions = emulator.client("lambda")
-    functions.create_function(
-        FunctionName="read",
-        Runtime="python3.12",
-        Role=_ROLE,
-        Handler="module.handler",
-        Timeout=900,
-        Code={"ZipFile": code.getvalue()},
-    )
+    emulator.add_function("read", _CODE.format(path=str(path)))
     tables = emulator.client("dynamodb")
     stream = tables.describe_table(TableName=TABLE)["Table"]["LatestStreamArn"]
-    functions.create_event_source_mapping(
+    emulator.client("lambda").create_event_source_mapping(
         FunctionName="read", EventSourceArn=stream, StartingPosition="LATEST", BatchSize=1
     )
     tables.put_item(TableName=TABLE, Item={"key": {"S": "done"}})

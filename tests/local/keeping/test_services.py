@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import json
-import resource
 import sqlite3
-import time
-import zipfile
 from contextlib import closing
 
 import pytest
 from botocore.exceptions import ClientError
 
-from tests.local.keeping.emulators import ACCOUNT, REGION, Emulator
+from tests.local.conftest import until
+from tests.local.keeping.emulators import REGION, ROLE, Emulator
 
-_ROLE = f"arn:aws:iam::{ACCOUNT}:role/anybody"
-_TRUST = {
-    "Version": "2012-10-17",
-    "Statement": [{"Effect": "Allow", "Principal": "*", "Action": "sts:AssumeRole"}],
-}
 _WAIT = {"StartAt": "Wait", "States": {"Wait": {"Type": "Wait", "Seconds": 3600, "End": True}}}
 # It does not come to its end the first time.
 _CODE = """
@@ -37,7 +29,7 @@ def handler(event, context):
 def emulator(tmp_path_factory):
     made = Emulator(tmp_path_factory.mktemp("kept"))
     made.start()
-    made.client("iam").create_role(RoleName="anybody", AssumeRolePolicyDocument=json.dumps(_TRUST))
+    made.add_role()
     yield made
     made.kill()
 
@@ -63,20 +55,14 @@ def test_all_that_calls_have_made_is_there_after_a_kill(emulator):
         s3.put_object(Bucket="bucket", Key=key, Body=b"bytes", Metadata={"robot": "car1"})
     s3.delete_object(Bucket="bucket", Key="deleted")
     states = emulator.client("stepfunctions")
-    machine = states.create_state_machine(name="wait", definition=json.dumps(_WAIT), roleArn=_ROLE)
+    machine = states.create_state_machine(name="wait", definition=json.dumps(_WAIT), roleArn=ROLE)
     execution = states.start_execution(stateMachineArn=machine["stateMachineArn"])["executionArn"]
     tables = emulator.client("dynamodb")
-    tables.create_table(
-        TableName="table",
-        KeySchema=[{"AttributeName": "key", "KeyType": "HASH"}],
-        AttributeDefinitions=[{"AttributeName": "key", "AttributeType": "S"}],
-        BillingMode="PAY_PER_REQUEST",
-        StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
-    )
+    emulator.add_table("table")
     for key in ("kept", "deleted"):
         tables.put_item(TableName="table", Item={"key": {"S": key}})
     tables.delete_item(TableName="table", Key={"key": {"S": "deleted"}})
-    session = emulator.client("sts").assume_role(RoleArn=_ROLE, RoleSessionName="viewer")["Credentials"]
+    session = emulator.client("sts").assume_role(RoleArn=ROLE, RoleSessionName="viewer")["Credentials"]
 
     emulator.restart()
 
@@ -101,28 +87,18 @@ def test_all_that_calls_have_made_is_there_after_a_kill(emulator):
 
 
 def test_an_invocation_that_a_kill_interrupts_begins_again(emulator, tmp_path):
-    code = io.BytesIO()
-    with zipfile.ZipFile(code, "w") as archive:
-        archive.writestr("module.py", _CODE)
-    function = emulator.client("lambda").create_function(
-        FunctionName="slow",
-        Runtime="python3.12",
-        Role=_ROLE,
-        Handler="module.handler",
-        Timeout=900,
-        Code={"ZipFile": code.getvalue()},
-    )["FunctionArn"]
+    function = emulator.add_function("slow", _CODE)
     rule = {"sql": "SELECT * FROM 'call'", "actions": [{"lambda": {"functionArn": function}}]}
     emulator.client("iot").create_topic_rule(ruleName="call", topicRulePayload=rule)
     lines = tmp_path / "lines"
     emulator.client("iot-data").publish(topic="call", qos=1, payload=json.dumps({"file": str(lines)}))
-    _wait(lambda: lines.exists() and lines.read_text())
+    until(lambda: lines.exists() and lines.read_text())
 
     emulator.restart()
 
-    _wait(lambda: lines.read_text() == "began\nbegan\n")
+    until(lambda: lines.read_text() == "began\nbegan\n")
     with closing(sqlite3.connect(emulator.ledger)) as ledger:
-        _wait(lambda: ledger.execute("SELECT count(*) FROM invocations").fetchone() == (0,))
+        until(lambda: ledger.execute("SELECT count(*) FROM invocations").fetchone() == (0,))
 
 
 def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
@@ -131,9 +107,7 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
     s3.put_object(Bucket="full", Key="key", Body=b"before")
     ssm.put_parameter(Name="/parameter", Value="before", Type="String")
     queue = sqs.create_queue(QueueName="full")["QueueUrl"]
-    # No file may grow beyond a page of the ledger.
-    unlimited = resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
-    try:
+    with emulator.full_disk():
         with pytest.raises(ClientError, match=r"50[03]"):
             s3.put_object(Bucket="full", Key="key", Body=b"x" * 10_000)
         with pytest.raises(ClientError, match=r"ServiceUnavailable|InternalError"):
@@ -142,7 +116,7 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
             sqs.send_message(QueueUrl=queue, MessageBody="x" * 10_000)
         # As their clients read it: these do not speak JSON.
         with pytest.raises(ClientError, match="ServiceUnavailable"):
-            iam.create_role(RoleName="full", AssumeRolePolicyDocument=json.dumps(_TRUST))
+            iam.create_user(UserName="full")
         with pytest.raises(ClientError, match="ServiceUnavailable"):
             cloudwatch.put_metric_alarm(
                 AlarmName="full",
@@ -154,8 +128,6 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
                 Threshold=1,
                 ComparisonOperator="GreaterThanThreshold",
             )
-    finally:
-        resource.prlimit(emulator.process.pid, resource.RLIMIT_FSIZE, unlimited)
     assert s3.get_object(Bucket="full", Key="key")["Body"].read() == b"before"
     sqs.send_message(QueueUrl=queue, MessageBody="after")
 
@@ -163,10 +135,3 @@ def test_a_full_disk_is_an_error_and_changes_nothing(emulator):
 
     assert s3.get_object(Bucket="full", Key="key")["Body"].read() == b"before"
     assert sqs.receive_message(QueueUrl=queue)["Messages"][0]["Body"] == "after"
-
-
-def _wait(condition) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)

@@ -3,102 +3,29 @@ runs the same cloud."""
 
 from __future__ import annotations
 
-import ipaddress
 import os
+import shutil
 import signal
-import socket
-import sqlite3
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from bench.keeping.disk import Disk
-from bench.meters import usage
 from iort_station import kept
-from iort_station.cloud import EMBEDDED_VARIABLE
 from local.deployment import ROOT
 from local.processes import Child
 from local.up.down import stop
 from local.up.service import NAME
 from tests.local.conftest import until
 from tests.local.network.booted import booted
-from tests.local.network.namespaces import Machine, two_machines
+from tests.local.network.laboratory import BIN, Laboratory, waiting
+from tests.local.network.namespaces import two_machines
 
-BIN = Path(sys.executable).parent
 # The issue asks for 20 s on a machine that does nothing else.
 SECOND_START_S = 60.0
-
-
-class Laboratory:
-    """The machine of the cloud, the car's machine, and `make up` on the first."""
-
-    def __init__(self, folder: Path, cloud: Machine, car: Machine) -> None:
-        self.folder, self.cloud, self.car = folder, cloud, car
-        # As we and the machine see it: what is mounted there is its own.
-        self.state = Path(f"/proc/{cloud.pid}/root{folder}/cloud")
-        self.disk = Disk(folder / "cloud", within=cloud.command())
-        self.up: Child
-        self.wait_ready: Callable[[], None]
-
-    @contextmanager
-    def running(self, *options: str, ready: bool = True) -> Iterator[None]:
-        """Run `make up` until it is killed or the block ends; it says when it is ready, as to systemd."""
-        told = self.folder / "notify"
-        told.unlink(missing_ok=True)
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told_by:
-            told_by.bind(str(told))
-            told_by.settimeout(1.0)
-            command = [sys.executable, "-m", "local.up.run", "--state", str(self.state), *options]
-            self.up = Child(
-                "make up",
-                self.cloud.command(*command),
-                environment={**os.environ, "NOTIFY_SOCKET": str(told)},
-                cwd=ROOT,
-                log=self.folder / "up.log",
-            )
-            self.wait_ready = lambda: until(lambda: self._is_ready(told_by), seconds=400)
-            try:
-                if ready:
-                    self.wait_ready()
-                yield
-            finally:
-                self.up.stop()
-
-    def kill(self) -> None:
-        """SIGKILL to all processes of `make up` at once, as at a power cut of a machine that has written
-        everything."""
-        for pid in (self.up.pid, *usage.descendants(self.up.pid)):
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        self.up.wait(10.0)
-
-    def _is_ready(self, told_by: socket.socket) -> bool:
-        self.up.check()
-        try:
-            return told_by.recv(100) == b"READY=1"
-        except TimeoutError:
-            return False
-
-    def iort(self, *arguments: str) -> str:
-        """The operator's command, on the cloud's machine."""
-        environment = {EMBEDDED_VARIABLE: str(self.state / kept.CLOUD)}
-        return self.cloud.run(str(BIN / "iort"), *arguments, environment=environment)
-
-    def listeners(self) -> set[tuple[str, int]]:
-        """Every socket of the cloud's machine that a network reaches, whoever listens: TCP and UDP."""
-        found = set()
-        for table, state in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
-            for line in Path(f"/proc/{self.cloud.pid}/net/{table}").read_text().splitlines()[1:]:
-                address, port = line.split()[1].split(":")
-                words = [bytes.fromhex(address[i : i + 8])[::-1] for i in range(0, len(address), 8)]
-                host = ipaddress.ip_address(b"".join(words))
-                if line.split()[3] == state and not host.is_loopback:
-                    found.add((str(host), int(port, 16)))
-        return found
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +57,43 @@ def car(laboratory: Laboratory) -> Iterator[Callable[..., Child]]:
         yield start
 
 
-def waiting(bundle: Path) -> int:
-    """The batches in a car's queue."""
-    with closing(sqlite3.connect(f"file:{bundle / 'queue.db'}?mode=ro", uri=True)) as queue:
-        ((found,),) = queue.execute("SELECT count(*) FROM batches").fetchall()
-    return int(found)
+def check(config: Path) -> list[str]:
+    return [str(BIN / "iort-agent"), "check", "--config", str(config)]
+
+
+def shows_the_ways(laboratory: Laboratory, bundle: Path) -> None:
+    """`iort-agent check` on both machines; the car's configuration has the cloud's address in the network."""
+    there = bundle / "car.yaml"
+    way = laboratory.car.run(*check(there))
+    assert f"route: from {laboratory.car.address} to {laboratory.cloud.address}" in way
+    assert "rules: answer a ping" in way
+    # A car of the cloud's own machine that was registered before LISTEN.
+    here = bundle / "here.yaml"
+    here.write_text(there.read_text().replace(laboratory.cloud.address, "127.0.0.1"))
+    assert "rules: answer a ping" in laboratory.cloud.run(*check(here))
+
+
+def is_well(laboratory: Laboratory, broker: str) -> None:
+    """What `iort doctor` finds of a cloud that is up, without a car that is connected."""
+    found = laboratory.findings(status=0)
+    assert f"cars connect to {broker}" in found["servers"]["text"]
+    assert found["robots"]["text"].startswith("0 of ")
+    assert found["backup"]["text"].endswith(str(laboratory.backup))
+    assert "recordings at most" in found["summaries"]["text"]
+    assert {"memory", "load", "disk", "certificate of broker", "clock"} <= found.keys()
+
+
+def is_whole_elsewhere(laboratory: Laboratory, bundle: Path, backed_up: int) -> None:
+    """A backup that was made while the car drove, in another folder."""
+    laboratory.iort("restore", str(laboratory.backup), state=laboratory.restored)
+    with laboratory.running(state=laboratory.restored):
+        assert laboratory.stored(laboratory.restored) >= backed_up
+        # The car is known there, with its certificate.
+        assert "accepts car1" in laboratory.car.run(*check(bundle / "car.yaml"))
+        # Of a run that goes on elsewhere nobody knows the open batches.
+        for one in laboratory.audited(laboratory.restored):
+            assert (one["missing"], one["refused"]) == (0, 0)
+            assert all(each["samples"] is None for each in one["shortfalls"])
 
 
 def test_a_first_deployment_that_a_kill_interrupts_is_made_up_for(laboratory):
@@ -179,6 +138,12 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         assert laboratory.listeners() == reached
         # It is back by itself; the batches in between have waited in its queue.
         until(lambda: "online since" in laboratory.iort("robots", "list"))
+        backed_up = laboratory.stored()
+        assert "files" in laboratory.iort("backup", str(laboratory.backup))
+        # It goes on.
+        until(lambda: laboratory.stored() > backed_up + 50)
+        refused = laboratory.iort("restore", str(laboratory.backup), "--force", status=1)
+        assert "stop it first" in refused
         agent.interrupt()
         assert agent.wait(30.0) == 0, agent.tail()
         until(lambda: "offline since" in laboratory.iort("robots", "list"))
@@ -188,20 +153,14 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         sent = car(bundle, "upload", str(upload))
         assert sent.wait(60.0) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car1")
-        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
-        # A car of the cloud's own machine that was registered before LISTEN.
-        config = bundle / "car.yaml"
-        (bundle / "here.yaml").write_text(config.read_text().replace(address, "127.0.0.1"))
-        here = laboratory.cloud.run(*check[:-1], str(bundle / "here.yaml"))
-        assert "rules: answer a ping" in here
-        way = laboratory.car.run(*check)
-        assert f"route: from {laboratory.car.address} to {address}" in way
-        assert "rules: answer a ping" in way
-        assert f"cars connect to {address}:{ports['mqtt']}" in laboratory.iort("doctor")
+        shows_the_ways(laboratory, bundle)
+        is_well(laboratory, f"{address}:{ports['mqtt']}")
         assert stop(laboratory.state)
+    assert laboratory.findings(status=1)["processes"]["level"] == "fail"
     assert laboratory.listeners() == set()
-    ended = laboratory.car.run("sh", "-c", '"$@" || true', "sh", *check)
+    ended = laboratory.car.run(*check(bundle / "car.yaml"), status=1)
     assert f"port: {address} answers, but nothing listens on {ports['mqtt']}" in ended
+    is_whole_elsewhere(laboratory, bundle, backed_up)
 
 
 def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
@@ -212,8 +171,7 @@ def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
         reached = {(address, ports[name]) for name in ("mqtt", "files", "network page")}
         assert laboratory.listeners() == reached
         laboratory.iort("robots", "add", "car6", "--out", str(laboratory.folder))
-        check = [str(BIN / "iort-agent"), "check", "--config", str(bundle / "car.yaml")]
-        assert "rules: answer a ping" in laboratory.car.run(*check)
+        assert "rules: answer a ping" in laboratory.car.run(*check(bundle / "car.yaml"))
         upload = laboratory.folder / "drive.bag"
         upload.write_bytes(b"samples")
         sent = car(bundle, "upload", str(upload))
@@ -224,25 +182,27 @@ def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
 
 def test_systemd_starts_the_cloud_again_after_a_kill_and_stops_it(laboratory):
     def service(*options: str) -> None:
-        machine.run(sys.executable, "-m", "local.up.service", "--state", str(laboratory.state), *options)
+        machine.run(sys.executable, "-m", "local.up.service", "--state", str(state), *options)
 
     def said(key: str) -> str:
         return machine.run("systemctl", "show", NAME, "--property", key, "--value").strip()
 
+    # What is mounted in a namespace is not there.
+    state = shutil.copytree(laboratory.state, laboratory.folder / "service")
     with booted(laboratory.folder) as machine:
         service("--listen", "127.0.0.5,iort.lab", "--page", "no")
         # Starting it ends when it is ready.
-        assert said("ActiveState") == "active"
+        assert (said("ActiveState"), said("UnitFileState")) == ("active", "enabled")
         main = said("MainPID")
         machine.run("kill", "-KILL", main)
         until(lambda: said("ActiveState") == "active" and said("MainPID") not in {"0", main})
         assert said("NRestarts") == "1"
-        doctor = machine.run(str(BIN / "iort"), "doctor", IORT_STATE=str(laboratory.state))
+        doctor = machine.run(str(BIN / "iort"), "doctor", IORT_STATE=str(state))
         assert f"processes: up {said('MainPID')}, emulator " in doctor
         assert "ok    servers: all answer" in doctor
         assert "connect to iort.lab:" in machine.run("journalctl", "--identifier", "iort-cloud")
         machine.run("systemctl", "stop", NAME)
         assert (said("Result"), said("ExecMainStatus")) == ("success", "0")
-        assert not (laboratory.state / kept.UP).exists()
+        assert not (state / kept.UP).exists()
         service("--remove")
         assert said("LoadState") == "not-found"

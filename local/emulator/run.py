@@ -35,7 +35,7 @@ def main() -> None:
     streams.install(ledger)
     gaps.install()
     if path:
-        kept.install(ledger, AsyncInvocations())
+        kept.install(ledger, AsyncInvocations().queue)
         presence.install()
     Gate(ledger).install()
     alarm_timer.start(os.environ["MINISTACK_REGION"])
