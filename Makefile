@@ -15,7 +15,7 @@ setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py
 
 demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong LIVE=pubnub REPORT=report.json PORT=8080
-	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
+	@$(BIN)/python -m local.demo.run $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
 		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT)) \
 		$(if $(LIVE),--live $(LIVE))
 

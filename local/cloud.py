@@ -32,15 +32,15 @@ from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.kept import LEDGER
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
-from local import first_calls, patched
-from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT, deploy
+from local.emulator import first_calls, patched
 from local.errors import LocalError
+from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
 from local.network.listen import Listen
+from local.network.relay import Relay
 from local.processes import Child
 from local.pubnub.standin import PubNubStandIn
-from local.relay import Relay
 from local.state import StateFolder
 
 FOLDER = ROOT / EMBEDDED.parent
@@ -250,7 +250,7 @@ class EmbeddedCloud:
             log.replace(f"{log}.1")
         self.emulator = Child(
             "the emulator",
-            [sys.executable, "-m", "local.emulator"],
+            [sys.executable, "-m", "local.emulator.run"],
             environment=environment,
             cwd=ROOT,
             log=None if self._journal else log,

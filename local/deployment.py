@@ -12,7 +12,7 @@ from pathlib import Path
 from iort_contract.cloud import PUBNUB
 from iort_station.cloud import Cloud
 from local.errors import LocalError
-from local.kept import kept
+from local.made_once import kept
 from local.processes import run
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from iort_station.kept import lock_of
-from local.certificates import write_private
 from local.errors import LocalError
+from local.network.certificates import write_private
 
 # Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.
 VERSION = 1

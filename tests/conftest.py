@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from local import patched
+from local.emulator import patched
 from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
 # The duration of an example depends only on the machine.

@@ -22,7 +22,7 @@ from iort_contract.messages.requests.files import (
     part_range,
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
-from local.certificates import Authority
+from local.network.certificates import Authority
 from tests.agent_fakes import Loopback
 
 

@@ -13,8 +13,9 @@ from types import MappingProxyType
 import numpy as np
 
 from iort_analysis.drives.building import build
+from iort_analysis.drives.cleaning import MANY_WILD, wild_share
 from iort_analysis.drives.drive import Drive
-from iort_analysis.drives.motion import vescs_of
+from iort_analysis.drives.motion import moving, vescs_of
 from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
@@ -49,7 +50,11 @@ def analyse(
     It never fails because of them: what cannot be computed is in the result's ``missing``, with the reason.
     """
     drive = build(key, streams, vehicle, known)
-    mined = merge([Mined(missing=_unusable(drive)), *(_mined(name, m, drive) for name, m in miners.items())])
+    found = merge(_mined(name, m, drive) for name, m in miners.items())
+    if wild := _wild(drive):
+        reasons = {name: f"{reason}; {wild}" for name, reason in found.missing.items()}
+        found = replace(found, missing=reasons)
+    mined = merge([Mined(missing=_unusable(drive)), found])
     repairs = Counter[str]()
     for repair in drive.repairs:
         repairs[repair.kind] += repair.samples
@@ -98,6 +103,20 @@ def _finite_event(event: Event) -> Event:
     # A chance that is not known is no evidence.
     p = event.p if event.p is None or np.isfinite(event.p) else 1.0
     return event._replace(effect=event.effect if known else None, p=p)
+
+
+def _wild(drive: Drive) -> str:
+    """The motor controller's fields with wild values that the cleaning left, since they were too many."""
+    block = drive.streams.get(drive.vesc or "")
+    moves = None if block is None else moving(block.columns)
+    if block is None or moves is None:
+        return ""
+    shares = {name: wild_share(column, moves) for name, column in block.columns.items()}
+    return ", ".join(
+        f"{share:.0%} of {drive.vesc}.{name} are wild values, far from their neighbours"
+        for name, share in shares.items()
+        if share > MANY_WILD
+    )
 
 
 def _unusable(drive: Drive) -> dict[str, str]:

@@ -29,7 +29,7 @@ from bench.report.result import Table
 from bench.ros.graph import python_with_rospy
 from local.errors import LocalError
 from local.figures import Spread
-from local.proxy import FREEZE, PASS
+from local.network.proxy import FREEZE, PASS
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserType, Page

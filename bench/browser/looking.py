@@ -40,7 +40,7 @@ from iort_station.page.answers import socket
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 
 _STREAM = "vesc"
 _WATCHED = "car1"

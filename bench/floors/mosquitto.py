@@ -16,7 +16,7 @@ import yaml
 from typing_extensions import Self
 
 from bench.errors import BenchError
-from local.certificates import Authority
+from local.network.certificates import Authority
 
 HOST = "127.0.0.1"
 # The robot that `Mosquitto.car` configures.

@@ -54,7 +54,7 @@ class Up:
         """The emulator's process; None while there is none."""
         for pid in usage.descendants(self._child.pid):
             with suppress(OSError):
-                if b"local.emulator" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                if b"local.emulator.run" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     return pid
         return None
 

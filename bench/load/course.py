@@ -24,7 +24,7 @@ from iort_station.page.answers import control, socket
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 
 ROBOT, TOPIC = "driven", "/cmd_vel"
 LEASE_S = 0.5

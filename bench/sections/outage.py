@@ -27,7 +27,7 @@ from iort_contract.tables import BATCH
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.operations.delivery import audit, counts
-from local.proxy import PASS, REFUSE, Proxy
+from local.network.proxy import PASS, REFUSE, Proxy
 
 ROBOT = "bench-outage"
 RATE_HZ = 50

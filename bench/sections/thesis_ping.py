@@ -25,7 +25,7 @@ from iort_station.fleet.robots import Bundle
 from iort_station.page import keys
 from iort_station.page.live.listener import Listener
 from local.figures import THESIS, THESIS_MS
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 
 ONE_WAY_S = PING_MS / 2 / 1000
 WITH = f"with {ONE_WAY_S * 1000:.0f} ms each way"

@@ -1,1 +1,1 @@
-"""What a kept cloud shows of itself in a network: where it listens, and the door to the files."""
+"""The sockets of an embedded cloud: certificates, addresses, the door to the files, a relay for browsers."""

@@ -7,9 +7,9 @@ import re
 import socket
 from dataclasses import dataclass
 
-from local.certificates import is_address, spelled
 from local.errors import LocalError
 from local.network.addresses import is_ipv6
+from local.network.certificates import is_address, spelled
 
 HTTPS_PORT = 443
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")

@@ -11,9 +11,9 @@ from pathlib import Path
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from local.certificates import write_private
 from local.errors import LocalError
 from local.network.addresses import client_of
+from local.network.certificates import write_private
 
 LEAST_CHARACTERS = 10
 _MOST_CHARACTERS = 1_000

@@ -16,7 +16,7 @@ from aiohttp import web
 from iort_contract.page import HEADERS
 from iort_station.page.server import PageServer
 from local.network.listen import Listen
-from local.relay import pass_socket
+from local.network.relay import pass_socket
 from local.up.login import SESSION_S, Password, Sessions, Tries
 
 # Browsers take a cookie of this name over TLS only, and for this host alone.

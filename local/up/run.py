@@ -23,10 +23,10 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
-from local.certificates import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from local.network.addresses import is_ipv6
+from local.network.certificates import write_private
 from local.network.listen import Listen
 from local.state import VERSION, StateFolder
 from local.up import notify, options

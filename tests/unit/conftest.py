@@ -66,7 +66,7 @@ def tables():
     One stack is synthesized, not the app, and only if its sources have changed since the last time.
     """
     from local.deployment import ROOT, sources
-    from local.kept import kept
+    from local.made_once import kept
 
     def synthesize(folder):
         from aws_cdk import App, assertions

@@ -27,6 +27,11 @@ _MAD_TO_SIGMA = 1.4826
 # An outlier is also further away than this share of the range in which the field nearly always is, and than
 # this many times the distance that all but this share of its values keep.
 _LEAST_SHARE, _TIMES, _USUAL = 0.15, 4.0, 0.98
+# A value is wild that is further from its neighbours than this many times the range in which the field
+# mostly is while the car moves. Few of them widen the range of nearly all values, and so hide each other.
+_WILD_TIMES, _MOSTLY = 10.0, (0.05, 0.95)
+# So many of them after the cleaning are worth a word; half of the values bound them then.
+MANY_WILD, _HALF_OF_THEM = 0.01, (0.25, 0.75)
 # Enough values for a quantile.
 _ENOUGH = 20_000
 # Angles jump from pi to -pi.
@@ -76,7 +81,7 @@ class _Cleaning:
 
     def __init__(self, stream: str, times: NDArray[np.int64], moves: NDArray[np.bool_]) -> None:
         self._stream, self._times = stream, times
-        self._moved = np.append(0, np.cumsum(moves))
+        self._moves, self._moved = moves, np.append(0, np.cumsum(moves))
         self.repairs: list[Repair] = []
 
     def count_gaps(self) -> None:
@@ -133,6 +138,7 @@ class _Cleaning:
         away = np.abs(column - _median_of_five(column))
         low, high = _quantiles(column, [0.01, 0.99])
         least = max(_TIMES * _quantiles(away, [_USUAL])[0], _LEAST_SHARE * (high - low))
+        least = min(least, _WILD_TIMES * _width(column[self._moves], _MOSTLY) or least)
         with np.errstate(invalid="ignore"):
             candidates = np.flatnonzero(away > least)
         if not len(candidates) or not least:
@@ -178,6 +184,21 @@ def _quantiles(column: Column, shares: list[float]) -> list[float]:
     known = known[~np.isnan(known)]
     found: list[float] = np.quantile(known, shares).tolist() if len(known) else [0.0] * len(shares)
     return found
+
+
+def _width(column: Column, shares: tuple[float, float]) -> float:
+    """The range of so much of the values."""
+    low, high = _quantiles(column, list(shares))
+    return high - low
+
+
+def wild_share(column: Column, moves: NDArray[np.bool_]) -> float:
+    """The share of values, single ones, that are far from their neighbours, of a field that was cleaned."""
+    width = _width(column[moves], _HALF_OF_THEM)
+    if len(column) < _FEWEST or not width:
+        return 0.0
+    with np.errstate(invalid="ignore"):
+        return float(np.mean(np.abs(column - _median_of_five(column)) > _WILD_TIMES * width))
 
 
 def _median_of_five(column: Column) -> Column:

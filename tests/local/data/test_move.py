@@ -38,7 +38,7 @@ from iort_station.operations import archive, quarantine
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.proxy import REFUSE, Proxy
+from local.network.proxy import REFUSE, Proxy
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
 from tests.local.data.test_archive import HOUR_US, START, stored

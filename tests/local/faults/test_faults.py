@@ -22,7 +22,7 @@ from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.fleet import robots
 from iort_station.operations.delivery import accounts, audit, counts
 from local.cloud import EmbeddedCloud
-from local.proxy import FREEZE, PASS, REFUSE, Proxy
+from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
 from tests.local.data.drives import RATE_HZ, Agent, counted, counter_log
 from tests.local.faults.test_uplink import set_status

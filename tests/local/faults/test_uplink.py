@@ -22,7 +22,7 @@ from iort_agent.mqtt.reconnect import SLOW_SHORTEST_S
 from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from local.proxy import FREEZE, PASS, REFUSE, Proxy
+from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
 from verify.tools.robot import Robot
 

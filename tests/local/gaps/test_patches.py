@@ -11,8 +11,8 @@ import sys
 
 import pytest
 
-from local import patched
 from local.deployment import ROOT
+from local.emulator import patched
 from local.errors import LocalError
 from tests.local.gaps import gap_probes
 

@@ -20,9 +20,9 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from local import patched
-from local.certificates import Authority
 from local.deployment import ROOT
+from local.emulator import patched
+from local.network.certificates import Authority
 from local.processes import Child
 from tests.ports import free_port
 
@@ -34,7 +34,7 @@ _POLL_S = 0.05
 class Emulator:
     """The emulator's process and its clients; `kill` and `start` as often as wanted."""
 
-    sync, arguments = "normal", ("-m", "local.emulator")
+    sync, arguments = "normal", ("-m", "local.emulator.run")
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -19,7 +19,7 @@ class Failing(Emulator):
         "-c",
         """
 import os, signal
-from local.emulator import main
+from local.emulator.run import main
 
 def fails(_file):
     raise OSError(5, "Input/output error")

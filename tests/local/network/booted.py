@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -72,12 +72,24 @@ def booted(folder: Path) -> Iterator[Booted]:
         orphaned=signal.SIGTERM,
     )
     try:
-        children = Path(f"/proc/{child.pid}/task/{child.pid}/children")
-        until(lambda: child.poll() is not None or children.read_text().split())
+        first = until(lambda: child.poll() is not None or _first(child.pid))
         if child.poll() is not None:
             pytest.skip(f"this machine boots no systemd in namespaces:\n{child.tail()}")
-        machine = Booted(int(children.read_text().split()[0]))
+        machine = Booted(first)
         until(machine.is_up)
         yield machine
     finally:
         child.stop()
+        # It leaves this one, and says so.
+        shutil.rmtree(f"/run/systemd/nspawn/propagate/{name}", ignore_errors=True)
+
+
+def _first(tool: int) -> int | None:
+    """The first process of the new namespaces; the tool has another child before it."""
+    for child in Path(f"/proc/{tool}/task/{tool}/children").read_text().split():
+        with suppress(FileNotFoundError):
+            status = Path(f"/proc/{child}/status").read_text().splitlines()
+            numbers = next(line for line in status if line.startswith("NSpid:")).split()
+            if len(numbers) > 2 and numbers[-1] == "1":
+                return int(child)
+    return None

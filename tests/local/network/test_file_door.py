@@ -15,8 +15,8 @@ import pytest
 from botocore.config import Config
 
 from iort_contract.messages.requests.files import PART_BYTES
-from local.certificates import Authority, ServerCertificate
 from local.network import file_door
+from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
 from tests.local.conftest import until
 

@@ -17,9 +17,9 @@ import pytest
 from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.kept import owner
-from local.certificates import Authority, ServerCertificate
 from local.deployment import ROOT
 from local.errors import LocalError
+from local.network.certificates import Authority, ServerCertificate
 from local.network.listen import Listen
 from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
@@ -102,6 +102,23 @@ def test_down_never_ends_a_process_that_only_has_the_number_of_an_earlier_cloud(
         assert not stop(tmp_path / "cloud")
         stranger.communicate(b"\n")
     assert stranger.returncode == 0
+
+
+def test_who_asks_for_the_owner_is_in_no_starts_way(tmp_path, monkeypatch):
+    code = (
+        "import sys; from contextlib import ExitStack; from pathlib import Path; "
+        "from local.state import StateFolder\n"
+        "with ExitStack() as stack:\n"
+        "    StateFolder(Path(sys.argv[1]), kept=True).take(stack); print('up', flush=True); input()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    cloud = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "cloud")], cwd=ROOT, **pipes)
+    with cloud:
+        assert cloud.stdout.readline() == b"up\n"
+        monkeypatch.setattr(kept.fcntl, "flock", lambda *_: pytest.fail("it takes the lock"))
+        assert owner(tmp_path / "cloud") == cloud.pid
+        cloud.communicate(b"\n")
+    assert owner(tmp_path / "cloud") is None
 
 
 def test_nobody_else_can_lock_the_folder(state):

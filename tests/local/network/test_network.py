@@ -192,7 +192,7 @@ def test_systemd_starts_the_cloud_again_after_a_kill_and_stops_it(laboratory):
     with booted(laboratory.folder) as machine:
         service("--listen", "127.0.0.5,iort.lab", "--page", "no")
         # Starting it ends when it is ready.
-        assert said("ActiveState") == "active"
+        assert (said("ActiveState"), said("UnitFileState")) == ("active", "enabled")
         main = said("MainPID")
         machine.run("kill", "-KILL", main)
         until(lambda: said("ActiveState") == "active" and said("MainPID") not in {"0", main})

@@ -12,7 +12,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from iort_contract.cloud import IOT
-from local.certificates import LASTS_S, ServerCertificate
+from local.network.certificates import LASTS_S, ServerCertificate
 from local.network.listen import Listen
 from local.up import network_page
 from local.up.login import TRIES, Password

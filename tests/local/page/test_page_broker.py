@@ -14,7 +14,7 @@ from iort_contract.topics import LIVE, build_topic
 from iort_station.page.answers import socket
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
-from local.proxy import Proxy
+from local.network.proxy import Proxy
 from tests.browser import plain, show, shown, until
 
 if TYPE_CHECKING:

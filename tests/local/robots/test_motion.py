@@ -17,7 +17,7 @@ from iort_contract.messages.control.shadow import decode_reported
 from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations.delivery import counts
-from local.demo import DOWNLINK
+from local.demo.run import DOWNLINK
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import Shadow, driving
 

@@ -27,7 +27,7 @@ from iort_agent.errors import AgentError
 from iort_agent.status.server import SOCKET, fetch
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from local.proxy import PASS, REFUSE, Proxy
+from local.network.proxy import PASS, REFUSE, Proxy
 from tests.local.conftest import embedded, iort, until  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read

@@ -148,7 +148,8 @@ def embedded():
     the import changes it."""
     program = """
 import json
-from local import gaps, patched
+from local import gaps
+from local.emulator import patched
 patched.use()
 from ministack.services import iot
 gaps.install()

@@ -85,3 +85,20 @@ def test_an_hour_takes_a_fraction_of_a_second() -> None:
 
     assert result.samples == 270_000
     assert took_s < 1
+
+
+def test_wild_values_are_repaired_and_named_where_they_are_too_many() -> None:
+    healthy = analyse(KEY, streams(), VEHICLE).mined
+    chance = np.random.default_rng(3)
+    for share, is_named in ((0.02, False), (0.2, True)):
+        vesc = streams()["vesc"]
+        wild = chance.random(len(vesc.times_us)) < share
+        current = np.where(wild, chance.uniform(-1e4, 1e4, len(wild)), vesc.columns["current_motor"])
+        made = {**streams(), "vesc": Block(vesc.times_us, {**vesc.columns, "current_motor": current})}
+        mined = analyse(KEY, made, VEHICLE).mined
+        lost = healthy.estimates.keys() - mined.estimates.keys()
+        assert ("motor_resistance_ohm" in lost) == bool(lost) == is_named
+        assert all("% of vesc.current_motor are wild values" in mined.missing[name] for name in lost)
+        if not is_named:
+            before = healthy.estimates["motor_resistance_ohm"]
+            assert before.low < mined.estimates["motor_resistance_ohm"].value < before.high

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from local.certificates import Authority
-from local.relay import Relay
+from local.network.certificates import Authority
+from local.network.relay import Relay
 
 REFUSED, NO_GATEWAY = 403, 502
 

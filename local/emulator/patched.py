@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from local.errors import LocalError
-from local.kept import kept
+from local.made_once import kept
 
-_ROOT = Path(__file__).resolve().parent.parent
+_ROOT = Path(__file__).resolve().parents[2]
 PATCHES = tuple(sorted((_ROOT / "local" / "patches").glob("*.patch")))
 
 

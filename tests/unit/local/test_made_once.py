@@ -1,4 +1,4 @@
-"""local/kept.py: folders that several processes make at the same time."""
+"""local/made_once.py: folders that several processes make at the same time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from local.kept import kept
+from local.made_once import kept
 
 
 def _make(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """`make demo`: a car drives through the embedded cloud, and the demo counts the samples that arrive.
 
-python -m local.demo --duration 20 --bag drive.bag --report report.json
+python -m local.demo.run --duration 20 --bag drive.bag --report report.json
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from iort_station.page.answers.index import actions, answers
 from iort_station.page.answers.socket import reaching
 from iort_station.page.live.listening import Listening, listening
 from iort_station.page.server import PageServer
-from local import demo_options
 from local.cloud import EmbeddedCloud
+from local.demo import options
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.figures import Figures, Spread, round_trips
@@ -67,7 +67,7 @@ _LOOK_S = 1.0
 
 def main() -> None:
     """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
-    options = demo_options.read()
+    given = options.read()
     stopped = threading.Event()
 
     def interrupt(_signal: int, _frame: object) -> NoReturn:
@@ -80,7 +80,7 @@ def main() -> None:
         signal.signal(number, interrupt)
     console = Console()
     try:
-        figures = _Demo(options, console, stopped).run()
+        figures = _Demo(given, console, stopped).run()
     except (LocalError, StationError) as error:
         console.print(f"demo: {error}", style="red", markup=False, highlight=False)
         sys.exit(2)
@@ -96,8 +96,8 @@ def main() -> None:
 
 
 class _Demo:
-    def __init__(self, options: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
-        self._options, self._console, self._stopped = options, console, stopped
+    def __init__(self, given: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
+        self._options, self._console, self._stopped = given, console, stopped
         self._began = time.monotonic()
 
     def run(self) -> Figures:

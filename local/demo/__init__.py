@@ -1,0 +1,1 @@
+"""`make demo`: a car drives through an embedded cloud that is thrown away."""
