@@ -21,9 +21,9 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench import ROOT, spending
+from bench import ROOT
 from bench.command import confirm, wound_up
-from bench.report import machine, writer
+from bench.report import machine, spending, writer
 from bench.report.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target

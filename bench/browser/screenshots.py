@@ -2,13 +2,14 @@
 
 On the embedded cloud: one real agent drives a simulated car through everything, and other cars are
 published to PubNub's stand-in as Lambda 1 would, so that there is a fleet to see, with a fault, a car that
-is gone, poses and accelerations.
+is gone, poses and accelerations. A second agent drives a healthy car, for `iort plot`.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
+import subprocess
 import sys
 import tempfile
 import threading
@@ -38,18 +39,21 @@ from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data.analysis import findings
+from iort_station.data.analysis.laps import laps_of_runs
 from iort_station.data.runs import runs
 from iort_station.fleet import robots
+from iort_station.kept import CLOUD
 from iort_station.page.answers import control
 from iort_station.page.answers.downloads import downloads
 from iort_station.page.answers.index import actions, answers
 from iort_station.page.server import PageServer
+from iort_station.times import iso
 from local.cloud import EmbeddedCloud
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100
-_REAL = "car1"
-_FLEET = 11
+_REAL, _HEALTHY = "car1", "car12"
+_FLEET = 10
 _FAULTY, _STOPS, _SENSES = 4, 7, 1
 # What the analysis finds in the real car, and the drives of the healthy one before.
 _FAULT = {"kind": "worn_battery", "strength": "strong"}
@@ -60,20 +64,26 @@ VIEWS = {
     "fleet": "#/",
     "car": "#/car/car2",
     "history": f"#/history/{_REAL}",
+    "compare": "#/compare",
     "insights": f"#/insights/{_REAL}",
+    "alarms": "#/alarms",
     "cloudwatch": "#/cloudwatch",
 }
+PLOT = "plot"
+_PLOTTED = "speed_mps,current_motor,voltage_input"
 _FILL_S = 65.0
 _SETTLE_MS = 4_000
+# The laps of a whole run, beside everything else.
+_LAPS_MS = 90_000
 
 Theme = Literal["dark", "light"]
 
 
 def main() -> None:
-    """Drive, look, and write one picture a view, theme and width."""
+    """Drive, look, and write one picture a view, theme and width; and what `iort plot` draws."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--only", choices=[*VIEWS], nargs="*", default=[*VIEWS])
+    parser.add_argument("--only", choices=[*VIEWS, PLOT], nargs="*", default=[*VIEWS, PLOT])
     options = parser.parse_args()
     try:
         _take(options.only, options.out)
@@ -88,7 +98,7 @@ def _take(views: Sequence[str], out: Path) -> None:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cloud = stack.enter_context(EmbeddedCloud(folder / "local"))
         stack.enter_context(_driving(cloud, folder))
-        vehicles = {f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 1)}
+        vehicles = {f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 2)}
         server = PageServer(
             namespace=cloud.namespace,
             **cloud.keys.reading(),
@@ -107,7 +117,12 @@ def _take(views: Sequence[str], out: Path) -> None:
         threading.Event().wait(_FILL_S)
         if "insights" in views:
             _analyse(cloud.cloud)
+        if PLOT in views:
+            _plot(folder / "local" / CLOUD, out / "plot.png")
+        addresses = {**VIEWS, "compare": _compared(cloud.cloud)}
         for view in views:
+            if view == PLOT:
+                continue
             on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
             looks: list[tuple[str, str, Theme]] = [
                 ("dark", "laptop", "dark"),
@@ -115,7 +130,7 @@ def _take(views: Sequence[str], out: Path) -> None:
                 ("phone", "phone", on_phone),
             ]
             for name, device, theme in looks:
-                _look(pages[device], server.url + VIEWS[view], theme)
+                _look(pages[device], server.url + addresses[view], theme)
                 _write(out / f"{view}-{name}.webp", pages[device].screenshot())
 
 
@@ -134,6 +149,8 @@ def _look(page: Any, address: str, theme: Theme) -> None:
     page.goto(address)
     if "/history/" in address:
         _scrub(page)
+    if "/compare" in address:
+        page.wait_for_selector("#part-lap option:nth-child(2)", state="attached", timeout=_LAPS_MS)
     if address.endswith("/cloudwatch"):
         page.wait_for_selector("#dashboard option", state="attached")
         page.select_option("#minutes", "15")
@@ -153,9 +170,12 @@ def _scrub(page: Any) -> None:
 @contextmanager
 def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
     """Run the real agent and the other cars until the block ends."""
-    source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3, "faults": [_FAULT]}
-    settings = {"sources": [source], "ping": {"rate_hz": 2}, "live": {"when": "always"}}
-    bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
+    source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3}
+    settings = {"ping": {"rate_hz": 2}, "live": {"when": "always"}}
+    bundles = [
+        robots.add(cloud.cloud, name, out=folder, settings={**settings, "sources": [{**source, **more}]})
+        for name, more in ((_REAL, {"faults": [_FAULT]}), (_HEALTHY, {}))
+    ]
     pubnub = cloud.keys
     publisher = Publisher(
         origin=pubnub.origin, publish_key=pubnub.publish_key, subscribe_key=pubnub.subscribe_key
@@ -169,7 +189,9 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
         threading.Timer(50, lambda: setattr(cars[_FAULTY], "fault_code", 5)),
         threading.Timer(55, lambda: cars.pop(_STOPS)),
     ]
-    with AgentProcess(bundle, drain_s=0.0):
+    with ExitStack() as agents:
+        for bundle in bundles:
+            agents.enter_context(AgentProcess(bundle, drain_s=0.0))
         driving.start()
         for event in events:
             event.start()
@@ -210,6 +232,32 @@ def _analyse(cloud: Cloud) -> None:
         )
     for finding in evaluate([result], [one.measured for one in earlier], []):
         table.put_finding(finding)
+
+
+def _compared(cloud: Cloud) -> str:
+    """The address of the real car's first and last complete lap, over distance."""
+    (run,) = laps_of_runs(cloud, _REAL, None, None, count=1)
+    laps = run.mined.tables["laps"]
+    parts = []
+    for row in (0, -1):
+        start_us = int(laps["start_us"][row])
+        parts.append(f"{_REAL}/{iso(start_us)}/{iso(start_us + int(laps['time_s'][row] * 1e6))}")
+    return f"#/compare?runs={','.join(parts)}&stream={VESC_STREAM}&x=distance"
+
+
+def _plot(cloud: Path, out: Path) -> None:
+    """Have `iort plot` draw the two real cars."""
+    command: list[str | Path] = [
+        Path(sys.executable).with_name("iort"),
+        "--embedded",
+        cloud,
+        "plot",
+        _HEALTHY,
+        VESC_STREAM,
+    ]
+    subprocess.run(
+        [*command, "--with", _REAL, "--last", "1m", "--fields", _PLOTTED, "--force", "--out", out], check=True
+    )
 
 
 def _write(path: Path, png: bytes) -> None:

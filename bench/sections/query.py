@@ -19,8 +19,8 @@ from boto3.dynamodb.conditions import Attr, Key
 from bench.errors import BenchError
 from bench.load import stored_drive
 from bench.load.simulated import RATE_HZ
-from bench.message_sizes import item_bytes
 from bench.meters import usage
+from bench.meters.message_sizes import item_bytes
 from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio

@@ -1,4 +1,4 @@
-"""The sizes of messages and items, as measured by `python -m bench.message_sizes`.
+"""The sizes of messages and items, as measured by `python -m bench.meters.message_sizes`.
 
 The command encodes a simulated drive with the agent's code; a test compares this table with it.
 """

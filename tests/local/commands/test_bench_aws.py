@@ -9,8 +9,9 @@ import json
 import pytest
 from botocore.exceptions import ClientError
 
-from bench import run, spending
+from bench import run
 from bench.load.events import live_event
+from bench.report import spending
 from bench.sections import SECTIONS, utilisation
 from bench.target import AWS, open_target
 from iort_station.fleet import robots

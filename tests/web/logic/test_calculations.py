@@ -21,6 +21,16 @@ def test_the_noise_of_positions_is_no_way() -> None:
     assert found[-1] == pytest.approx(10, rel=0.1)
 
 
+def test_a_tachometer_counts_samples_that_were_taken_at_once_and_no_restart() -> None:
+    # 50 Hz at 5 m/s, in bursts of ten within a millisecond; then the VESC starts again from zero.
+    times = [i // 10 * 0.2 + i % 10 / 10_000 for i in range(200)]
+    # 1 m is 100 counts: at 1 m/s a minute has 6,000, of six a revolution.
+    counts = [1_000_000 + 10 * i for i in range(100)] + [10 * i for i in range(100)]
+    speed = {"scale": 1 / 1000, "shift": 0}
+    drive = {"times_s": times, "fields": {"distance_traveled": {"mean": counts}}}
+    assert call("history/align.ts", "distance", drive, speed)[-1] == pytest.approx(19.8)
+
+
 @pytest.mark.parametrize(
     ("splits", "labels"),
     [

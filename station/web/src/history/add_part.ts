@@ -55,6 +55,7 @@ export class AddPart {
     this.offer([]);
     this.note.set("");
     if (!NAME.test(robot)) return;
+    this.run.replaceChildren(el("option", {}, "Loading …"));
     try {
       const { runs } = await ask<RunsAnswer>("runs", { robot, count: String(RUNS) });
       if (robot !== this.robot.value.trim() || stream !== this.stream) return;
@@ -64,7 +65,9 @@ export class AddPart {
       if (parts.length === 0) this.note.set(`${robot} has no runs of ${stream}.`);
       await this.findLaps();
     } catch (error) {
-      if (robot === this.robot.value.trim()) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (robot !== this.robot.value.trim()) return;
+      this.run.replaceChildren();
+      this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
   }
 

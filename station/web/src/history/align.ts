@@ -15,6 +15,8 @@ export interface Line {
 const COUNTERS = ["distance_traveled", "displacement"];
 // A count that changes faster has begun anew, after a restart of its VESC.
 const MOST_MPS = 100;
+// A computer that was busy takes the samples that waited all at once: their times say nothing of a speed.
+const LEAST_STEP_S = 0.1;
 // Shorter steps between positions count once they add up: they may be the noise of a car that stands.
 const LEAST_STEP_M = 0.1;
 const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
@@ -32,7 +34,7 @@ export function distance({ times_s, fields }: HistoryAnswer, speed: Linear | und
     const metres = Math.abs(speed.scale) * (60 / TACHOMETER_COUNTS);
     return summed(rows, [counter], (i, before) => {
       const step = Math.abs(Number(counter[i]) - Number(counter[before])) * metres;
-      return step > MOST_MPS * (times_s[i]! - times_s[before]!) ? 0 : step;
+      return step > MOST_MPS * Math.max(LEAST_STEP_S, times_s[i]! - times_s[before]!) ? 0 : step;
     });
   }
   for (const path of POSITIONS) {

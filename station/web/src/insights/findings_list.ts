@@ -32,7 +32,7 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
       ...(named ? [el("a", { class: "tool", href: route({ view: "insights", robot }) }, robot)] : []),
       el("span", { class: "note" }, `${dayTime(from)} ${zone(from)}`),
     ),
-    el("p", {}, capital(text)),
+    el("p", {}, ...marked(capital(text))),
     ...(effect ? [size(finding)] : []),
     el("p", {}, el("b", {}, "What to do: "), ...marked(action)),
     el("p", { class: "seen" }, el("a", { class: "tool", href: route({ view: "history", robot, query }) }, "Show the evidence"), ...chance),

@@ -7,10 +7,12 @@ from typer.testing import CliRunner
 
 from iort_contract.messages.analysis.findings import DriveKey, Estimate
 from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.page import PAGE_URL, history_link
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.data.analysis import findings
 from iort_station.fleet import registry
+from tests.unit.functions.test_analysis import finding
 
 TOO_SHORT = "the drive must last 240 s"
 
@@ -28,16 +30,24 @@ def iort(monkeypatch):
     return run
 
 
-def test_a_reason_that_many_share_is_said_once_and_a_share_has_no_unit(iort):
+def test_a_reason_that_many_share_is_said_once_and_a_share_is_in_percent(iort):
     missing = {"temperature_drift_k": TOO_SHORT, "vesc": "no motor controller", "controller_lag_s": TOO_SHORT}
     shares = {"style_standing_share": Estimate(0.14, 0.07, 0.26, "1")}
     key = DriveKey("car7", 0, "0badcafe")
 
     said = iort([AnalysedDrive(key, 60_000_000, "job", 3000, shares, missing, {})])
 
-    assert "style_standing_share 0.14 (0.07 to 0.26)" in said
+    assert "style_standing_share 14 % (7 to 26)" in said
     # A narrow terminal takes a second line.
     assert f"missing temperature_drift_k, controller_lag_s: {TOO_SHORT}" in " ".join(said)
+
+
+def test_the_link_to_the_evidence_is_in_one_piece(monkeypatch):
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: None)
+    one = finding()
+    monkeypatch.setattr(findings, "findings", lambda *_given, most: [one][:most])
+    done = CliRunner().invoke(app, ["findings", "car7"], env={"COLUMNS": "60"})
+    assert f" evidence {history_link(PAGE_URL, one)}\n" in done.output
 
 
 def test_a_range_without_an_analysed_drive_says_so(iort):

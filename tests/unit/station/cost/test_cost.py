@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from bench import message_sizes
 from bench.load.simulated import simulated_drive
+from bench.meters import message_sizes
 from functions.shared.metrics import Gathered, emit
 from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S

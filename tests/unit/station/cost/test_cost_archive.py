@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from bench import message_sizes
+from bench.meters import message_sizes
 from iort_station.cli.main import app
 from iort_station.cost import sizes
 from iort_station.cost.bill import analysing, archiving, model

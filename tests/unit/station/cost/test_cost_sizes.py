@@ -6,8 +6,8 @@ from dataclasses import asdict
 
 import pytest
 
-from bench import message_sizes
 from bench.load.simulated import simulated_drive
+from bench.meters import message_sizes
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_station.cost import sizes
 
@@ -25,7 +25,7 @@ def test_each_item_of_a_second_fits_in_one_write_unit():
 def test_the_table_of_sizes_matches_measured_sizes(row):
     # Versions of zlib differ a little in size.
     fresh = message_sizes.batch_sizes(row.samples, 1.0)
-    assert row == pytest.approx(fresh, rel=0.03), "put in what `python -m bench.message_sizes` prints"
+    assert row == pytest.approx(fresh, rel=0.03), "put in what `python -m bench.meters.message_sizes` prints"
 
 
 def test_the_other_sizes_match_measured_sizes():

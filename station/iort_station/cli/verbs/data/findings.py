@@ -71,7 +71,8 @@ def _show(one: Finding) -> None:
         Text.assemble(
             f"{iso_s(one.from_us)}  {one.drive.robot}  ",
             (f"{one.severity}: {one.text}", _STYLES.get(one.severity, "")),
-        )
+        ),
+        soft_wrap=True,
     )
     rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
     rows.add_column(width=8)
@@ -82,15 +83,17 @@ def _show(one: Finding) -> None:
         rows.add_row("before", _interval(one.baseline))
     if one.q is not None:
         rows.add_row("false", f"at most {one.q:.2g} of such findings")
-    rows.add_row("evidence", history_link(PAGE_URL, one))
     if kind is not None:
         rows.add_row("to do", kind.action)
     out.print(rows)
+    # In one piece, to be clicked or copied.
+    out.print(Text(f" evidence {history_link(PAGE_URL, one)}"), soft_wrap=True)
 
 
 def _interval(estimate: Estimate) -> str:
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    return f"{estimate.value:.4g}{unit} ({estimate.low:.4g} to {estimate.high:.4g})"
+    factor, unit = (100, "%") if estimate.unit == "1" else (1, estimate.unit)
+    value, low, high = (each * factor for each in (estimate.value, estimate.low, estimate.high))
+    return f"{value:.4g} {unit} ({low:.4g} to {high:.4g})"
 
 
 def _show_drive(one: AnalysedDrive) -> None:

@@ -1,6 +1,6 @@
 """Measures the sizes of messages and items, by encoding a simulated drive.
 
-    python -m bench.message_sizes
+    python -m bench.meters.message_sizes
 
 prints the constants of station/iort_station/cost/sizes.py, on which the cost model rests.
 """
