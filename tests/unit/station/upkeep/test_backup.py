@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import gzip
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -12,10 +13,12 @@ import tarfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from iort_station.errors import StationError
+from iort_station.upkeep import backup
 from iort_station.upkeep.backup import back_up
 from iort_station.upkeep.restore import restore, verify
 from iort_station.upkeep.state import held
@@ -191,3 +194,36 @@ def test_a_restore_does_not_touch_a_state_that_is_there(state: Path, tmp_path: P
     assert not (state / "since").exists()
     with pytest.raises(StationError, match="has no kept cloud"):
         back_up(tmp_path / "nothing", tmp_path / "other.tar")
+
+
+def test_a_backup_overwrites_nothing_and_needs_room(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = tmp_path / "cloud.tar"
+    archive.write_text("mine")
+    with pytest.raises(StationError, match="exists"):
+        back_up(state, archive)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000))
+    with pytest.raises(StationError, match=r"must have 1\.0 GB free for this, got 0\.0 GB"):
+        back_up(state, archive, force=True)
+    assert archive.read_text() == "mine"
+
+
+def test_a_backup_of_another_format_or_with_a_broken_database_is_not_restored(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "broken"
+    with closing(sqlite3.connect(broken)) as database:
+        database.execute("CREATE TABLE n (n)")
+        database.commit()
+    broken.write_bytes(broken.read_bytes()[:4096] + b"x" * 4096)
+    files = {"VERSION": state / "VERSION", "ledger.db": broken}
+    with (tmp_path / "cloud.tar").open("wb") as archive:
+        backup._write(archive, files, 0.0, lambda _bytes: None)
+    with pytest.raises(StationError, match=r"database ledger\.db is damaged"):
+        restore(tmp_path / "cloud.tar", tmp_path / "restored")
+    monkeypatch.setattr(backup, "FORMAT", 2)
+    back_up(state, tmp_path / "newer.tar")
+    with pytest.raises(StationError, match="must have format 1, got 2"):
+        restore(tmp_path / "newer.tar", tmp_path / "restored")
+    assert not (tmp_path / "restored").exists()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from datetime import datetime, timezone
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import boto3
@@ -17,7 +20,7 @@ from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.upkeep import deployment, doctor, machine
 from iort_station.upkeep.finding import FAIL, OK, WARN
-from iort_station.upkeep.state import held
+from iort_station.upkeep.state import LAST_BACKUP, held
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
 
 DAY_S = 86_400
@@ -182,3 +185,16 @@ def test_the_facts_of_a_process_and_of_its_children():
     assert not machine.runs(child.pid)
     assert machine.memory().total > machine.memory().available > 0
     assert machine.clock_is_set() in (True, False)
+
+
+@pytest.mark.parametrize(("told", "level"), [(6, OK), (8, WARN), ("{", WARN)])
+def test_an_old_backup_is_told(folder, told, level):
+    made = {"made_s": time.time() - told * DAY_S, "file": "/mnt/cloud.tar"} if told != "{" else None
+    (folder / LAST_BACKUP).write_text(json.dumps(made) if made else told)
+    assert looked(doctor.of_kept(folder))["backup"].level == level
+
+
+def test_a_cloud_of_another_release_is_told(folder):
+    up = kept.Up.load(folder)
+    assert doctor._version(up).level == WARN
+    assert doctor._version(replace(up, versions={"iort": version("iort-station")})).level == OK
