@@ -30,7 +30,7 @@ OPEN_MOST_S = 2.5
 # Between the moment at which the emulator answers again and the next kill; and how long the disk is full.
 _LEAST_S, _MOST_S = 0.3, 6.0
 _FULL_LEAST_S, _FULL_MOST_S = 3.0, 10.0
-_SUMMARY_S = 120.0
+_FIRST_S, _SUMMARY_S = 60.0, 120.0
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class AgentKill:
 class Kills:
     """What was killed how often, and what the audit found of each car afterwards.
 
-    ``open_s`` has, by car, how far before each kill of its agent the last stored sample was taken. Runs that
-    were killed before their first batch are not among them.
+    ``open_s`` has, by car, how long before each kill of its agent the last stored sample was taken; None for
+    a run that was killed before its first batch.
     """
 
     killed: dict[str, int]
@@ -56,7 +56,7 @@ class Kills:
     restart_s: Spread | None
     cars: dict[str, Counted]
     agent_kills: dict[str, int]
-    open_s: dict[str, list[float]]
+    open_s: dict[str, list[float | None]]
 
     @property
     def good(self) -> bool:
@@ -67,7 +67,7 @@ class Kills:
             and one.killed_runs <= self.agent_kills.get(name, 0)
             for name, one in self.cars.items()
         )
-        return there and all(one <= OPEN_MOST_S for each in self.open_s.values() for one in each)
+        return there and all((one or 0) <= OPEN_MOST_S for each in self.open_s.values() for one in each)
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -81,7 +81,7 @@ class Kills:
                 f"{one.batches:,}",
                 f"{one.samples:,}",
                 f"**{one.lost:,}**" if one.lost else "0",
-                ", ".join(f"{open_s:.2f}" for open_s in self.open_s.get(name, ())) or "-",
+                ", ".join("all" if one is None else f"{one:.2f}" for one in self.open_s.get(name, ())) or "-",
                 f"{one.duplicated:,}",
                 f"{one.summarized:,} of {one.expected:,}",
             )
@@ -123,6 +123,7 @@ def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Ki
             ways["full disk"] = lambda: _full(small, up, chance.uniform(_FULL_LEAST_S, _FULL_MOST_S))
         else:
             say("the disk is never full: this machine allows nobody a mount namespace of his own")
+        _wait_until_driving(cloud)
         began = time.monotonic()
         # Each way comes, whatever the dice say.
         order = [*ways, *chance.choices(sorted(ways), k=max(0, kills - len(ways)))][:kills]
@@ -164,20 +165,30 @@ def _full(small: disk.Disk, up: Up, seconds: float) -> float:
     return 0.0
 
 
+def _wait_until_driving(cloud: Cloud) -> None:
+    """Wait for the first batch of each car."""
+    deadline = time.monotonic() + _FIRST_S
+    for i in range(CARS):
+        while next(audit.headers(cloud, f"car{i + 1}", VESC_STREAM), None) is None:
+            if time.monotonic() > deadline:
+                raise BenchError(f"car{i + 1} has sent no batch in {_FIRST_S:.0f} s")
+            threading.Event().wait(0.2)
+
+
 def _stored(cloud: Cloud) -> int:
     return sum(1 for i in range(CARS) for _ in audit.headers(cloud, f"car{i + 1}", VESC_STREAM))
 
 
-def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[float]]:
-    """How long before each kill of an agent the last stored sample of that run was taken."""
-    found = defaultdict(list)
+def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[float | None]]:
+    """How long before each kill of an agent the last stored sample of that run was taken: see `Kills`."""
+    found: dict[str, list[float | None]] = defaultdict(list)
     for robot in dict.fromkeys(one.robot for one in agent_kills):
         batches = counts.batches(cloud, robot, VESC_STREAM)
         times_us = [time_us for batch in batches for time_us in batch.times_us]
         for one in agent_kills:
             of_run = [time_us for time_us in times_us if one.started_us <= time_us <= one.killed_us]
-            if one.robot == robot and of_run:
-                found[robot].append(round((one.killed_us - max(of_run)) / 1e6, 3))
+            if one.robot == robot:
+                found[robot].append(round((one.killed_us - max(of_run)) / 1e6, 3) if of_run else None)
     return dict(found)
 
 

@@ -31,7 +31,7 @@ def write(folder: Path, killed: Kills | None, soaked: Soak | None, figures: dict
         if killed.open_s:
             parts.append(
                 "`open s`: how long before each kill of an agent its last stored sample was taken. What came "
-                "after that was in the batch of a second that was still open."
+                "after that was in the batch of a second that was still open. `all`: it had sent none."
             )
     if soaked:
         table = soaked.table()

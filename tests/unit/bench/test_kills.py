@@ -25,6 +25,7 @@ DRIVE = Kills(
 
 def test_a_killed_agent_may_lose_its_open_batch_and_nothing_else():
     assert DRIVE.good
+    assert replace(DRIVE, open_s={"car1": [None]}).good
     assert not replace(DRIVE, open_s={"car1": [OPEN_MOST_S + 0.1]}).good
     # An agent ended badly, and nobody had killed it.
     assert not replace(DRIVE, agent_kills={}).good
@@ -34,4 +35,4 @@ def test_a_killed_agent_may_lose_its_open_batch_and_nothing_else():
 
 def test_the_figures_are_json_and_the_table_names_what_was_open():
     assert json.loads(json.dumps(DRIVE.as_json()))["cars"]["car1"]["killed_runs"] == 1
-    assert "0.90" in DRIVE.table().as_markdown()
+    assert "| 0.90, all |" in replace(DRIVE, open_s={"car1": [0.9, None]}).table().as_markdown()
