@@ -107,9 +107,8 @@ class Gate:
                     # The cloud says what it has done.
                     await self.passed(since)
                 await publish(account, region, topic, payload, **rest)
-                if not rest.get("qos"):
-                    return
-                await self.passed(since)
+                if rest.get("qos"):
+                    await self.passed(since)
             except LedgerError as error:
                 refusals.append(error)
             finally:

@@ -20,10 +20,10 @@ _NEEDED = ("TelemetryTable", "ArchiveTable", "RobotsTable", "FindingsTable", "Qu
 
 @dataclass(frozen=True)
 class Plan:
-    """What the source has of a robot. ``files`` are those that the target lacks."""
+    """What the source has of a robot, and how it is registered. ``files`` are those that the target lacks."""
 
     robot: str
-    new: bool
+    registered: str
     streams: Sequence[str]
     hours: int
     files: Sequence[StoredFile]
@@ -92,6 +92,12 @@ def _is_stranger(source: Cloud, target: Cloud, robot: str) -> bool:
     return not (ours & theirs) - {None}
 
 
+def _registered(source: Cloud, target: Cloud, robot: str) -> str:
+    if registry.find(source, robot) is None:
+        return "removed here, its recordings move"
+    return "new in the target" if registry.find(target, robot) is None else "is in the target"
+
+
 def _of(source: Cloud, target: Cloud, robot: str) -> Plan:
     streams = inventory.known(source, robot)
     there = {(one.key, one.size) for one in files.listed(target, robot)}
@@ -100,7 +106,7 @@ def _of(source: Cloud, target: Cloud, robot: str) -> Plan:
     hours = sum(1 for stream in streams for _ in Archive(source, topic_of(source, robot, stream)).rows())
     return Plan(
         robot=robot,
-        new=registry.find(target, robot) is None and registry.find(source, robot) is not None,
+        registered=_registered(source, target, robot),
         streams=streams,
         hours=hours,
         files=lacking,

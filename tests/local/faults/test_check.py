@@ -54,10 +54,16 @@ def test_the_way_to_a_cloud_that_works(
     assert "cannot be sent to 127.0.0.1" in findings["files"].text
 
 
-# Python's ssl leaves a socket open that is reset before TLS begins.
-@pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
+# Python's `SSLSocket._create` raises without closing what it has made, if the connection is reset before.
+LEFT_OPEN = pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
+
+
 @pytest.mark.parametrize(
-    ("mode", "text"), [(REFUSE, "the connection ends before TLS"), (FREEZE, "says nothing for 0.5 s")]
+    ("mode", "text"),
+    [
+        pytest.param(REFUSE, "the connection ends before TLS", marks=LEFT_OPEN),
+        (FREEZE, "says nothing for 0.5 s"),
+    ],
 )
 def test_a_broken_network_is_named(
     bundle: Callable[..., robots.Bundle], proxy: Proxy, mode: str, text: str, monkeypatch: pytest.MonkeyPatch

@@ -26,9 +26,6 @@ from verify.question import WITH_KEY, Question, Verdict, ask
 from verify.questions import ALL
 from verify.questions.messages import live
 
-# PubNub's SDK may leave the socket of a long poll to the garbage collector.
-pytestmark = pytest.mark.filterwarnings("ignore:unclosed <socket.socket:ResourceWarning")
-
 RULES = tuple(one for one in ALL if one.subject == "rules")
 
 

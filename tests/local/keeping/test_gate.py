@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sqlite3
+import threading
 from contextlib import closing
 
 import pytest
@@ -13,6 +14,7 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, iot, sqs
 
 from local.keeping.gate import QUOTA_EXCEEDED, Gate
+from local.keeping.ledger import LedgerError
 from tests.local.keeping.in_process import ACCOUNT, REGION, kept
 
 NAME = "gate-items"
@@ -32,7 +34,7 @@ class Cloud:
         with closing(sqlite3.connect(self.ledger.path)) as other:
             return {key for (key,) in other.execute("SELECT pk FROM items")}
 
-    async def publish(self, key, *, qos=1, version=4):
+    async def publish(self, key, *, topic="record", qos=1, version=4):
         """Publish a record; returns whether the connection stays."""
         number = len(self.acknowledged) + 1
 
@@ -49,12 +51,30 @@ class Cloud:
         connect = name + key.encode()
         assert await iot._feed_session(session, bytes([0x10, len(connect)]) + connect, 10_000)
         payload = json.dumps({"key": key, "text": "x" * 60}).encode()
-        body = b"\0\6record" + bytes([0, number] if qos else []) + properties + payload
+        name = bytes([0, len(topic)]) + topic.encode()
+        body = name + bytes([0, number] if qos else []) + properties + payload
         packet = bytes([0x30 | qos << 1, len(body)]) + body
         try:
             return await iot._feed_session(session, packet, 10_000)
         except ConnectionError:
             return False
+
+    async def told(self, topic, act):
+        """What was committed when the cloud's own message about an act reached a subscriber."""
+        found = []
+
+        async def send(message):
+            if (message.get("bytes") or b"\0")[0] & 0xF0 == 0x30:
+                found.append(self.committed())
+
+        session = iot._WSSession(send, ACCOUNT, REGION, ACCOUNT)
+        connect = b"\0\4MQTT\4\2\0\x3c\0\4page"
+        subscribe = b"\0\1" + bytes([0, len(topic)]) + topic.encode() + b"\0"
+        for kind, body in ((0x10, connect), (0x82, subscribe)):
+            assert await iot._feed_session(session, bytes([kind, len(body)]) + body, 10_000)
+        act()
+        await iot.broker_publish(ACCOUNT, REGION, topic, b"done")
+        return found
 
     @property
     def dead_letters(self):
@@ -136,6 +156,57 @@ class Failing:
         return self._connection.execute(sql, *arguments)
 
 
+def put(key):
+    dynamodb._put_item({"TableName": NAME, "Item": {"key": {"S": key}}})
+
+
+def test_a_record_that_anothers_failure_undoes_is_not_acknowledged(cloud, monkeypatch):
+    dispatch = iot._dispatch_rule_action
+
+    async def and_fail(*arguments):
+        await dispatch(*arguments)
+        with pytest.raises(LedgerError), cloud.ledger.write() as connection:
+            connection.execute("INSERT INTO nothing VALUES (1)")
+
+    with monkeypatch.context() as context:
+        context.setattr(iot, "_dispatch_rule_action", and_fail)
+        assert not asyncio.run(cloud.publish("a"))
+    assert cloud.acknowledged == {}
+    assert asyncio.run(cloud.publish("a"))
+
+
+def test_the_cloud_tells_and_answers_what_is_committed(cloud):
+    assert asyncio.run(cloud.told("told", lambda: put("a"))) == [{"a"}]
+
+    async def reply():
+        put("b")
+
+    asyncio.run(Gate(cloud.ledger)._replying(reply)())
+    assert cloud.committed() == {"a", "b"}
+
+
+def test_a_slow_disk_does_not_stop_the_others(cloud, monkeypatch):
+    threads = []
+    wait = cloud.ledger._wait_for_disk
+    monkeypatch.setattr(
+        cloud.ledger, "_wait_for_disk", lambda: (threads.append(threading.current_thread()), wait())
+    )
+    assert asyncio.run(cloud.publish("a"))
+    assert bool(threads) == (cloud.ledger.sync == "full")
+    assert threading.main_thread() not in threads
+
+
+def test_a_record_is_refused_with_its_republished_message(cloud, monkeypatch):
+    again = {"republish": {"topic": "record", "qos": 0, "roleArn": ""}}
+    rule = {"ruleName": "again", "sql": "SELECT * FROM 'again'", "actions": [again]}
+    monkeypatch.setitem(iot._topic_rules, "again", rule)
+    cloud.ledger.floor_bytes = 1 << 60
+    assert not asyncio.run(cloud.publish("a", topic="again"))
+    cloud.ledger.floor_bytes = 0
+    assert asyncio.run(cloud.publish("a", topic="again"))
+    assert cloud.acknowledged == {"a": {"a"}}
+
+
 def test_records_are_refused_before_the_disk_is_full(cloud):
     cloud.ledger.floor_bytes = 1 << 60
     assert not asyncio.run(cloud.publish("a"))
@@ -183,8 +254,7 @@ async def call(action, **data):
 
 
 def test_a_call_is_answered_when_its_change_is_committed(cloud, monkeypatch):
-    put = {"TableName": NAME, "Item": {"key": {"S": "a"}}}
-    assert asyncio.run(call("PutItem", **put)) == 200
+    assert asyncio.run(call("PutItem", TableName=NAME, Item={"key": {"S": "a"}})) == 200
     assert cloud.committed() == {"a"}
     with monkeypatch.context() as context:
         context.setattr(cloud.ledger, "_connection", Failing(cloud.ledger._connection))

@@ -253,3 +253,20 @@ def test_changes_are_pending_until_their_commit_is_over(ledger):
             found = other.execute("SELECT count(*) FROM n").fetchone()
             committing.join()
             assert found == (n + 1,)
+
+
+def test_what_others_committed_is_pending_until_it_is_on_the_disk(tmp_path):
+    with closing(Ledger(tmp_path / "ledger.db", sync="full")) as ledger:
+        ledger.define("CREATE TABLE IF NOT EXISTS n (n INTEGER PRIMARY KEY, text TEXT)")
+        put(ledger, 1)
+        assert ledger.read_committed("SELECT n FROM n") == [(1,)]
+        assert ledger.pending
+        ledger.commit()
+        assert not ledger.pending
+
+
+def test_the_name_of_a_new_file_survives_a_power_cut(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
+    Ledger(tmp_path / "ledger.db", sync="full").close()
+    assert synced == [tmp_path.stat().st_ino]

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import pytest
 from pubnub.pubnub import SubscribeListener
 
+from iort_station.page.live.listener import Listener
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
@@ -267,3 +268,11 @@ def test_channel_names_are_unquoted(standin):
     ask(standin, f"/publish/pub/sub/0/{quote('grün.1')}/0/1")
     _, [received] = poll(standin, quote("grün.*"), token)
     assert (received["c"], received["b"]) == ("grün.1", "grün.*")
+
+
+def test_a_listener_that_stopped_polls_no_more(standin):
+    """The SDK may begin its next poll while it stops."""
+    with Listener(subscribe_key="sub", robot="car1", origin=standin.origin, tls=False) as listener:
+        pass
+    session = listener._client.get_request_handler()._ensure_session()
+    assert session.is_closed

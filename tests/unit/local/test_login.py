@@ -40,6 +40,22 @@ def test_a_password_of_a_wrong_length_is_refused(tmp_path, short):
         Password(tmp_path, QUICK).set(short)
 
 
+def test_a_long_guess_is_not_hashed_and_a_damaged_file_lets_nobody_in(tmp_path):
+    class Counting(PasswordHasher):
+        def verify(self, kept, told):
+            guesses.append(told)
+            return super().verify(kept, told)
+
+    guesses: list[str] = []
+    password = Password(tmp_path, Counting(time_cost=1, memory_cost=8, parallelism=1))
+    made = password.make()
+    assert not password.is_right("x" * 1001)
+    assert guesses == []
+    (file,) = tmp_path.iterdir()
+    file.write_text("half")
+    assert not password.is_right(made)
+
+
 def test_an_address_waits_after_its_tries_and_others_do_not():
     now = Now()
     tries = Tries(now)
@@ -85,3 +101,12 @@ def test_a_session_ends_when_nobody_uses_it():
     assert not sessions.goes_on("")
     sessions.end(used)
     assert not sessions.goes_on(used)
+
+
+def test_sessions_are_bounded_and_the_longest_unused_ends_first(monkeypatch):
+    monkeypatch.setattr(login, "_MOST_SESSIONS", 2)
+    sessions = Sessions(Now())
+    first, second = sessions.begin(), sessions.begin()
+    assert sessions.goes_on(first)
+    third = sessions.begin()
+    assert [sessions.goes_on(one) for one in (first, second, third)] == [True, False, True]

@@ -11,6 +11,7 @@ from pubnub.callbacks import SubscribeCallback
 from pubnub.enums import PNReconnectionPolicy, PNStatusCategory
 from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
+from pubnub.request_handlers.httpx import HttpxRequestHandler
 from typing_extensions import Self
 
 from iort_contract.cloud import channel
@@ -50,7 +51,7 @@ class Listener:
         config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
         self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
         self._callback = _Callback(on_update)
-        self._client = PubNub(config)
+        self._client = PubNub(config, custom_request_handler=_Requests)
         if token:
             self._client.set_token(token)
         self._client.add_listener(self._callback)
@@ -71,6 +72,24 @@ class Listener:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._client.stop()
+
+
+class _Requests(HttpxRequestHandler):  # type: ignore[misc]  # the SDK's class has no types
+    """The SDK's requests. The poll that begins while the client stops would make a session of its own, which
+    nobody closes."""
+
+    _ended = False
+
+    def close(self) -> None:
+        """End all sessions, also those to come."""
+        self._ended = True
+        super().close()
+
+    def _ensure_session(self) -> Any:
+        session = super()._ensure_session()
+        if self._ended:
+            session.close()
+        return session
 
 
 class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types

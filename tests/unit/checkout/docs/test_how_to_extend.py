@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +34,10 @@ FOLDERS = (
     "station",
     "tests",
 )
+ADDED = ("A field", "A derived field", "A rule", "A function")
+# The sections that change a thing, and the number of files that each touches.
+CHANGES = {"A topic": 1, "A retention": 1, "An alarm": 1, "A chart": 2, "A price": 1, "A policy": 1}
 SKIPPED = ("__pycache__", "*.egg-info", "build", "built", "images", "bench-*", "node_modules")
-SYNTHESIZE = """
-from pathlib import Path
-from aws_cdk import App
-from app import build
-from stacks.settings import Settings
-app = App(outdir="cdk.out")
-build(app, Settings(layer=Path("scripts"), analysis_layer=Path("scripts")))
-app.synth()
-"""
 
 
 class Copy:
@@ -113,22 +108,56 @@ def copy(tmp_path: Path) -> Copy:
     return Copy(tmp_path / "checkout")
 
 
+@dataclass(frozen=True)
+class Deployed:
+    """A copy with every section that changes the stacks or the generated parts: the files that each touched,
+    and the resources of each stack, by logical id."""
+
+    copy: Copy
+    touched: dict[str, list[str]]
+    stacks: dict[str, dict[str, Any]]
+
+    def of_type(self, stack: str, kind: str, name: str) -> Any:
+        """The properties of the one resource of a type whose logical id begins so."""
+        resources = self.stacks[f"iort-{stack}"]
+        (found,) = (one for key, one in resources.items() if one["Type"] == kind and key.startswith(name))
+        return found["Properties"]
+
+
+@pytest.fixture(scope="module")
+def deployed(tmp_path_factory: pytest.TempPathFactory) -> Deployed:
+    copy = Copy(tmp_path_factory.mktemp("deployed") / "checkout")
+    touched = {name: copy.follow(name) for name in (*ADDED, *CHANGES)}
+    for name in ("lambda", "analysis"):
+        layer = copy.root / "build" / "layer" / name
+        layer.mkdir(parents=True)
+        (layer / "nothing.py").touch()
+    copy.run("app.py")
+    copy.run("-m", "scripts.docs_parts")
+    stacks = {
+        path.name.removesuffix(".template.json"): json.loads(path.read_text())["Resources"]
+        for path in (copy.root / "cdk.out").glob("*.template.json")
+    }
+    return Deployed(copy, touched, stacks)
+
+
 def test_the_page_lists_each_of_its_sections() -> None:
     assert set(re.findall(r"^\| \[(.*?)\]", PAGE, re.MULTILINE)) == {name.lower() for name in SECTIONS}
 
 
-def test_the_way_to_add_a_field_works(copy: Copy) -> None:
-    assert len(set(copy.follow("A field"))) == 1
+def test_the_way_to_add_a_field_works(deployed: Deployed) -> None:
+    copy = deployed.copy
+    assert len(set(deployed.touched["A field"])) == 1
     assert copy.show("unit('vesc', 'temp_battery_max')", "from iort_station.data.units import unit") == "degC"
     hottest = "from iort_contract.catalog.vesc import hottest_degc"
     assert copy.show("hottest_degc({'temp_battery': 81.5, 'temp_fet': 40})", hottest) == 81.5
-    copy.run("-m", "scripts.docs_parts")
     assert "| `temp_battery` | degC |" in (copy.root / "docs/reference/fields.md").read_text()
     assert '"temp_battery"' in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
-def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
-    assert len(set(copy.follow("A derived field"))) == 1
+def test_the_way_to_add_a_derived_field_works(deployed: Deployed) -> None:
+    copy = deployed.copy
+    assert len(set(deployed.touched["A derived field"])) == 1
     columns = "{'duty_cycle': [0.5, None], 'voltage_input': [12.0, 12.0], 'current_motor': [10, 10]}"
     batch = f"Batch('0badcafe', 0, [1_000_000, 1_020_000], {columns})"
     second = copy.show(
@@ -147,63 +176,41 @@ def test_the_way_to_add_a_derived_field_works(copy: Copy) -> None:
     assert found == [60.0, None]
     needs = "select('car', 'vesc', where='motor_power_w > 5').needs('duty_cycle')"
     assert copy.show(needs, "from iort_station.data.selection import select") is True
-    copy.run("-m", "scripts.docs_parts")
     formula = "`duty_cycle * voltage_input * current_motor`"
     assert f"| {formula} |" in (copy.root / "docs/reference/fields.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
-def templates(copy: Copy) -> dict[str, dict[str, Any]]:
-    """The resources of each stack of the copy, by logical id."""
-    for name in ("lambda", "analysis"):
-        layer = copy.root / "build" / "layer" / name
-        layer.mkdir(parents=True)
-        (layer / "nothing.py").touch()
-    copy.run("app.py")
-    return {
-        path.name.removesuffix(".template.json"): json.loads(path.read_text())["Resources"]
-        for path in (copy.root / "cdk.out").glob("*.template.json")
-    }
-
-
-def of_type(resources: dict[str, Any], kind: str, name: str) -> Any:
-    """The properties of the one resource of a type whose logical id begins so."""
-    (found,) = (one for key, one in resources.items() if one["Type"] == kind and key.startswith(name))
-    return found["Properties"]
-
-
-def test_the_way_to_add_a_rule_works(copy: Copy) -> None:
-    assert len(set(copy.follow("A rule"))) == 3
-    stacks = templates(copy)
-    rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Horn")
+def test_the_way_to_add_a_rule_works(deployed: Deployed) -> None:
+    copy = deployed.copy
+    assert len(set(deployed.touched["A rule"])) == 3
+    rule = deployed.of_type("ingest", "AWS::IoT::TopicRule", "Horn")
     assert rule["TopicRulePayload"]["Sql"].endswith("FROM 'live/iort/+/+' WHERE sample.horn > 0")
     assert rule["TopicRulePayload"]["ErrorAction"]
-    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Horn")
+    function = deployed.of_type("processing", "AWS::Lambda::Function", "Horn")
     assert function["Handler"] == "functions.horn.handler"
-    assert of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Alarm", "AlarmsHornErrors")
+    assert deployed.of_type("monitoring", "AWS::CloudWatch::Alarm", "AlarmsHornErrors")
     assert "HornsSounded" in json.dumps(
-        of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Dashboard", "DashboardsRobots")
+        deployed.of_type("monitoring", "AWS::CloudWatch::Dashboard", "DashboardsRobots")
     )
     handler = (
         "from functions.horn import handler; import os; os.environ['NAMESPACE'] = 'iort'; handler({}, None)"
     )
     assert json.loads(copy.run("-c", handler))["HornsSounded"] == 1
-    copy.run("-m", "scripts.docs_parts")
     assert (
         "| `horn` | counts who sounds the horn |"
         in (copy.root / "docs/explanation/processing.md").read_text()
     )
 
 
-def test_the_way_to_add_a_function_works(copy: Copy) -> None:
-    assert len(set(copy.follow("A function"))) == 3
-    stacks = templates(copy)
-    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Count")
+def test_the_way_to_add_a_function_works(deployed: Deployed) -> None:
+    assert len(set(deployed.touched["A function"])) == 3
+    function = deployed.of_type("processing", "AWS::Lambda::Function", "Count")
     assert function["Environment"]["Variables"].keys() == {"NAMESPACE", "TELEMETRY_TABLE"}
-    policy = of_type(stacks["iort-processing"], "AWS::IAM::Policy", "CountRole")
+    policy = deployed.of_type("processing", "AWS::IAM::Policy", "CountRole")
     actions = [one["Action"] for one in policy["PolicyDocument"]["Statement"]]
     assert "dynamodb:Query" in actions
-    assert copy.show("callable(handler)", "from functions.count import handler") is True
+    assert deployed.copy.show("callable(handler)", "from functions.count import handler") is True
 
 
 def test_the_way_to_add_a_miner_works(copy: Copy) -> None:
@@ -255,25 +262,22 @@ def test_the_way_to_add_a_source_works(copy: Copy, tmp_path: Path) -> None:
     assert found == [["clock", ["second_of_day"]]]
 
 
-def test_each_way_to_change_a_thing_works(copy: Copy) -> None:
-    files = {
-        name: set(copy.follow(name))
-        for name in ("A topic", "A retention", "An alarm", "A chart", "A price", "A policy")
-    }
-    assert all(len(found) == 1 for name, found in files.items() if name != "A chart")
-    assert len(files["A chart"]) == 2
-    stacks = templates(copy)
-    rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Record")
+def test_each_way_to_change_a_thing_works(deployed: Deployed) -> None:
+    copy = deployed.copy
+    assert {name: len(set(deployed.touched[name])) for name in CHANGES} == CHANGES
+    rule = deployed.of_type("ingest", "AWS::IoT::TopicRule", "Record")
     assert "FROM 'record/iort/+/+'" in rule["TopicRulePayload"]["Sql"]
-    policy = json.dumps(of_type(stacks["iort-fleet"], "AWS::IoT::Policy", "RobotPolicy"))
+    policy = json.dumps(deployed.of_type("fleet", "AWS::IoT::Policy", "RobotPolicy"))
     assert "_record/record/iort/" in policy
     assert "topic/news/iort" in policy
-    quarantine = of_type(stacks["iort-quarantine"], "AWS::Lambda::Function", "Quarantine")
+    quarantine = deployed.of_type("quarantine", "AWS::Lambda::Function", "Quarantine")
     assert quarantine["Environment"]["Variables"]["RETENTION_S"] == str(30 * 86_400)
-    alarms = [one for one in stacks["iort-monitoring"].values() if one["Type"] == "AWS::CloudWatch::Alarm"]
+    alarms = [
+        one for one in deployed.stacks["iort-monitoring"].values() if one["Type"] == "AWS::CloudWatch::Alarm"
+    ]
     assert 30 in {one["Properties"]["EvaluationPeriods"] for one in alarms}
     assert "Weakest battery, V" in json.dumps(
-        of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Dashboard", "DashboardsRobots")
+        deployed.of_type("monitoring", "AWS::CloudWatch::Dashboard", "DashboardsRobots")
     )
     prices = "from iort_station.cost.prices import PRICES"
     assert copy.show("PRICES['rule'].usd", prices) == 0.16

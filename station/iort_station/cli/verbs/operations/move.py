@@ -90,6 +90,9 @@ def move_(
         if not names:
             # Messages that name no robot.
             moving.quarantine(NO_ROBOT)
+    except KeyboardInterrupt:
+        say("interrupted: move again, and it goes on")
+        raise
     except ClientError as error:
         if error.response["Error"]["Code"] not in _DENIED:
             raise
@@ -240,8 +243,7 @@ def _show_plan(plan: Plan, *, with_files: bool) -> None:
         parts.append(what if with_files else f"{what} stay here, by --no-files")
     if plan.files_there:
         parts.append(f"{_number(plan.files_there, 'file')} there already")
-    new = "new in the target" if plan.new else "is in the target"
-    out.print(f"{plan.robot}: {new}; {', '.join(parts)}", soft_wrap=True)
+    out.print(f"{plan.robot}: {plan.registered}; {', '.join(parts)}", soft_wrap=True)
 
 
 def _show(one: dict[str, Any]) -> None:
