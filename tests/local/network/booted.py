@@ -20,7 +20,9 @@ from tests.local.conftest import until
 _TOOL = "systemd-nspawn"
 # Its own unit is ours, or none: we ask no systemd of this machine.
 # None of the services that this machine has, but those that every boot needs.
-_BARE = ("systemd.unit=basic.target", "systemd.mask=systemd-firstboot.service")
+# There is no network to wait for, which would take two minutes.
+_MASKED = ("systemd-firstboot.service", "systemd-networkd-wait-online.service")
+_BARE = ("systemd.unit=basic.target", *(f"systemd.mask={service}" for service in _MASKED))
 _ALONE = ("--register=no", "--keep-unit", "--link-journal=no", "--private-network", "--console=pipe")
 
 

@@ -121,7 +121,7 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
         rate = {"robot": car.robot, "name": "live.rate_hz", "value": "4"}
         told = control.change(embedded.cloud, rate)["settings"]
         (entry,) = (one for one in told if one["name"] == "live.rate_hz")
-        assert (entry["value"], entry["desired"], entry["pending"]) == ("4", True, "")
+        assert (entry["value"], entry["desired"], entry["pending"]) == ("4", True, None)
         sped = control.change(embedded.cloud, {**rate, "name": "fields.vesc", "value": "sped"})["settings"]
         assert "did you mean speed?" in sped[-1]["reason"]
         with pytest.raises(StationError, match="got 40; nothing is changed"):
