@@ -35,7 +35,8 @@ def browser() -> Iterator[Browser]:
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     """Open an address in a new window and wait until the page is connected.
 
-    A script's error fails the test, and so does what the page's policy forbids.
+    A script's error fails the test, and so does what the page's policy forbids, unless the test takes it
+    from `open_page.errors`.
     """
     contexts, errors = [], []
 
@@ -50,6 +51,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
             until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
         return page
 
+    open_.errors = errors  # type: ignore[attr-defined]  # for tests that provoke some
     yield open_
     for context in contexts:
         context.close()

@@ -113,7 +113,7 @@ def test_text_from_a_robot_is_never_html(page: Page, car: Car, url: str) -> None
     assert page.evaluate("window.hacked") is None
 
 
-def test_a_foreign_script_does_not_run(page: Page) -> None:
+def test_a_foreign_script_does_not_run(page: Page, open_page: Any) -> None:
     page.evaluate(
         """() => {
           const script = document.createElement("script");
@@ -123,6 +123,9 @@ def test_a_foreign_script_does_not_run(page: Page) -> None:
     )
     assert page.evaluate("window.hacked") is None
     assert page.evaluate("fetch('https://example.com').then(() => 'went', () => 'refused')") == "refused"
+    until(lambda: len(open_page.errors) == 3, "the policy's words")
+    assert all("Content Security Policy" in error for error in open_page.errors)
+    open_page.errors.clear()
 
 
 def test_the_delay_equals_the_delay_measured_outside(page: Page, car: Car) -> None:
