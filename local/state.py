@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from iort_station.kept import lock_of
+from iort_station.page.background import BackgroundServer
 from local.errors import LocalError
 from local.network.certificates import write_private
 
@@ -110,19 +111,32 @@ class StateFolder:
         usual = 0 if self._any_ports else USUAL_PORTS.get(name, 0)
         found = _lasting(hosts, usual) if self.kept and not asked else _free(hosts, asked)
         if found is None:
-            advice = "free it, give another, or none"
-            if asked == known.get(name):
-                advice = (
-                    f"`sudo ss -tanp 'sport = :{asked}'` names the program. End it (another cloud of this "
-                    "machine by `make down STATE=its folder`), or choose another port for this one in "
-                    f"{self._settings_path}"
-                )
-                if name == "mqtt":
-                    # It is in the bundles.
-                    advice += ", and write it into the car.yaml of its cars"
-            raise LocalError(f"port {asked} ({name}) is in use on {' or '.join(hosts)}: {advice}")
+            raise self._in_use(name, asked, hosts)
         self.remember(ports={**known, name: found})
         return found
+
+    def serve(self, stack: ExitStack, name: str, server: BackgroundServer) -> None:
+        """Start a server at the port that `port` has found, until the stack closes. Raises `LocalError` if
+        somebody else has taken it since."""
+        try:
+            stack.enter_context(server)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise self._in_use(name, server.port, [server.host]) from error
+            raise LocalError(f"cannot listen on {server.host}:{server.port}: {error}") from error
+
+    def _in_use(self, name: str, port: int, hosts: Sequence[str]) -> LocalError:
+        advice = "free it, give another, or none"
+        if port == self.settings().get("ports", {}).get(name):
+            advice = (
+                f"`sudo ss -tanp 'sport = :{port}'` names the program. End it (another cloud of this "
+                "machine by `make down STATE=its folder`), or choose another port for this one in "
+                f"{self._settings_path}"
+            )
+            if name == "mqtt":
+                # It is in the bundles.
+                advice += ", and write it into the car.yaml of its cars"
+        return LocalError(f"port {port} ({name}) is in use on {' or '.join(hosts)}: {advice}")
 
     def secret(self, name: str, size: int = 20) -> str:
         """A random text, the same one at each start of a kept cloud."""

@@ -22,6 +22,7 @@ hours of a clock that is set forward: [what that is, and what it says](../explan
 
 def write(folder: Path, killed: Kills | None, soaked: Soak | None, figures: dict[str, Any]) -> None:
     """Write the files."""
+    folder.mkdir(parents=True, exist_ok=True)
     parts = [_HEAD, _machine(figures["machine"])]
     if killed:
         table = killed.table()

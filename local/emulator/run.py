@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import NoReturn, cast
 
 from ministack import app
+from ministack.services import iot
 
 from local import gaps
 from local.gaps.functions.async_invocations import AsyncInvocations
@@ -30,7 +33,8 @@ def main() -> None:
         ledger = Ledger(Path(path or f"{mkdtemp()}/ledger.db"), sync=sync)
     except LedgerError as error:
         sys.exit(f"{error}; `iort restore` brings a backup back")
-    ledger.on_broken = _end
+    # Nothing may be acknowledged any more.
+    ledger.on_broken = partial(_end, status=os.EX_IOERR)
     # Before the gaps, which read streams.
     streams.install(ledger)
     gaps.install()
@@ -38,14 +42,26 @@ def main() -> None:
         kept.install(ledger, AsyncInvocations().queue)
         presence.install()
     Gate(ledger).install()
+    iot.mtls_start = _listening(iot.mtls_start)
     alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()
 
 
-def _end(error: LedgerError) -> NoReturn:
-    """End at once: nothing may be acknowledged any more. `make up` starts the emulator again."""
-    print(error, file=sys.stderr, flush=True)  # noqa: T201 - the process' last words
-    os._exit(os.EX_IOERR)
+def _listening(start: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
+    """Start the broker, or end: ministack would run on without one."""
+
+    async def started() -> None:
+        await start()
+        if not iot.mtls_is_listening():
+            _end(f"the broker cannot listen on port {os.environ['IOT_MTLS_PORT']}", os.EX_UNAVAILABLE)
+
+    return started
+
+
+def _end(words: object, status: int) -> NoReturn:
+    """End at once. `make up` starts the emulator again."""
+    print(words, file=sys.stderr, flush=True)  # noqa: T201 - the process' last words
+    os._exit(status)
 
 
 if __name__ == "__main__":

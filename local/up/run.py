@@ -23,7 +23,7 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
-from local.cloud import EmbeddedCloud
+from local.cloud import EmbeddedCloud, EmulatorError
 from local.errors import LocalError
 from local.network.addresses import is_ipv6
 from local.network.certificates import write_private
@@ -39,10 +39,6 @@ _RENEW_S = 3600.0
 # An emulator that ends by itself is started again, unless that happens so often in this time.
 _MOST_ENDS, _ENDS_S = 3, 600.0
 _MOST_LOG_BYTES = 20 * 1024 * 1024
-
-
-class _EmulatorError(LocalError):
-    """The emulator ended, and nobody has stopped it."""
 
 
 def main() -> None:
@@ -83,10 +79,12 @@ class _Kept:
         while not self._stopped.is_set():
             try:
                 self._once()
-            except _EmulatorError as ended:  # noqa: PERF203 - once a start
+            except EmulatorError as ended:  # noqa: PERF203 - once a start
                 ends = [at for at in ends if time.monotonic() - at < _ENDS_S] + [time.monotonic()]
                 if len(ends) >= _MOST_ENDS:
-                    raise LocalError(f"{ended}\nThis was the {len(ends)}th time in a short while") from ended
+                    raise LocalError(
+                        f"{ended}\nIt ended {len(ends)} times within {_ENDS_S / 60:.0f} min"
+                    ) from ended
                 _say(f"{ended}\nIt is started again")
 
     def _once(self) -> None:
@@ -116,7 +114,7 @@ class _Kept:
         renewed = time.monotonic()
         while not self._stopped.is_set():
             if embedded.emulator.wait(_LOOK_S) is not None:
-                raise _EmulatorError(f"the emulator {embedded.emulator.ended()}:\n{embedded.emulator.tail()}")
+                raise EmulatorError(embedded.emulator)
             embedded.emulator.shorten_log(_MOST_LOG_BYTES)
             if time.monotonic() - renewed > _RENEW_S:
                 renewed = time.monotonic()

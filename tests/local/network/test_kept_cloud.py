@@ -5,9 +5,11 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,14 +19,17 @@ import pytest
 from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.kept import owner
+from iort_station.page.background import BackgroundServer
+from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.network.certificates import Authority, ServerCertificate
 from local.network.listen import Listen
 from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
-from local.up import service
+from local.up import options, run, service
 from local.up.down import stop
+from tests.local.keeping.emulators import Emulator
 
 
 @pytest.fixture
@@ -239,3 +244,47 @@ def test_a_page_at_an_ipv6_address_needs_a_name_that_a_browsers_policy_can_have(
         1,
         "up: PAGE must have a name after an IPv6 address, such as PAGE=::1,iort.lab\n",
     )
+
+
+def test_an_emulator_whose_broker_cannot_listen_ends(tmp_path):
+    emulator = Emulator(tmp_path)
+    with (
+        socket.create_server(("127.0.0.1", emulator.mqtt_port)),
+        pytest.raises(LocalError, match=f"the broker cannot listen on port {emulator.mqtt_port}"),
+    ):
+        emulator.start()
+    assert emulator.process.poll() == os.EX_UNAVAILABLE
+
+
+def test_a_server_that_finds_its_port_taken_meanwhile_says_so(state):
+    server = BackgroundServer("127.0.0.1", state.port("files", "127.0.0.1"))
+    with (
+        ExitStack() as stack,
+        socket.create_server((server.host, server.port)),
+        pytest.raises(LocalError, match=rf"port {server.port} \(files\) is in use .*'sport = :"),
+    ):
+        state.serve(stack, "files", server)
+
+
+def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_few_times(
+    tmp_path, monkeypatch
+):
+    starts = []
+
+    class Killed(EmbeddedCloud):
+        def start_emulator(self, *given):
+            super().start_emulator(*given)
+            starts.append(self.emulator.pid)
+            os.kill(self.emulator.pid, signal.SIGKILL)
+
+    def deploy(*_given, **_settings):
+        raise LocalError("cdk deploy failed")
+
+    monkeypatch.setattr(run, "EmbeddedCloud", Killed)
+    monkeypatch.setattr("local.cloud.deploy", deploy)
+    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
+    with pytest.raises(
+        LocalError, match=r"(?s)emulator was ended by SIGKILL.*It ended 3 times within 10 min"
+    ):
+        run._Kept(given, threading.Event()).run()
+    assert len(starts) == 3
