@@ -45,7 +45,10 @@ def number(envelope: Mapping[str, Any], key: str) -> float:
     value = envelope.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ContractError(f"{key} must be a number, got {shown(value)}")
-    return value
+    try:
+        return float(value)
+    except OverflowError as error:  # an integer may be larger than every float
+        raise ContractError(f"{key} must be a number, got {shown(value)}") from error
 
 
 def _flag(envelope: Mapping[str, Any], key: str) -> bool:

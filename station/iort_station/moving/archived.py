@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
@@ -30,45 +31,59 @@ def copy(source: Cloud, target: Cloud, topic: str) -> Hours:
 
     An hour that both have is made by each from its own table; `compare` tells if one lacks something.
     """
-    rows = list(Archive(target, topic).rows())
-    there, objects = {row.hour for row in rows}, {row.key: row.sha256 for row in rows}
+    there = {row.hour for row in Archive(target, topic).rows()}
     copied = left = 0
     copies = _Objects(source, target)
     for row in Archive(source, topic).rows():
         if row.hour in there:
             continue
         new: ArchivedHour | None = row
-        if row.key and objects.get(row.key, row.sha256) != row.sha256:
+        if row.key and not copies.copy(row.key, row.sha256):
             # The target has another object of this day, with hours of its own.
             new = copies.copy_hour(row)
-        elif row.key:
-            copies.copy(row.key, row.sha256)
-        if new is None:
+        refused = refused_key(parse_topic(topic), parse_hour(row.hour))
+        if new and (not row.refused or copies.copy(refused)) and _put_row(target, new):
+            copied += 1
+        else:
             left += 1
-            continue
-        if row.refused:
-            copies.copy(refused_key(parse_topic(topic), parse_hour(row.hour)))
-        target.client("dynamodb").put_item(
-            TableName=target.output("storage", "ArchiveTable"), Item=new.item()
-        )
-        copied += 1
     return Hours(copied, left)
 
 
+def _put_row(target: Cloud, row: ArchivedHour) -> bool:
+    """Write a row; returns False if the target has one of this hour by now."""
+    return _is_new(
+        target.client("dynamodb").put_item,
+        TableName=target.output("storage", "ArchiveTable"),
+        Item=row.item(),
+        ConditionExpression="attribute_not_exists(content)",
+    )
+
+
+def _is_new(put: Callable[..., Any], **what: Any) -> bool:
+    """Put what must not be there; returns whether it was not."""
+    try:
+        put(**what)
+    except ClientError as error:
+        if error.response["Error"]["Code"] not in {"PreconditionFailed", "ConditionalCheckFailedException"}:
+            raise
+        return False
+    return True
+
+
 class _Objects:
-    """Copies the archive's objects, each once: a day's hours are in one."""
+    """Copies the archive's objects, each once: a day's hours are in one. None of the target's is replaced."""
 
     def __init__(self, source: Cloud, target: Cloud) -> None:
         self._from, self._to = source.client("s3"), target.client("s3")
         self._source, self._target = (one.output("storage", "FilesBucket") for one in (source, target))
-        self._copied: set[str] = set()
+        self._copied: dict[str, bool] = {}
         self._day: tuple[str, ArchiveFile] | None = None
 
-    def copy(self, key: str, sha256: str | None = None) -> None:
-        """Copy an object as it is."""
+    def copy(self, key: str, sha256: str | None = None) -> bool:
+        """Copy an object as it is; returns False if the target has another one."""
         if key not in self._copied:
-            self._to.put_object(Bucket=self._target, Key=key, Body=self._read(key, sha256))
-            self._copied.add(key)
+            self._copied[key] = self._put(key, self._read(key, sha256))
+        return self._copied[key]
 
     def copy_hour(self, row: ArchivedHour) -> ArchivedHour | None:
         """Copy an hour of a day's object into an object of its own, as before the day was joined.
@@ -81,18 +96,16 @@ class _Objects:
         into = io.BytesIO()
         write_day({hour: self._day[1]}, into, describe=described(topic.name))
         content, key = into.getvalue(), hour_key(topic, hour)
-        try:
-            self._to.put_object(Bucket=self._target, Key=key, Body=content, IfNoneMatch="*")
-        except ClientError as error:
-            if error.response["Error"]["Code"] != "PreconditionFailed":
-                raise
-            if not self._is(key, content):
-                return None
+        if not self._put(key, content):
+            return None
         return replace(row, key=key, sha256=hashlib.sha256(content).hexdigest(), size_bytes=len(content))
 
-    def _is(self, key: str, content: bytes) -> bool:
-        """Whether an interrupted move has written the object."""
-        return bool(self._to.get_object(Bucket=self._target, Key=key)["Body"].read() == content)
+    def _put(self, key: str, content: bytes) -> bool:
+        """Write an object, unless an interrupted move has; returns False if the target has another one."""
+        what: Any = {"Bucket": self._target, "Key": key}
+        if _is_new(self._to.put_object, **what, Body=content, IfNoneMatch="*"):
+            return True
+        return bool(self._to.get_object(**what)["Body"].read() == content)
 
     def _read(self, key: str, sha256: str | None) -> bytes:
         try:

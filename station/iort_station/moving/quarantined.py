@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from iort_contract.dynamodb import Item
-from iort_contract.tables import ENTRY, EXPIRES_S, ROBOT
+from iort_contract.tables import ENTRY, EXPIRES_S, LAST_MS, ROBOT
 from iort_station.cloud import Cloud
 
 
@@ -23,21 +23,18 @@ def copy(source: Cloud, target: Cloud, robot: str) -> int:
 
 def lacking(source: Cloud, target: Cloud, robot: str) -> set[str]:
     """The ids of the source's messages that the target does not have."""
-    here, there = (_ids(cloud, robot) for cloud in (source, target))
-    return here - there
-
-
-def _ids(cloud: Cloud, robot: str) -> set[str]:
-    """The ids of a robot's messages, without those that DynamoDB is about to delete."""
-    keys = {
-        "ProjectionExpression": "#id, #expires",
-        "ExpressionAttributeNames": {"#robot": ROBOT, "#id": ENTRY, "#expires": EXPIRES_S},
-    }
+    names = {"#robot": ROBOT, "#id": ENTRY, "#expires": EXPIRES_S, "#last": LAST_MS}
+    keys = {"ProjectionExpression": "#id, #expires, #last", "ExpressionAttributeNames": names}
+    # Of a message that was replayed the id is left.
+    there = {item[ENTRY]["S"] for item in _items(target, robot, **keys)}
     now_s = time.time()
     return {
         str(item[ENTRY]["S"])
-        for item in _items(cloud, robot, **keys)
-        if EXPIRES_S not in item or int(item[EXPIRES_S]["N"]) > now_s
+        for item in _items(source, robot, **keys)
+        if LAST_MS in item
+        and item[ENTRY]["S"] not in there
+        # DynamoDB is about to delete those that have expired.
+        and (EXPIRES_S not in item or int(item[EXPIRES_S]["N"]) > now_s)
     }
 
 

@@ -24,7 +24,10 @@ from iort_contract.topics import as_subscribed
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
-_LISTED = (ROBOT, ENTRY, SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)
+_HEADER = (SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)
+_LISTED = (ROBOT, ENTRY, *_HEADER)
+# What goes when a dead letter is deleted.
+CONTENTS = (*_HEADER, PAYLOAD)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def load(cloud: Cloud, letter: DeadLetter) -> DeadLetter | None:
     answer = cloud.client("dynamodb").get_item(
         TableName=cloud.output("storage", "QuarantineTable"), Key=key(letter), ConsistentRead=True
     )
-    return _letter(answer["Item"]) if "Item" in answer else None
+    return _letter(answer["Item"]) if LAST_MS in answer.get("Item", ()) else None
 
 
 def key(letter: DeadLetter) -> dict[str, Any]:

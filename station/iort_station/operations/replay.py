@@ -23,7 +23,6 @@ from iort_contract.tables import (
     BY_LATER,
     BY_RULE,
     BY_STREAM,
-    ENTRY,
     ENVELOPE,
     LAST_MS,
     RECEIVED_MS,
@@ -35,7 +34,7 @@ from iort_contract.topics import RECORD
 from iort_station.cloud import Cloud
 from iort_station.data.stored.batches import telemetry_table
 from iort_station.errors import StationError
-from iort_station.operations.quarantine import DeadLetter, key, load
+from iort_station.operations.quarantine import CONTENTS, DeadLetter, key, load
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 
 # After this many attempts a person must look at it.
@@ -163,8 +162,8 @@ def _count(cloud: Cloud, letter: DeadLetter) -> None:
         TableName=cloud.output("storage", "QuarantineTable"),
         Key=key(letter),
         UpdateExpression="ADD #replays :one",
-        ConditionExpression="attribute_exists(#id)",
-        ExpressionAttributeNames={"#replays": REPLAYS, "#id": ENTRY},
+        ConditionExpression="attribute_exists(#last)",
+        ExpressionAttributeNames={"#replays": REPLAYS, "#last": LAST_MS},
         ExpressionAttributeValues={":one": {"N": "1"}},
     )
 
@@ -234,14 +233,18 @@ def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[s
 
 
 def _delete(cloud: Cloud, letter: DeadLetter) -> None:
-    """Delete the dead letter, unless the same message was refused again in the meantime."""
+    """Delete the dead letter, unless the same message was refused again in the meantime.
+
+    Its id stays until it would have expired: a further move must not bring it back.
+    """
     dynamodb = cloud.client("dynamodb")
     try:
-        dynamodb.delete_item(
+        dynamodb.update_item(
             TableName=cloud.output("storage", "QuarantineTable"),
             Key=key(letter),
-            ConditionExpression="#last = :last",
-            ExpressionAttributeNames={"#last": LAST_MS},
+            UpdateExpression="REMOVE " + ", ".join(f"#{name}" for name in CONTENTS),
+            ConditionExpression=f"#{LAST_MS} = :last",
+            ExpressionAttributeNames={f"#{name}": name for name in CONTENTS},
             ExpressionAttributeValues={":last": {"N": str(letter.last_ms)}},
         )
     except dynamodb.exceptions.ConditionalCheckFailedException:

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,7 +22,17 @@ from functions.shared.bucket import Bucket, metadata
 from iort_contract.cloud import IOT
 from iort_contract.messages.batch import BatchId
 from iort_contract.messages.requests.files import PART_BYTES, File, file_key
-from iort_contract.tables import BATCH, CONNECTED_MS, ENTRY, LAST_MS, PAYLOAD, TOPIC
+from iort_contract.tables import (
+    BATCH,
+    BY_LATER,
+    CONNECTED_MS,
+    ENTRY,
+    LAST_MS,
+    PAYLOAD,
+    PUT_OFF,
+    SOURCE,
+    TOPIC,
+)
 from iort_contract.tables import ROBOT as ROBOT_KEY
 from iort_station import data
 from iort_station.cli.main import app
@@ -34,7 +45,7 @@ from iort_station.fleet.control import shadow
 from iort_station.fleet.identity import claims
 from iort_station.moving import recorded, stored_files
 from iort_station.moving.stored_files import base64_sha256
-from iort_station.operations import archive, quarantine
+from iort_station.operations import archive, quarantine, replay
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
@@ -191,8 +202,17 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     tags.change(source, robot, {"lab": "north"})
     note = notes.write(source, robot, "new tyres", by="anna")
     shadow.Shadow(source, robot).desire({"live.rate_hz": 5.0, "motion.stopped": True})
-    letter = {ROBOT_KEY: {"S": robot}, ENTRY: {"S": "0123"}, PAYLOAD: {"B": b"\0\xff"}, LAST_MS: {"N": "1"}}
-    source.client("dynamodb").put_item(TableName=source.output("storage", "QuarantineTable"), Item=letter)
+    letter: dict[str, Any] = {
+        ROBOT_KEY: {"S": robot},
+        ENTRY: {"S": "0123"},
+        PAYLOAD: {"B": b"\0\xff"},
+        LAST_MS: {"N": str(int(time.time() * 1000))},
+    }
+    waiting = json.dumps({PUT_OFF: [[topic_of(source, robot, STREAM), "1-0-0"]]}).encode()
+    later = {**letter, ENTRY: {"S": "4567"}, PAYLOAD: {"B": waiting}}
+    later |= {SOURCE: {"S": BY_LATER}, TOPIC: {"S": topic_of(source, robot, STREAM)}}
+    for one in (letter, later):
+        source.client("dynamodb").put_item(TableName=source.output("storage", "QuarantineTable"), Item=one)
 
     def move() -> None:
         done = iort(
@@ -208,8 +228,9 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     assert {name: float(row[name]) for name in VEHICLE} == VEHICLE
     assert tags.listed(target)[robot]["lab"] == "north"
     assert notes.notes(target, robot) == [note]
-    (kept,) = quarantine.entries(target, robot=robot)
+    kept, replayed = sorted(quarantine.entries(target, robot=robot), key=lambda one: one.id)
     assert quarantine.load(target, kept) == quarantine.load(source, kept)
+    assert [one.fate for one in replay.replay(target, [replayed])] == [replay.Fate.REPLAYED]
     assert desired() == {"live.rate_hz": 5.0, "motion.stopped": True}
     # Until the robot is there, changes follow.
     registry.set_vehicle(source, robot, {"speed_to_erpm_gain": 5000.0})
@@ -217,6 +238,7 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     move()
     assert float(registry.get(target, robot)["speed_to_erpm_gain"]) == 5000.0
     assert desired() == {"motion.stopped": False}
+    assert list(quarantine.entries(target, robot=robot)) == [kept]
     # Then its new cloud's values stay.
     with Robot(tmp_path / "new" / robot) as there:
         there.online()

@@ -97,5 +97,5 @@ def decode_estimate(content: Any) -> Estimate:
     """Decode an estimate; raises `ContractError`."""
     if not isinstance(content, Mapping):
         raise ContractError(f"estimate must be an object, got {shown(content)}")
-    value, low, high = (float(number(content, name)) for name in ("value", "low", "high"))
+    value, low, high = (number(content, name) for name in ("value", "low", "high"))
     return Estimate(value, low, high, text(content, "unit"))

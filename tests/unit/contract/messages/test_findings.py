@@ -38,11 +38,22 @@ def test_a_finding_survives_json() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"fields": "voltage_input"}, {"p": "small"}, {"effect": {"value": 1}}, {"kind": 7}, {"run": None}],
+    [
+        {"fields": "voltage_input"},
+        {"p": "small"},
+        {"p": 10**400},
+        {"effect": {"value": 1}},
+        {"kind": 7},
+        {"run": None},
+    ],
 )
 def test_what_is_no_finding_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(ContractError):
         decode_finding({**encode_finding(FINDING), **change})
+
+
+def test_a_whole_number_is_a_float_too() -> None:
+    assert repr(decode_finding({**encode_finding(FINDING), "p": 0}).p) == "0.0"
 
 
 def test_every_parameter_names_a_kind_that_exists() -> None:

@@ -1,4 +1,4 @@
-"""The examples of docs/how-to/archive.md count each sample once, at every moment of the archive's life."""
+"""The examples of docs/how-to/archive-tools.md count each sample once, all through the archive's life."""
 
 from __future__ import annotations
 

@@ -55,6 +55,8 @@ class Account:
         self.rows = [
             ArchivedHour(TOPIC, f"2026-11-22T{hour}", DAY, 1, 50, 0, "", sha256, 1, 0, 0) for hour in hours
         ]
+        # The row that its archive writes before the next one is put.
+        self.meanwhile: list[ArchivedHour] = []
         self.findings = FindingsTable(OneTable(), "findings")
 
     def client(self, _service: str) -> Account:
@@ -74,7 +76,11 @@ class Account:
             raise ClientError({"Error": {"Code": "PreconditionFailed"}}, "PutObject")
         self.content[Key] = Body
 
-    def put_item(self, *, TableName: str, Item: dict[str, Any]) -> None:
+    def put_item(self, *, TableName: str, Item: dict[str, Any], ConditionExpression: str) -> None:
+        if self.meanwhile:
+            self.rows.append(self.meanwhile.pop())
+        if Item["hour"]["S"] in {row.hour for row in self.rows}:
+            raise ClientError({"Error": {"Code": "ConditionalCheckFailedException"}}, ConditionExpression)
         self.rows.append(archived_hour(Item))
 
     def speeds(self) -> dict[str, list[Any]]:
@@ -126,6 +132,29 @@ def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
     other.content[hour.key] = b"being written"
     assert archived.copy(source, other, TOPIC) == (0, 1)
     assert other.content[hour.key] == b"being written"
+
+
+def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:
+    source = Account("1", "07")
+    # It has joined a day, or written an hour, and no row points to it yet.
+    joining = Account("2")
+    joining.content[DAY] = day("09")
+    assert archived.copy(source, joining, TOPIC) == (1, 0)
+    assert joining.content[DAY] == day("09")
+    assert joining.speeds() == {"07": [7.0] * 3}
+    hour = Account("1")
+    key = DAY.replace("day.", "07.")
+    hour.content[key] = day("07")
+    hour.rows = [replace(source.rows[0], key=key)]
+    writing = Account("2")
+    writing.content[key] = b"being written"
+    assert archived.copy(hour, writing, TOPIC) == (0, 1)
+    assert (writing.content[key], writing.rows) == (b"being written", [])
+    # The row comes between.
+    late = Account("2")
+    late.meanwhile = [own := replace(source.rows[0], content="own")]
+    assert archived.copy(source, late, TOPIC) == (0, 1)
+    assert late.rows == [own]
 
 
 def test_what_the_target_has_analysed_again_is_not_replaced() -> None:

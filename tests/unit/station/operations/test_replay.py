@@ -69,8 +69,11 @@ class Queues(FakeCloud):
     def send_message(self, **message):
         self.sent.append(message)
 
-    def delete_item(self, *, Key, **_):
-        self.deleted.append(Key["id"]["S"])
+    def update_item(self, *, Key, UpdateExpression, ExpressionAttributeNames, **_):
+        if UpdateExpression.startswith("REMOVE"):
+            # A move reads the key and the expiry.
+            assert not {"robot", "id", "expires_s"} & set(ExpressionAttributeNames.values())
+            self.deleted.append(Key["id"]["S"])
 
 
 def test_deferred_batches_that_failed_are_queued_again():
