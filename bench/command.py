@@ -83,7 +83,7 @@ def wound_up(console: Console) -> Iterator[Callable[[], None]]:
         if asked:
             # The terminal may have gone.
             with suppress(OSError):
-                console.print("still restoring the changes", style="yellow")
+                console.print("still cleaning up", style="yellow")
             return
         asked = True
         raise KeyboardInterrupt

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, steps, write
+from bench.command import made, parser, steps, wound_up, write
 from bench.errors import BenchError
 from bench.keeping import disk, kills, report, week
 from iort_station.errors import StationError
@@ -40,7 +40,7 @@ def main() -> None:
     say = steps(console)
     killed = soaked = None
     try:
-        with tempfile.TemporaryDirectory() as folder:
+        with wound_up(console), tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             if given.kills:
                 killed = kills.drive(Path(folder) / "kills", given.kills, given.seed, say)
                 killed.table().show(console)

@@ -84,13 +84,19 @@ def soak(folder: Path, hours: int, minutes: int, say: Callable[[str], None]) -> 
     end: dict[str, Any] = {}
     say("starting the cloud of the soak")
     with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        for line in process.stdout or ():
-            said = json.loads(line)
-            if "look" not in said:
-                end = said
-                continue
-            looks.append(Look(**said["look"]))
-            say(f"hour {looks[-1].hour} of {hours}: {looks[-1].emulator_mb:.0f} MB")
+        try:
+            for line in process.stdout or ():
+                said = json.loads(line)
+                if "look" not in said:
+                    end = said
+                    continue
+                looks.append(Look(**said["look"]))
+                say(f"hour {looks[-1].hour} of {hours}: {looks[-1].emulator_mb:.0f} MB")
+        except BaseException:
+            # Its cloud ends with it.
+            process.kill()
+            process.wait()
+            raise
     if process.returncode or not end:
         raise BenchError(f"the soak ended with status {process.returncode}")
     cars = {name: Counted(**found) for name, found in end["found"].items()}

@@ -116,7 +116,10 @@ def _addresses(up: Up) -> Iterator[Finding]:
     yield Finding("servers", OK, f"all answer; {where}")
     shown_s = _shown_end_s(cars, up.ports["mqtt"])
     written_s = next((one.ends_s for one in up.certificates if one.name == "broker"), None)
-    if shown_s is not None and written_s is not None and abs(shown_s - written_s) > 1:
+    if shown_s is None:
+        text = "it shows no certificate, so no car can connect"
+        yield Finding("broker", FAIL, text, "`make down`, then `make up`")
+    elif written_s is not None and abs(shown_s - written_s) > 1:
         text = f"the broker shows a certificate that ends on {_day(shown_s)}, not the one in its file"
         yield Finding("broker", WARN, text, "`make down`, then `make up`, before that day")
 
@@ -126,7 +129,7 @@ def _at(host: str, port: int) -> str:
 
 
 def _shown_end_s(host: str, port: int) -> float | None:
-    """The end of the certificate that a server shows; None if it shows none to us."""
+    """The end of the certificate that a server shows; None if it shows none."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with suppress(OSError, ValueError):

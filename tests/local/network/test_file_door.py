@@ -128,6 +128,26 @@ def test_nothing_else_passes(send, presigned, embedded, case):
     assert send(method, target, **headers) == (403, "only presigned requests for files pass here\n")
 
 
+def test_a_header_that_no_signature_covers_copies_nothing(send, presigned, embedded):
+    s3, bucket = embedded.cloud.client("s3"), embedded.cloud.output("storage", "FilesBucket")
+    s3.put_object(Bucket=bucket, Key="analysis/secret", Body=b"secret")
+    headers = {"x-amz-copy-source": f"/{bucket}/analysis/secret"}
+    assert send("PUT", presigned(key="robots/copy"), **headers)[0] == 200
+    assert s3.get_object(Bucket=bucket, Key="robots/copy")["Body"].read() == BODY
+
+
+def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, monkeypatch):
+    monkeypatch.setattr(file_door, "UPLOAD_URL_S", 0.3)
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=30)
+    connection.putrequest("PUT", presigned())
+    connection.putheader("Content-Length", "9")
+    connection.endheaders()
+    assert connection.getresponse().status == 408
+    connection.close()
+    until(lambda: door._passing.total() == 0)
+
+
 @pytest.mark.parametrize("length", ["none", str(PART_BYTES + 1)])
 def test_no_body_passes_that_is_larger_than_a_part_of_a_file(door, presigned, embedded, length):
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
