@@ -14,9 +14,11 @@ def copy(source: Cloud, target: Cloud, robot: str) -> int:
     old, new = findings.table(source), findings.table(target)
     # The target may have analysed a drive again, with all of its batches.
     analysed, there = {one.drive for one in new.drives(robot)}, {note.id for note in new.notes(robot)}
+    # A drive whose analysis failed has a finding, and no row.
+    found = {finding.id for finding in new.findings(robot)}
     count = 0
     for finding in old.findings(robot):
-        if finding.drive not in analysed:
+        if finding.drive not in analysed and finding.id not in found:
             new.put_finding(finding)
             count += 1
     # After its findings: a move that ends between them goes on.
