@@ -323,7 +323,7 @@ class _Reader:
     def _compare(self, node: ast.Compare) -> Node:
         parts: list[Node] = []
         left = node.left
-        for kind, right in zip(node.ops, node.comparators, strict=True):
+        for kind, right in zip(node.ops, node.comparators):
             parts.append(self._pair(left, kind, right))
             left = right
         return parts[0] if len(parts) == 1 else Every(tuple(parts))

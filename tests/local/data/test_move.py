@@ -27,6 +27,7 @@ from iort_contract.tables import (
     BY_LATER,
     CONNECTED_MS,
     ENTRY,
+    FIRST_MS,
     LAST_MS,
     PAYLOAD,
     PUT_OFF,
@@ -202,11 +203,13 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     tags.change(source, robot, {"lab": "north"})
     note = notes.write(source, robot, "new tyres", by="anna")
     shadow.Shadow(source, robot).desire({"live.rate_hz": 5.0, "motion.stopped": True})
+    now_ms = {"N": str(int(time.time() * 1000))}
     letter: dict[str, Any] = {
         ROBOT_KEY: {"S": robot},
         ENTRY: {"S": "0123"},
         PAYLOAD: {"B": b"\0\xff"},
-        LAST_MS: {"N": str(int(time.time() * 1000))},
+        FIRST_MS: now_ms,
+        LAST_MS: now_ms,
     }
     waiting = json.dumps({PUT_OFF: [[topic_of(source, robot, STREAM), "1-0-0"]]}).encode()
     later = {**letter, ENTRY: {"S": "4567"}, PAYLOAD: {"B": waiting}}

@@ -159,7 +159,7 @@ class _Moving:
                 hours = archived.copy(source, target, topic)
                 batches = recorded.copy(source, target, topic, units_per_s=self._units, progress=read.tell)
             found = compared.compare(source, target, robot, stream, read.tell)
-        if not found.batches:
+        if not found.batches and not hours.left:
             return
         problem = found.problem
         if hours.left:
