@@ -34,7 +34,7 @@ from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
 from local.deployment import ROOT, deploy
 from local.emulator import first_calls, patched
-from local.errors import LocalError
+from local.errors import EmulatorError, LocalError
 from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
 from local.network.listen import Listen
@@ -53,13 +53,6 @@ _END_S = 1.0
 _REFUSES = 1
 
 Progress = Callable[[str], None]
-
-
-class EmulatorError(LocalError):
-    """The emulator ended, and nobody has stopped it; errors of its clients come from this."""
-
-    def __init__(self, emulator: Child) -> None:
-        super().__init__(f"the emulator {emulator.ended()}:\n{emulator.tail()}")
 
 
 class EmbeddedCloud:
@@ -289,7 +282,7 @@ class EmbeddedCloud:
         status = self.emulator.wait(_END_S) if isinstance(error, Exception) else None
         self.emulator.kill()
         if status not in {None, _REFUSES}:
-            raise EmulatorError(self.emulator) from error
+            raise EmulatorError(self.emulator.ended()) from error
 
     def _kept_variables(self) -> dict[str, str]:
         return {

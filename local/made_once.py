@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from local.errors import LocalError
+
 _KEPT = 4
 # A folder that is still being made after this time was left by a process that ended.
 _LEFT_S = 3600
@@ -19,7 +21,8 @@ _LEFT_S = 3600
 def kept(folder: Path, key: str, sources: Iterable[Path], make: Callable[[Path], object]) -> Path:
     """Return the folder below ``folder`` for the key and the sources' content; ``make`` fills a new one.
 
-    Processes may call it at the same time. The oldest folders are removed.
+    Processes may call it at the same time. The oldest folders are removed. Raises `LocalError` in a checkout
+    that is another user's, if it has no such folder.
     """
     digest = hashlib.sha256(f"{sys.version} {key}".encode())
     for source in sources:
@@ -30,6 +33,11 @@ def kept(folder: Path, key: str, sources: Iterable[Path], make: Callable[[Path],
         with suppress(OSError):
             found.touch()
         return found
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    if not os.access(there, os.W_OK):
+        raise LocalError(
+            f"you must be able to write {there}: its owner must run this once, or use a checkout of your own"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     making = found.with_suffix(f".{os.getpid()}")
     shutil.rmtree(making, ignore_errors=True)

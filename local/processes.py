@@ -75,12 +75,13 @@ class Child:
     def check(self) -> None:
         """Raise `LocalError` with the end of its log if it has stopped."""
         if self.poll() is not None:
-            raise LocalError(f"{self.name} {self.ended()}:\n{self.tail()}")
+            raise LocalError(self.ended())
 
     def ended(self) -> str:
-        """How it has ended, in words."""
+        """How it has ended, in words, and the end of its log."""
         status = self._process.returncode
-        return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        return f"{self.name} {how}:\n{self.tail()}"
 
     def tail(self) -> str:
         """The last lines of its log."""

@@ -91,10 +91,20 @@ class StateFolder:
             )
 
     def settings(self) -> dict[str, Any]:
-        """What a kept cloud remembers of its last start."""
+        """What a kept cloud remembers of its last start. Raises `LocalError` if somebody has broken it."""
         if not self.kept or not self._settings_path.exists():
             return {}
-        found: dict[str, Any] = json.loads(self._settings_path.read_text())
+        try:
+            found: dict[str, Any] = json.loads(self._settings_path.read_text())
+            ports = found.get("ports", {})
+            wrong = [(name, port) for name, port in ports.items() if port not in range(1, 65_536)]
+        except (ValueError, AttributeError) as error:
+            raise LocalError(f"{self._settings_path} must be a JSON object: {error}") from error
+        if wrong:
+            [(name, port), *_] = wrong
+            raise LocalError(
+                f"{self._settings_path}: the port {name} must be a number from 1 to 65535, got {port!r}"
+            )
         return found
 
     def remember(self, **settings: Any) -> None:

@@ -29,7 +29,10 @@ def main() -> None:
 
 def stop(folder: Path) -> bool:
     """Stop the cloud of a folder; whether one was up. Raises `LocalError` if it does not end."""
-    pid = owner(folder)
+    try:
+        pid = owner(folder)
+    except PermissionError as error:
+        raise LocalError(f"{folder} is another user's, who must stop its cloud: {error}") from error
     if pid is None:
         return False
     # It may end by itself meanwhile.

@@ -23,8 +23,8 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
-from local.cloud import EmbeddedCloud, EmulatorError
-from local.errors import LocalError
+from local.cloud import EmbeddedCloud
+from local.errors import EmulatorError, LocalError
 from local.network.addresses import is_ipv6
 from local.network.certificates import write_private
 from local.network.listen import Listen
@@ -114,7 +114,7 @@ class _Kept:
         renewed = time.monotonic()
         while not self._stopped.is_set():
             if embedded.emulator.wait(_LOOK_S) is not None:
-                raise EmulatorError(embedded.emulator)
+                raise EmulatorError(embedded.emulator.ended())
             embedded.emulator.shorten_log(_MOST_LOG_BYTES)
             if time.monotonic() - renewed > _RENEW_S:
                 renewed = time.monotonic()

@@ -5,11 +5,9 @@ from __future__ import annotations
 import fcntl
 import os
 import re
-import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,16 +18,14 @@ from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.kept import owner
 from iort_station.page.background import BackgroundServer
-from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.network.certificates import Authority, ServerCertificate
 from local.network.listen import Listen
 from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
-from local.up import options, run, service
+from local.up import service
 from local.up.down import stop
-from tests.local.keeping.emulators import Emulator
 
 
 @pytest.fixture
@@ -51,6 +47,30 @@ def test_a_kept_folder_keeps_its_ports_and_a_second_cloud_is_refused(state):
         pytest.raises(LocalError, match=r"is in use .*'sport = :.*`make down .*settings\.json, .*car\.yaml"),
     ):
         again.port("mqtt", "127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('{"ports": {"mqtt": 8884,}}', "must be a JSON object: "),
+        ('["ports"]', "must be a JSON object: "),
+        ('{"ports": {"mqtt": "8884"}}', "the port mqtt must be a number from 1 to 65535, got '8884'"),
+        ('{"ports": {"mqtt": 70000}}', "the port mqtt must be a number from 1 to 65535, got 70000"),
+    ],
+)
+def test_settings_that_somebody_broke_are_an_error_that_says_so(state, text, why):
+    (state.path / "settings.json").write_text(text)
+    with pytest.raises(LocalError, match=re.escape(why)):
+        state.port("mqtt", "127.0.0.1")
+
+
+def test_down_of_another_users_cloud_says_so(tmp_path, monkeypatch):
+    def refuses(_folder):
+        raise PermissionError(13, "Permission denied", "cloud.lock")
+
+    monkeypatch.setattr("local.up.down.owner", refuses)
+    with pytest.raises(LocalError, match="is another user's, who must stop its cloud"):
+        stop(tmp_path)
 
 
 def test_a_second_cloud_leaves_the_usual_ports_to_the_first(tmp_path):
@@ -246,16 +266,6 @@ def test_a_page_at_an_ipv6_address_needs_a_name_that_a_browsers_policy_can_have(
     )
 
 
-def test_an_emulator_whose_broker_cannot_listen_ends(tmp_path):
-    emulator = Emulator(tmp_path)
-    with (
-        socket.create_server(("127.0.0.1", emulator.mqtt_port)),
-        pytest.raises(LocalError, match=f"the broker cannot listen on port {emulator.mqtt_port}"),
-    ):
-        emulator.start()
-    assert emulator.process.poll() == os.EX_UNAVAILABLE
-
-
 def test_a_server_that_finds_its_port_taken_meanwhile_says_so(state):
     server = BackgroundServer("127.0.0.1", state.port("files", "127.0.0.1"))
     with (
@@ -264,27 +274,3 @@ def test_a_server_that_finds_its_port_taken_meanwhile_says_so(state):
         pytest.raises(LocalError, match=rf"port {server.port} \(files\) is in use .*'sport = :"),
     ):
         state.serve(stack, "files", server)
-
-
-def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_few_times(
-    tmp_path, monkeypatch
-):
-    starts = []
-
-    class Killed(EmbeddedCloud):
-        def start_emulator(self, *given):
-            super().start_emulator(*given)
-            starts.append(self.emulator.pid)
-            os.kill(self.emulator.pid, signal.SIGKILL)
-
-    def deploy(*_given, **_settings):
-        raise LocalError("cdk deploy failed")
-
-    monkeypatch.setattr(run, "EmbeddedCloud", Killed)
-    monkeypatch.setattr("local.cloud.deploy", deploy)
-    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
-    with pytest.raises(
-        LocalError, match=r"(?s)emulator was ended by SIGKILL.*It ended 3 times within 10 min"
-    ):
-        run._Kept(given, threading.Event()).run()
-    assert len(starts) == 3

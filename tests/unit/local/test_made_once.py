@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from local.errors import LocalError
 from local.made_once import kept
 
 
@@ -52,3 +53,14 @@ def test_a_folder_may_go_while_the_ages_are_read(tmp_path: Path, monkeypatch: py
     listed = Path.iterdir
     monkeypatch.setattr(Path, "iterdir", lambda folder: iter([*listed(folder), gone]))
     assert kept(tmp_path, "key", [], _make).is_dir()
+
+
+def test_another_users_checkout_keeps_what_it_has_and_refuses_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = kept(tmp_path, "there", [], _make)
+    # Root may write everywhere.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert kept(tmp_path, "there", [], _make) == found
+    with pytest.raises(LocalError, match=f"you must be able to write {tmp_path}: its owner"):
+        kept(tmp_path, "new", [], _make)

@@ -1,0 +1,49 @@
+"""Starts of a cloud at which the emulator ends: it is started again, or the start says why not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+
+import pytest
+
+from local.cloud import EmbeddedCloud
+from local.errors import LocalError
+from local.up import options, run
+from tests.local.keeping.emulators import Emulator
+
+
+def test_an_emulator_whose_broker_cannot_listen_ends(tmp_path):
+    emulator = Emulator(tmp_path)
+    with (
+        socket.create_server(("127.0.0.1", emulator.mqtt_port)),
+        pytest.raises(LocalError, match=f"the broker cannot listen on port {emulator.mqtt_port}"),
+    ):
+        emulator.start()
+    assert emulator.process.poll() == os.EX_UNAVAILABLE
+
+
+def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_few_times(
+    tmp_path, monkeypatch
+):
+    starts = []
+
+    class Killed(EmbeddedCloud):
+        def start_emulator(self, *given):
+            super().start_emulator(*given)
+            starts.append(self.emulator.pid)
+            os.kill(self.emulator.pid, signal.SIGKILL)
+
+    def deploy(*_given, **_settings):
+        raise LocalError("cdk deploy failed")
+
+    monkeypatch.setattr(run, "EmbeddedCloud", Killed)
+    monkeypatch.setattr("local.cloud.deploy", deploy)
+    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
+    with pytest.raises(
+        LocalError, match=r"(?s)emulator was ended by SIGKILL.*It ended 3 times within 10 min"
+    ):
+        run._Kept(given, threading.Event()).run()
+    assert len(starts) == 3
