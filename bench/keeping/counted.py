@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
@@ -58,3 +60,11 @@ def count(cloud: Cloud, robot: str) -> Counted:
         summarized=counts.samples_summarized(cloud, robot, VESC_STREAM),
         expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
     )
+
+
+def counted(cars: Mapping[str, Any]) -> dict[str, Counted]:
+    """The counts of each car, from JSON."""
+    return {
+        name: Counted(**{**figures, "incomplete": tuple(figures["incomplete"])})
+        for name, figures in cars.items()
+    }

@@ -14,7 +14,7 @@ from typing import Any
 
 from bench.errors import BenchError
 from bench.keeping import disk
-from bench.keeping.counted import Counted, count
+from bench.keeping.counted import Counted, count, counted
 from bench.keeping.up import Up
 from bench.load.agent_process import AgentProcess
 from bench.report.result import Table
@@ -71,6 +71,12 @@ class Kills:
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
+
+    @classmethod
+    def of_json(cls, figures: dict[str, Any]) -> Kills:
+        """The figures that `as_json` returned."""
+        restart_s = figures["restart_s"] and Spread(**figures["restart_s"])
+        return cls(**{**figures, "restart_s": restart_s, "cars": counted(figures["cars"])})
 
     def table(self) -> Table:
         """A row for each car."""

@@ -15,7 +15,7 @@ from typing import Any
 from bench import ROOT
 from bench.errors import BenchError
 from bench.keeping import clock
-from bench.keeping.counted import Counted
+from bench.keeping.counted import Counted, counted
 from bench.keeping.soak import CARS, Look
 from bench.report.result import Table
 
@@ -48,6 +48,13 @@ class Soak:
 
     def as_json(self) -> dict[str, Any]:
         return {**asdict(self), "growth": round(self.growth, 4)}
+
+    @classmethod
+    def of_json(cls, figures: dict[str, Any]) -> Soak:
+        """The figures that `as_json` returned."""
+        looks = [Look(**one) for one in figures["looks"]]
+        cars = counted(figures["cars"])
+        return cls(figures["hours"], figures["minutes"], looks, figures["sent"], cars)
 
     def table(self) -> Table:
         """A row for each of a few hours."""
@@ -99,5 +106,4 @@ def soak(folder: Path, hours: int, minutes: int, say: Callable[[str], None]) -> 
             raise
     if process.returncode or not end:
         raise BenchError(f"the soak ended with status {process.returncode}")
-    cars = {name: Counted(**found) for name, found in end["found"].items()}
-    return Soak(hours, minutes, looks, end["sent"], cars)
+    return Soak(hours, minutes, looks, end["sent"], counted(end["found"]))

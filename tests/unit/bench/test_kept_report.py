@@ -9,6 +9,7 @@ from bench.keeping.counted import Counted
 from bench.keeping.soak import Look
 from bench.keeping.week import Soak
 from bench.report import machine
+from tests.unit.bench.test_kills import DRIVE
 
 
 def soak(*emulator_mb: float) -> Soak:
@@ -22,9 +23,12 @@ def test_memory_may_not_grow_after_the_first_quarter(last, good):
     assert soak(80.0, 100.0, 100.0, last).good is good
 
 
-def test_the_report_is_written_into_a_new_folder(tmp_path):
-    report.write(tmp_path / "new", None, soak(100.0, 100.0, 100.0, 101.0), {"machine": machine.describe()})
+def test_a_part_that_was_not_measured_now_stays_in_the_report(tmp_path):
+    folder, here = tmp_path / "new", machine.describe()
+    report.write(folder, None, soak(100.0, 100.0, 100.0, 101.0), here)
+    report.write(folder, DRIVE, None, here)
 
-    text = (tmp_path / "new" / "kept.md").read_text()
+    text = (folder / "kept.md").read_text()
     assert "0 lost, memory +1.0% from the second quarter to the last" in text
-    assert (tmp_path / "new" / "kept.svg").exists()
+    assert DRIVE.table().as_markdown() in text
+    assert (folder / "kept.svg").exists()
