@@ -24,10 +24,13 @@ settings.register_profile("fast", settings.get_profile("iort"), max_examples=10,
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
 # starts its own cloud, the synthesized app, the browser. They start first, in this order: a long group that
-# starts last runs alone. A node id's beginning decides, and the first that fits.
+# starts last runs alone. A node id's beginning decides, and the first that fits; a group runs in the order of
+# its paths here.
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
+    # Before the others have raised the alarms that it waits for.
+    "tests/local/operations/test_eyes.py": "cloud of the data",
     "tests/local/data/": "cloud of the data",
     "tests/local/operations/": "cloud of the data",
     "tests/local/page/": "cloud of the data",
@@ -60,7 +63,13 @@ def group(nodeid: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the tests of the groups first."""
     order = {name: i for i, name in enumerate(dict.fromkeys(GROUPS.values()))}
-    items.sort(key=lambda item: order.get(group(item.nodeid), len(order)))
+    paths = list(GROUPS)
+
+    def place(nodeid: str) -> tuple[int, int]:
+        path = next((i for i, path in enumerate(paths) if nodeid.startswith(path)), len(paths))
+        return order.get(group(nodeid), len(order)), path
+
+    items.sort(key=lambda item: place(item.nodeid))
 
 
 def pytest_configure() -> None:
