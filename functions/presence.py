@@ -79,6 +79,26 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def late(event: Mapping[str, Any]) -> dict[str, Any]:
+    """The update for a connect event that its own disconnect has overtaken: the robot stays offline."""
+    at = {"N": str(_number(event, "timestamp"))}
+    return {
+        "Key": {ROBOT: {"S": check_robot(event.get("clientId", ""))}},
+        "UpdateExpression": f"SET {tables.CONNECTED_MS} = :at, {tables.CERTIFICATE_ID} = :certificate",
+        "ConditionExpression": (
+            f"{SESSION_VERSION} = :version AND #online = :not"
+            f" AND (attribute_not_exists({tables.CONNECTED_MS}) OR {tables.CONNECTED_MS} < :at)"
+        ),
+        "ExpressionAttributeNames": {"#online": tables.ONLINE},
+        "ExpressionAttributeValues": {
+            ":at": at,
+            ":certificate": _text(event.get("principalIdentifier")),
+            ":version": {"N": str(_number(event, "versionNumber"))},
+            ":not": {"BOOL": False},
+        },
+    }
+
+
 def _number(event: Mapping[str, Any], name: str) -> int:
     value = event.get(name)
     if type(value) is not int or value < 0:
@@ -94,12 +114,18 @@ def _text(value: Any) -> dict[str, str]:
 
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the rules presence and version. Events without effect are counted."""
-    dynamodb = clients.dynamodb()
+    dynamodb, kind = clients.dynamodb(), event.get("eventType")
+    table = variables(RegistryEnvironment).robots_table
+    missed = dynamodb.exceptions.ConditionalCheckFailedException
     try:
-        dynamodb.update_item(TableName=variables(RegistryEnvironment).robots_table, **change(event))
-    except (ContractError, dynamodb.exceptions.ConditionalCheckFailedException) as error:
+        try:
+            dynamodb.update_item(TableName=table, **change(event))
+        except missed:
+            if kind != "connected":
+                raise
+            dynamodb.update_item(TableName=table, **late(event))
+    except (ContractError, missed) as error:
         _log.info("ignored: %s", error)
         emit("presence", PresenceIgnored=1)
         return
-    kind = event.get("eventType")
     emit("presence", RobotsConnected=kind == "connected", RobotsDisconnected=kind == "disconnected")

@@ -108,8 +108,13 @@ def _any_order(table, events):
         assert row["session_version"] == last["versionNumber"]
         assert row["last_seen_ms"] == last["timestamp"]
         if row["online"]:
-            assert row["certificate_id"] == last["principalIdentifier"]
             assert "disconnect_reason" not in row
+        newest = max(
+            (event for event in events if event["eventType"] == "connected"),
+            key=lambda event: event["versionNumber"],
+        )
+        assert row["connected_ms"] == newest["timestamp"], order
+        assert row["certificate_id"] == newest["principalIdentifier"], order
 
 
 def test_versions_that_restart_after_an_hour_are_newer(table):

@@ -86,6 +86,8 @@ class Commands:
             for motion in self._motions.values():
                 if stopped:
                     motion.leases.hold(now)
+                    # Before the first stop, after which the agent may die.
+                    self._tell_guard(motion)
                 else:
                     motion.leases.free()
         self.tick()

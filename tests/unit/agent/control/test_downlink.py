@@ -192,6 +192,17 @@ class FakeGuard:
         pass
 
 
+class DyingError(Exception):
+    """The agent's end."""
+
+
+class DyingGuard(FakeGuard):
+    """The agent dies while it tells."""
+
+    def tell(self, _topic: str, _until: float | None, *, held: bool) -> bool:
+        raise DyingError
+
+
 def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
     clock = ManualClock(now_us=T0)
     guard = FakeGuard(clock)
@@ -217,6 +228,13 @@ def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
         (at, None, False),
         (at, None, True),
     ]
+
+
+def test_the_guard_knows_of_an_emergency_stop_before_the_first_stop() -> None:
+    rig = Rig(guard=DyingGuard(ManualClock(now_us=T0)))
+    with pytest.raises(DyingError):
+        rig.downlink.set_stopped(True)
+    assert rig.graph.published == []
 
 
 def test_two_names_of_one_topic_share_its_lease() -> None:
