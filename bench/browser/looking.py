@@ -132,23 +132,26 @@ def _looked(options: argparse.Namespace, console: Console) -> list[Look]:
         counted = Counted(embedded.cloud)
         stack.enter_context(counted.broker)
         server = stack.enter_context(_served(embedded.cloud))
-        looking = _Looking(browser, server.url, counted, options.cars, options.pictures)
+        looking = _Looking(browser, server.url, counted, options, console)
         wait_for(lambda: len(counted.over(1.0)) > 0, "a car", 60)
         return [
             looking.at("nobody looks", None),
             looking.at("the fleet", "#/"),
             *looking.one_car(),
             looking.killed(),
-            _far(browser, embedded.cloud),
+            _far(browser, embedded.cloud, console),
         ]
 
 
 class _Looking:
     """Opens pages, and counts meanwhile."""
 
-    def __init__(self, browser: Any, url: str, counted: Counted, cars: int, pictures: Path | None) -> None:
-        self._browser, self._url, self._counted = browser, url, counted
-        self._cars, self._pictures = cars, pictures
+    def __init__(
+        self, browser: Any, url: str, counted: Counted, options: argparse.Namespace, console: Console
+    ) -> None:
+        self._browser, self._url, self._counted, self._console = browser, url, counted, console
+        self._cars: int = options.cars
+        self._pictures: Path | None = options.pictures
 
     def at(self, what: str, view: str | None) -> Look:
         """Look at a view with one page; at none, the page is closed."""
@@ -201,6 +204,7 @@ class _Looking:
             context.close()
 
     def _count(self, what: str, page: Any, note: str = "") -> Look:
+        self._console.print(f"counting for {_COUNTED_S:.0f} s: {what}")
         counted = self._counted.over(_COUNTED_S)
         if page is not None:
             note = "; ".join(filter(None, (note, page.inner_text("#awake"), page.inner_text("#count"))))
@@ -212,8 +216,9 @@ class _Looking:
         return Look(what, watched / _COUNTED_S, others / _COUNTED_S, note)
 
 
-def _far(browser: Any, cloud: Cloud) -> Look:
+def _far(browser: Any, cloud: Cloud, console: Console) -> Look:
     """Look at the car over a slow connection that drops, and note the longest time without a message."""
+    console.print(f"looking for {_FAR_S:.0f} s over a slow connection that drops")
     relay = int(cloud.websocket_url.rpartition(":")[2].partition("/")[0])
     with Proxy("127.0.0.1", relay, latency_s=_LATENCY_S) as proxy:
         far = replace(cloud, websocket=f"ws://127.0.0.1:{proxy.port}/mqtt")
