@@ -145,7 +145,7 @@ def test_a_status_is_the_same_after_reading_its_json() -> None:
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_an_emergency_stop_ends_with_an_agent_that_is_asked_to_end(asked: bool) -> None:  # noqa: FBT001
+def test_an_emergency_stop_ends_with_an_agent_that_is_asked_to_end(asked: bool) -> None:
     def end(_emit: Emit, _stop: threading.Event) -> None:
         if asked:
             rig.runtime.stop()
