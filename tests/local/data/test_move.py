@@ -298,7 +298,7 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
             until(lambda: len(list(counts.batches(source, robot, STREAM))) >= 2)
             proxy.mode = REFUSE
             # These stay in the queue on the robot's disk.
-            until(lambda: agent.status()["spool"]["batches"] >= 6)
+            until(lambda: agent.told()["spool"]["batches"] >= 6)
             agent.stop()
             agent.process.wait()
     there = {(batch.boot, batch.seq) for batch in counts.batches(source, robot, STREAM)}

@@ -33,7 +33,7 @@ def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
     )
     agent = Agent(car)
     try:
-        until(agent.status, seconds=60)
+        until(agent.status)
         done = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60")
         # The same car, by the way without PubNub.
         straight = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60", "--live", "iot")

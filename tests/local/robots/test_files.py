@@ -121,9 +121,9 @@ def test_a_large_upload_resumes_after_the_agent_is_killed(bundle, bucket, tmp_pa
     large.write_bytes(content)
     watched = {"folder": str(folder), "settle_s": 1, "remove_after_s": 0}
     source = {"type": "sim", "stream": "vesc", "rate_hz": 10}
-    car = bundle(sources=[source], files={**watched, "rate_kb_s": 4000})
+    car = bundle(sources=[source], files={**watched, "rate_kb_s": 1500})
     agent = Agent(car)
-    until(lambda: bucket.parts(car.robot), seconds=120)
+    until(lambda: bucket.parts(car.robot))
     agent.kill()
     there = bucket.parts(car.robot)
     assert not bucket.keys(car.robot)
@@ -131,10 +131,10 @@ def test_a_large_upload_resumes_after_the_agent_is_killed(bundle, bucket, tmp_pa
 
     robots.configure(car, {"files": {**watched, "rate_kb_s": 0}})
     agent = Agent(car)
-    (key,) = until(lambda: bucket.keys(car.robot), seconds=120)
+    (key,) = until(lambda: bucket.keys(car.robot))
     assert bucket.content(key) == content
-    until(lambda: not large.exists(), seconds=60)
-    status = agent.status()["files"]
+    until(lambda: not large.exists())
+    status = agent.told()["files"]
     agent.process.terminate()
     agent.report()
     # Parts that were stored before the kill were not sent again.
@@ -321,6 +321,6 @@ def test_an_expired_address_is_stale(embedded, bucket, robot, tmp_path):
     def sent():
         return sender.put(address, local, 0, len(CONTENT), threading.Event())
 
-    put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one, seconds=60)
+    put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one)
     assert put.outcome is Outcome.STALE
     assert "403" in put.text
