@@ -21,6 +21,7 @@ from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until
 from tests.local.faults.test_uplink import self_signed, set_status
+from tests.waiting import GUARD_S
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 
@@ -137,7 +138,7 @@ def test_a_running_agent_reports_its_status(embedded, bundle):
             samples = until(lambda: _own_samples(embedded, car.robot))
         finally:
             agent.terminate()
-            assert agent.wait(120) == 0
+            assert agent.wait(GUARD_S) == 0
     assert samples.keys() == AGENT_FIELDS.keys()
     assert samples["connects"][-1] == 1
     assert 1 < samples["rss_mb"][-1] < 200

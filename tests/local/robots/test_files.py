@@ -45,6 +45,7 @@ from local.deployment import ROOT
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
+from tests.waiting import GUARD_S
 from verify.tools.robot import Robot
 
 CONTENT = b"a small file"
@@ -84,7 +85,7 @@ def upload(car, *files, env=None):
     """Run the robot's own command."""
     command = [Path(sys.executable).parent / "iort-agent", "upload", "--config", car.config, "--json", *files]
     done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=180, env=env
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=GUARD_S, env=env
     )
     return done.returncode, json.loads(done.stdout or "[]"), done.stderr
 
@@ -218,7 +219,9 @@ def put(embedded):
 
     def send(address: Address, body: bytes) -> tuple[int, str]:
         url = urlsplit(address.url)
-        connection = http.client.HTTPSConnection(url.hostname or "", url.port, context=context, timeout=60)
+        connection = http.client.HTTPSConnection(
+            url.hostname or "", url.port, context=context, timeout=GUARD_S
+        )
         connection.request("PUT", f"{url.path}?{url.query}", body, dict(address.headers))
         answer = connection.getresponse()
         text = answer.read().decode()
