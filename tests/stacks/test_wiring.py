@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
-import json
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from aws_cdk import App
@@ -56,8 +50,6 @@ HANDLERS = (
 )
 CONTRACT = sorted((ROOT / "contract" / "iort_contract").rglob("*"))
 ANALYSIS = sorted((ROOT / "analysis" / "iort_analysis").rglob("*"))
-# Lambda's Python has boto3 and what boto3 needs.
-RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
 
 
 @pytest.fixture(scope="module")
@@ -82,68 +74,6 @@ def test_the_asset_holds_exactly_the_functions_the_contract_and_the_analysis(syn
         for path, home in expected.items()
         if path.is_file() and "__pycache__" not in path.parts
     }
-
-
-@pytest.fixture(scope="module")
-def runtime(tmp_path_factory):
-    """Lambda's Python beside the asset: only boto3 from this environment."""
-    folder = tmp_path_factory.mktemp("runtime")
-    for package in RUNTIME_PACKAGES:
-        spec = importlib.util.find_spec(package)
-        assert spec is not None
-        assert spec.origin is not None
-        origin = Path(spec.origin)
-        origin = origin.parent if origin.name == "__init__.py" else origin
-        (folder / origin.name).symlink_to(origin)
-    return folder
-
-
-@pytest.mark.parametrize("function", HANDLERS)
-def test_every_handler_imports_from_its_asset_alone(synthesized, functions, runtime, tmp_path, function):
-    properties = functions[function]
-    asset = synthesized.asset(properties["Code"])
-    path = [str(asset)]
-    if "Layers" in properties:
-        layer = ROOT / "build" / "layer" / "local" / "python"
-        if not layer.is_dir():
-            pytest.skip(f"{layer} is not there: run `make setup`")
-        (tmp_path / "layer").symlink_to(layer)
-        path.append(str(tmp_path / "layer"))
-    path.append(str(runtime))
-    program = """
-import importlib, json, sys
-sys.path[:0] = json.loads(sys.argv[1])
-module, _, attribute = sys.argv[2].rpartition(".")
-handler = getattr(importlib.import_module(module), attribute)
-assert callable(handler)
-files = {n: m.__file__ for n, m in sys.modules.items() if getattr(m, "__file__", None)}
-print(json.dumps(files))
-"""
-    # -I and -S: neither this environment's packages nor the checkout are on the path.
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-B", "-c", program, json.dumps(path), properties["Handler"]],
-        cwd=tmp_path,
-        env={"PATH": os.environ["PATH"]},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    files = json.loads(done.stdout)
-    own = {
-        module: file
-        for module, file in files.items()
-        if module.split(".")[0] in ("functions", "iort_contract")
-    }
-    assert {"iort_contract", "functions", properties["Handler"].rpartition(".")[0]} <= own.keys()
-    for file in own.values():
-        assert Path(file).is_relative_to(asset)
-    assert not [
-        file for file in files.values() if Path(file).is_relative_to(ROOT) and asset not in Path(file).parents
-    ]
-    # pubnub takes 240 ms to load: only the function that publishes pays for it.
-    assert ("pubnub" in files) == (function == "Live")
 
 
 def test_every_function_module_with_a_handler_is_deployed(functions):

@@ -79,7 +79,7 @@ def test_an_offline_car_is_told_from_an_unknown_one(open_page: Callable[..., Pag
     assert page.get_by_role("link", name="What it did before").is_visible()
     page.goto(f"{served}#/car/car-22")
     until(lambda: page.inner_text("#empty-title") == "There is no car car-22", "the refusal")
-    assert "Registered are car-2, car-3, car-10." in page.inner_text("#empty")
+    assert "Registered: car-2, car-3, car-10." in page.inner_text("#empty")
 
 
 def test_a_page_without_a_server_lists_no_absent_car(page: Page, url: str) -> None:

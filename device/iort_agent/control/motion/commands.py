@@ -86,10 +86,10 @@ class Commands:
             for motion in self._motions.values():
                 if stopped:
                     motion.leases.hold(now)
-                    # Before the first stop, after which the agent may die.
-                    self._tell_guard(motion)
                 else:
                     motion.leases.free()
+                # Before the first stop, after which the agent may die.
+                self._tell_guard(motion)
         self.tick()
         self._wake()
 
@@ -109,17 +109,18 @@ class Commands:
                 if motion.leases.stop_due(now):
                     if not motion.stopping:
                         stopped += self._begin_stop(motion, now)
-                    data = motion.stop(self._clock.now_us())
-                    motion.stops += self._graph.publish(motion.topic, data)
+                    motion.unheard = not self._publish_stop(motion)
                 elif motion.stopping and motion.leases.next_due() is None:
                     motion.stopping = False
                     # Under the lock, so that no command that has just passed is released.
                     self._graph.release(motion.topic)
-                self._tell_guard(motion)
+                # A lease whose stop nobody hears ends for the guard, too, which then publishes its own.
+                if not motion.unheard:
+                    self._tell_guard(motion)
             found = [motion.leases.next_due() for motion in self._motions.values()]
             # After the stops, since it may have to start a process.
             if self._guard is not None:
-                self._guard.tick()
+                self._guard.tick(stops=not any(motion.unheard for motion in self._motions.values()))
         for sample in stopped:
             self._operator.drove(sample)
         return min((at for at in found if at is not None), default=None)
@@ -152,6 +153,16 @@ class Commands:
         ends = motion.leases.ends
         until = None if ends is None else ends + STOP_AHEAD_MS / 1000
         return self._guard.tell(motion.topic, until, held=motion.leases.held)
+
+    def _publish_stop(self, motion: Motion) -> bool:
+        """Whether that was possible. One motion that fails must not keep the others from stopping."""
+        try:
+            published = self._graph.publish(motion.topic, motion.stop(self._clock.now_us()))
+        except Exception:  # noqa: BLE001 - whatever a ROS library raises
+            _log.exception("%s: the stop failed", motion.topic)
+            return False
+        motion.stops += published
+        return published
 
     def _begin_stop(self, motion: Motion, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""

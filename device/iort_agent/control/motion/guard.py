@@ -61,8 +61,9 @@ class Guard:
         self._told[topic] = _line([topic, until, held])
         return self._write(self._told[topic])
 
-    def tick(self) -> None:
-        """Start it again if it has died or frozen; called at least every second or so."""
+    def tick(self, *, stops: bool = True) -> None:
+        """Start it again if it has died or frozen; called at least every second or so. ``stops`` tells
+        whether the agent can publish its stops; if not, the guard publishes those of an emergency stop."""
         now = self._clock.monotonic()
         if self._start_at is None or now < self._start_at:
             return
@@ -72,7 +73,7 @@ class Guard:
             )
             self._kill()
         if self._running():
-            if self._in_graph:
+            if self._in_graph and stops:
                 self._write(b"\n")
             return
         self._start_at = now + _AGAIN_S

@@ -27,10 +27,11 @@ _log = logging.getLogger("iort_agent.guard")
 # The stop of a lease that the agent has certainly not ended.
 _UNANSWERED = 2
 # In an emergency stop the agent writes at least every `STOP_HOLD_S`.
-_SILENT_S = 0.5
+_SILENT_S = 0.15
 _POLL_S, _IDLE_S = 0.05, 4.0
-# Between two looks for the agent's node.
-_LOOK_S = 1.0
+# Between two looks for the agent's node. It must be there several times in a row: subscribers need a moment
+# to connect to it, and it may die again.
+_LOOK_S, _LOOKS = 1.0, 3
 _CONNECT_S = 2.0
 _BUFFER = 65_536
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -100,8 +101,10 @@ class _Guard:
 
     def watch(self, over: threading.Event) -> None:
         """Set ``over`` once the agent's node is in the graph again."""
+        seen = 0
         while not over.wait(_LOOK_S):
-            if self.node.lives(self._agent):
+            seen = seen + 1 if self.node.lives(self._agent) else 0
+            if seen == _LOOKS:
                 over.set()
 
     def tick(self) -> float | None:

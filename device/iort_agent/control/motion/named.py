@@ -27,6 +27,8 @@ class Motion:
         # The name of the newest command that passed.
         self.last: Named | None = None
         self.stops = 0
+        # The newest stop could not be published: the agent is not in the ROS graph.
+        self.unheard = False
 
     def stop(self, now_us: int) -> bytes:
         return encode(self._definition, self._stop, now_us=now_us, partial=True)

@@ -180,6 +180,7 @@ class FakeGuard:
     def __init__(self, clock: ManualClock) -> None:
         self.clock = clock
         self.told: list[tuple[float, float | None, bool]] = []
+        self.stops = True
 
     def ready(self) -> bool:
         return True
@@ -188,8 +189,8 @@ class FakeGuard:
         self.told.append((self.clock.monotonic(), until, held))
         return True
 
-    def tick(self) -> None:
-        pass
+    def tick(self, *, stops: bool = True) -> None:
+        self.stops = stops
 
 
 class DyingError(Exception):
@@ -235,6 +236,45 @@ def test_the_guard_knows_of_an_emergency_stop_before_the_first_stop() -> None:
     with pytest.raises(DyingError):
         rig.downlink.set_stopped(True)
     assert rig.graph.published == []
+
+
+def test_the_guard_stops_what_an_agent_outside_the_graph_cannot() -> None:
+    clock = ManualClock(now_us=T0)
+    guard = FakeGuard(clock)
+    rig = Rig(clock=clock, guard=guard)
+    rig.send({"data": 2.5})
+    # Another node has taken the agent's name.
+    rig.graph.up = False
+    clock.advance(0.3)
+    rig.downlink.tick()
+    assert guard.told == [(1000.0, pytest.approx(1000 + LEASE_MS / 1000), False)], (
+        "the lease ends for it, too"
+    )
+    rig.downlink.set_stopped(True)
+    assert guard.told[1:] == [(1000.3, None, True)]
+    assert not guard.stops
+    rig.graph.up = True
+    clock.advance(0.1)
+    rig.downlink.tick()
+    assert guard.stops
+    rig.graph.up = False
+    rig.downlink.set_stopped(False)
+    assert guard.told[-1][1:] == (None, False), "it must not hold what was released"
+
+
+def test_a_motion_whose_stop_fails_keeps_no_other_from_stopping() -> None:
+    steer = {**CONFIG["cmd"]["speed"], "topic": "/commands/servo/position"}
+    rig = Rig(cmd={**CONFIG["cmd"], "steer": steer})
+    publish = rig.graph.publish
+
+    def failing(topic: str, data: bytes) -> bool:
+        if topic == STOP[0]:
+            raise RuntimeError("no more sockets")
+        return publish(topic, data)
+
+    rig.graph.publish = failing  # type: ignore[method-assign]  # for ever
+    rig.downlink.set_stopped(True)
+    assert rig.graph.published == [(steer["topic"], STOP[1])]
 
 
 def test_two_names_of_one_topic_share_its_lease() -> None:

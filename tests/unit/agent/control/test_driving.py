@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.errors import ConfigError
 from tests.unit.agent.control.downlink_rig import T0, Rig, doubles
 
@@ -160,3 +164,21 @@ def test_a_message_with_other_fields_needs_partial() -> None:
     pose = {**POSE["cmd"]["pose"], "partial": False}
     with pytest.raises(ConfigError, match=r"z: is missing; downlink\.cmd\.pose\.partial must be true"):
         Rig(cmd={"pose": pose}, drive=POSE["drive"])
+
+
+def test_an_emergency_stop_is_kept_once_the_disk_works_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = tmp_path / "queue.db"
+    kept = KeptStop(queue)
+    with monkeypatch.context() as full:
+        full.setattr(Path, "touch", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        kept.keep(stopped=True)
+        kept.tick()
+        assert "No space left" in (kept.alarm or "")
+        assert not KeptStop(queue).stopped
+    kept.tick()
+    assert kept.alarm is None
+    assert KeptStop(queue).stopped
+    kept.keep(stopped=False)
+    assert not KeptStop(queue).stopped

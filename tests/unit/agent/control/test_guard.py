@@ -109,6 +109,16 @@ def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_w
     assert len(node.published) == 5
 
 
+def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node, looks = Node(), iter([True, True, False, True, True, True])
+    monkeypatch.setattr(node, "lives", lambda _name: next(looks))
+    monkeypatch.setattr(guard_process, "_LOOK_S", 0.01)
+    guarded(node, monkeypatch, ["/speed", None, True])
+    assert next(looks, None) is None
+
+
 def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
     node = Node()
     monkeypatch.setattr(node, "lives", lambda name: name == "car" and len(node.published) > 12)
