@@ -258,5 +258,5 @@ def test_a_renewal_waits_for_an_agent_that_is_too_busy_to_answer(monkeypatch: py
     monkeypatch.setattr(provision_module, "ask", ask)
     monkeypatch.setattr(provision_module, "_LOOK_S", 0)
     # Without a configuration it cannot connect alone, which would take the agent's connection.
-    provision_module._wait_connected(None, "new", Path("agent.sock"))  # type: ignore[arg-type]
+    provision_module._wait_connected(None, "new", Path("agent.sock"))  # type: ignore[arg-type]  # none
     assert len(asked) == 2
