@@ -112,5 +112,6 @@ def _alarms(agent: Agent) -> list[str]:
     if agent.downlink is not None:
         waits.append(agent.downlink.waits())
         alarms += agent.downlink.alarms()
+        alarms += [agent.kept_stop.alarm] if agent.kept_stop.alarm is not None else []
     # Without repetitions: sources and commands may share a ROS node.
     return alarms + [f"source waits: {why}" for why in dict.fromkeys(waits) if why]

@@ -43,3 +43,19 @@ def test_a_tachometer_counts_samples_that_were_taken_at_once_and_no_restart() ->
 )
 def test_an_axis_is_labelled_with_its_values(splits: list[float], labels: list[str]) -> None:
     assert call("charts/axes.ts", "labels", splits) == labels
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "zero", "expected"),
+    [
+        # The highest value is not at the edge, though it is a round number.
+        (11.9, 12.5, False, [11.8, 12.6]),
+        # Zero is one, for values that do not cross it.
+        (0.02, 8, True, [0, 10]),
+        (-3, -1, True, [-3.5, 0]),
+    ],
+)
+def test_an_axis_has_room_above_and_below_its_values(
+    least: float, most: float, zero: bool, expected: list[float]
+) -> None:
+    assert call("charts/axes.ts", "roundRange", least, most, 0.1, zero) == pytest.approx(expected)

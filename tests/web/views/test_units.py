@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.page.server import PageServer
 from local.deployment import ROOT
 from tests.browser import drawn, plain, show, shown, until
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
+from tests.web.lab import VIEWS, Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -99,6 +101,22 @@ def test_each_time_has_a_zone(
     page.goto(f"{server.url}#/car/car-1")
     show(page, car.send({**SAMPLE, "fault_code": 5}))
     assert page.locator(".faults th").first.inner_text() == f"Since, {zone}"
+
+
+def test_every_view_tells_the_zone_of_its_times(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(server.invitation(), timezone_id="Asia/Kolkata", locale="de-DE")
+        line = {"level": "error", "logger": "iort_agent", "text": "failed", "left_out": 0}
+        car = Car(pubnub)
+        for view, (address, filled) in VIEWS.items():
+            page.goto(server.url + address)
+            show(page, car.send())
+            show(page, car.send(line, stream=LOG_STREAM))
+            page.locator(filled).first.wait_for()
+            told = page.evaluate("document.body.textContent")
+            assert re.findall(r"\d\d:\d\d:\d\d(?!.{0,24}GMT\+5:30)", told) == [], view
 
 
 def test_ros_standard_messages_have_their_units(page: Page, car: Car) -> None:

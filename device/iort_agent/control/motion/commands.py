@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 
 # Between two samples of refused motions: others drive meanwhile.
 _REFUSED_S = 0.1
+# rospy hands a stop to threads of its own. An agent that is killed before it is written must leave it to the
+# guard, which publishes its own `STOP_AHEAD_MS` after the agent's.
+_WRITTEN_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -86,18 +89,18 @@ class Commands:
             for motion in self._motions.values():
                 if stopped:
                     motion.leases.hold(now)
-                    # Before the first stop, after which the agent may die.
-                    self._tell_guard(motion)
                 else:
                     motion.leases.free()
+                # Before the first stop, after which the agent may die.
+                self._tell_guard(motion)
         self.tick()
         self._wake()
 
-    def halt(self) -> None:
-        """Stop all motion, and let no further command pass."""
+    def halt(self, *, keep_stop: bool) -> None:
+        """Stop all motion, and let no further command pass; ``keep_stop`` goes on with an emergency stop."""
         with self._lock:
             for command in self._commands.values():
-                command.leases.close(self._clock.monotonic())
+                command.leases.close(self._clock.monotonic(), free=not keep_stop)
         self.tick()
 
     def tick(self) -> float | None:
@@ -109,17 +112,18 @@ class Commands:
                 if motion.leases.stop_due(now):
                     if not motion.stopping:
                         stopped += self._begin_stop(motion, now)
-                    data = motion.stop(self._clock.now_us())
-                    motion.stops += self._graph.publish(motion.topic, data)
+                    motion.unheard = not self._publish_stop(motion)
                 elif motion.stopping and motion.leases.next_due() is None:
                     motion.stopping = False
                     # Under the lock, so that no command that has just passed is released.
                     self._graph.release(motion.topic)
-                self._tell_guard(motion)
-            found = [motion.leases.next_due() for motion in self._motions.values()]
+                # A lease whose stop nobody hears ends for the guard, too, which then publishes its own.
+                if not motion.unheard and now >= motion.written:
+                    self._tell_guard(motion)
+            found = [motion.next_due(now) for motion in self._motions.values()]
             # After the stops, since it may have to start a process.
             if self._guard is not None:
-                self._guard.tick()
+                self._guard.tick(stops=not any(motion.unheard for motion in self._motions.values()))
         for sample in stopped:
             self._operator.drove(sample)
         return min((at for at in found if at is not None), default=None)
@@ -131,11 +135,15 @@ class Commands:
     def alarms(self) -> list[str]:
         """Why no motion may pass."""
         found = []
-        if any(motion.leases.held for motion in self._motions.values()):
+        if self.held():
             found.append("emergency stop: no motion until an operator releases it")
         if self.guarded() is False:
             found.append("the guard does not run yet: no motion until it does")
         return found
+
+    def held(self) -> bool:
+        """Whether an emergency stop holds."""
+        return any(motion.leases.held for motion in self._motions.values())
 
     def guarded(self) -> bool | None:
         """Whether the guard would stop the robot; None if it needs none."""
@@ -153,9 +161,21 @@ class Commands:
         until = None if ends is None else ends + STOP_AHEAD_MS / 1000
         return self._guard.tell(motion.topic, until, held=motion.leases.held)
 
+    def _publish_stop(self, motion: Motion) -> bool:
+        """Whether that was possible. One motion that fails must not keep the others from stopping."""
+        try:
+            published = self._graph.publish(motion.topic, motion.stop(self._clock.now_us()))
+        except Exception:  # noqa: BLE001 - whatever a ROS library raises
+            _log.exception("%s: the stop failed", motion.topic)
+            return False
+        motion.stops += published
+        return published
+
     def _begin_stop(self, motion: Motion, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""
         motion.stopping = True
+        if self._guard is not None:
+            motion.written = now + _WRITTEN_S
         command, last = motion.last, motion.leases.last
         what = f"command {command.name}" if command is not None else motion.topic
         _log.warning("%s: %s, stopping", what, motion.leases.why_stopped())
@@ -221,6 +241,7 @@ class Commands:
                 )
             if reason is None and motion is not None:
                 motion.last = command
+                motion.stopping = motion.stopping and offered.ends
                 # Before the robot moves.
                 if not self._tell_guard(motion):
                     motion.leases.cut(now)

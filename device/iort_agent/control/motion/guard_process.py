@@ -16,9 +16,11 @@ import signal
 import sys
 import threading
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Mapping
 
 from iort_agent.clock import SystemClock
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.motion.stops import Stops
 from iort_agent.ros1.json_message import encode
 from iort_agent.ros1.node import Node, shared
@@ -27,10 +29,11 @@ _log = logging.getLogger("iort_agent.guard")
 # The stop of a lease that the agent has certainly not ended.
 _UNANSWERED = 2
 # In an emergency stop the agent writes at least every `STOP_HOLD_S`.
-_SILENT_S = 0.5
+_SILENT_S = 0.15
 _POLL_S, _IDLE_S = 0.05, 4.0
-# Between two looks for the agent's node.
-_LOOK_S = 1.0
+# Between two looks for the agent's node. It must be there several times in a row: subscribers need a moment
+# to connect to it, and it may die again.
+_LOOK_S, _LOOKS = 1.0, 3
 _CONNECT_S = 2.0
 _BUFFER = 65_536
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -63,6 +66,7 @@ class _Guard:
         # Stops since the last news of a lease. At its end the agent publishes a stop itself, and tells it.
         self._stops = 0
         self._joined: float | None = None
+        self._queue: str | None = config.get("queue")
 
     def ready(self) -> bool:
         """Whether the stops would be heard: the topics' subscribers have connected, or had the time to."""
@@ -99,9 +103,14 @@ class _Guard:
             motion.stops.put_off(now)
 
     def watch(self, over: threading.Event) -> None:
-        """Set ``over`` once the agent's node is in the graph again."""
+        """Keep an emergency stop for the next agent, and set ``over`` once its node is in the graph."""
+        if self._queue is not None and any(motion.stops.held for motion in self._motions.values()):
+            # The agent may have died before it did. A slow disk delays no stop here.
+            KeptStop(Path(self._queue)).keep(stopped=True)
+        seen = 0
         while not over.wait(_LOOK_S):
-            if self.node.lives(self._agent):
+            seen = seen + 1 if self.node.lives(self._agent) else 0
+            if seen == _LOOKS:
                 over.set()
 
     def tick(self) -> float | None:

@@ -68,6 +68,8 @@ class Leases(Stops):
         ``limits`` are those of the command's name. ``now_us`` is the cloud's time to within
         ``uncertainty_us``; the robot's own time if that is None.
         """
+        # In an agent that was frozen, a command may come before the stop.
+        self.expire(now)
         age_us = now_us - command.sent_us + (uncertainty_us or 0)
         lease_s = _lease_s(command, limits, age_us)
         reason = self._rejection(command, limits, age_us, uncertainty_us, lease_s)
@@ -102,9 +104,10 @@ class Leases(Stops):
             self._refuse(self.last.session)
         super().hold(now)
 
-    def close(self, now: float) -> None:
-        """End the lease now, and let no further command pass."""
-        self.free()
+    def close(self, now: float, *, free: bool = True) -> None:
+        """End the lease now, and let no further command pass; ``free`` also ends an emergency stop."""
+        if free:
+            self.free()
         self._closed = True
         self.cut(now)
 

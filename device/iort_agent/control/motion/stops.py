@@ -38,11 +38,15 @@ class Stops:
         """Begin a lease, or renew it; no stop is due before its end."""
         self.ends, self._stops = until, 0
 
-    def stop_due(self, now: float) -> bool:
-        """Whether the caller must publish a stop now."""
+    def expire(self, now: float) -> None:
+        """Note the end of a lease that is over."""
         if self.ends is not None and now >= self.ends:
             self.ends, self.ended = None, now
             self._stops, self._next_stop = STOP_REPEATS + 1, now
+
+    def stop_due(self, now: float) -> bool:
+        """Whether the caller must publish a stop now."""
+        self.expire(now)
         if not self._stops or now < self._next_stop:
             return False
         self._stops -= 1

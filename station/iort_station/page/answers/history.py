@@ -9,12 +9,14 @@ import numpy as np
 
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
 from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
+from iort_station.data import inventory
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
@@ -35,7 +37,10 @@ def runs_of(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
     """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
     before_us = whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
     count = whole(asked, "count", 1, _MOST_RUNS)
-    return runs(cloud, check_robot(text(asked, "robot")), end_us=before_us, count=count)
+    robot = check_robot(text(asked, "robot"))
+    # The page also asks about a car that never recorded, or that nobody knows: it has no runs.
+    streams = [name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS]
+    return runs(cloud, robot, streams=streams, end_us=before_us, count=count)
 
 
 def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:

@@ -71,7 +71,7 @@ export function asSpeed(field: string, spec: Spec, speed: Linear | undefined): S
 export function write(value: Value | undefined, spec: Spec): string {
   const { digits, texts, time } = spec;
   if (value === null || value === undefined) return NOTHING;
-  if (time && typeof value === "number") return dayTime(value / 1e6);
+  if (time && typeof value === "number") return when(value / 1e6);
   if (typeof value === "number") return texts?.[String(value)] ?? number(linear(value, spec), digits);
   return String(value);
 }
@@ -126,4 +126,9 @@ export function dayTime(seconds: number, options: Intl.DateTimeFormatOptions = {
   const time = at.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", ...options });
   const day = at.toDateString() === new Date().toDateString() ? "" : `${at.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short" })} `;
   return day + time;
+}
+
+/** As `dayTime`, with the time zone: Fri 20 Nov 14:03:27 CET. */
+export function when(seconds: number, options: Intl.DateTimeFormatOptions = {}): string {
+  return `${dayTime(seconds, options)} ${zone(seconds)}`;
 }

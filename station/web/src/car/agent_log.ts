@@ -2,7 +2,7 @@
 
 import { LOG_STREAM, type Config, type HistoryAnswer, type StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { dayTime } from "../base/format";
+import { when } from "../base/format";
 import { lineOf, type Line } from "../live/lines";
 import type { Robot } from "../live/robot";
 import { ask, AnswerError } from "../server/answers";
@@ -61,5 +61,5 @@ export class AgentLog {
 
 function row({ t_us, level, logger, text, leftOut }: Line): HTMLElement {
   const left = leftOut > 0 ? [" ", el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
-  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", dayTime(t_us / 1e6)), text, ...left);
+  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", when(t_us / 1e6)), text, ...left);
 }

@@ -8,6 +8,9 @@ export interface Paint {
   grid: string;
 }
 
+// The part of a range that is left free above and below.
+const ROOM = 0.04;
+
 export const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
 
 export function paint(): Paint {
@@ -66,12 +69,15 @@ export function roundStep(step: number): number {
   return (share <= 1 ? 1 : share <= 2 ? 2 : share <= 5 ? 5 : 10) * power;
 }
 
-/** A range of round numbers around `least` to `most`, of at least `span`; with `zero` it includes zero. */
+/** A range of round numbers around `least` to `most`, of at least `span` and with room at its ends; with `zero` it includes zero. */
 export function roundRange(least: number, most: number, span: number, zero: boolean): [number, number] {
   if (zero) [least, most] = [Math.min(0, least), Math.max(0, most)];
   const missing = span - (most - least);
   if (missing > 0 && zero && least === 0) most += missing;
   else if (missing > 0) [least, most] = [least - missing / 2, most + missing / 2];
+  // A line at the edge of a chart looks cut off. Zero is an edge that few values cross.
+  const room = (most - least) * ROOM;
+  [least, most] = [least < 0 ? least - room : Math.max(0, least - room), most > 0 ? most + room : Math.min(0, most + room)];
   const step = roundStep((most - least) / 8);
   return [Math.floor(least / step + 1e-9) * step, Math.ceil(most / step - 1e-9) * step];
 }

@@ -4,7 +4,7 @@ import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { gestures } from "./gestures";
 import type { Range } from "../base/range";
-import { dayTime, number, zone } from "../base/format";
+import { dayTime, number, when } from "../base/format";
 import { colour, onTheme } from "../base/theme";
 import { Spoken, type About } from "./spoken";
 
@@ -127,7 +127,7 @@ export class RangeChart {
     this.spoken = new Spoken(host, this.plot, {
       ...options.about,
       lines: options.curves.map(({ label }) => label),
-      range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${dayTime(this.range[1])} ${zone(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
+      range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${when(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
       at: (x) => (unit === undefined ? dayTime(x, { fractionalSecondDigits: 1 }) : `${number(x, 2)} ${unit}`),
       timeless: unit !== undefined,
       band: options.band ?? false,

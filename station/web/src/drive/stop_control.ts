@@ -3,7 +3,7 @@
 
 import type { Config } from "../base/contract";
 import { el, onPress, setAttribute, Text } from "../base/dom";
-import { dayTime } from "../base/format";
+import { when } from "../base/format";
 import { Stops } from "./stops";
 
 // A longer list of names says nothing more.
@@ -60,7 +60,7 @@ export class StopControl {
     const texts = [
       ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
       ...(pending.length > 0 ? [`Not confirmed by ${listed(pending)}.`] : []),
-      ...(one?.asked && one.by ? [`Stopped by ${one.by}, ${dayTime(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`] : []),
+      ...(one?.asked && one.by ? [`Stopped by ${one.by}, ${when(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`] : []),
       ...(this.robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
       ...(one?.reason ? [`${this.robot} rejects the ${one.asked ? "stop" : "release"}: ${one.reason}.`] : []),
       ...(this.stops.error ? [`${this.stops.error}.`] : []),

@@ -2,7 +2,7 @@
 
 import type { LapsAnswer, RunsAnswer } from "../base/contract";
 import { byName, el, Text } from "../base/dom";
-import { age, dayTime, number, zone } from "../base/format";
+import { age, number, when } from "../base/format";
 import { NAME } from "../base/contract";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
@@ -61,7 +61,7 @@ export class AddPart {
       if (robot !== this.robot.value.trim() || stream !== this.stream) return;
       const parts = runs.filter((run) => Object.hasOwn(run.streams, stream)).map((run) => run.streams[stream]!);
       this.runs = parts.map(({ from_us, to_us }) => ({ robot, range: [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000] }));
-      this.run.replaceChildren(...this.runs.map(({ range: [from, to] }) => el("option", {}, `${dayTime(from)} ${zone(from)}, ${age(to - from)}`)));
+      this.run.replaceChildren(...this.runs.map(({ range: [from, to] }) => el("option", {}, `${when(from)}, ${age(to - from)}`)));
       if (parts.length === 0) this.note.set(`${robot} has no runs of ${stream}.`);
       await this.findLaps();
     } catch (error) {

@@ -1,7 +1,7 @@
 // Says which part of an answer comes from the archive.
 
 import type { Archived } from "../base/contract";
-import { dayTime, zone } from "../base/format";
+import { dayTime, when } from "../base/format";
 import type { Range } from "../base/range";
 
 /** A sentence, with a space before it; nothing if all comes from the table. */
@@ -9,5 +9,5 @@ export function fromArchive(archive: Archived | null, [start, end]: Range): stri
   if (archive === null) return "";
   const [from, to] = [Math.max(start, archive.from_us / 1e6), Math.min(end, archive.to_us / 1e6)];
   if (from <= start && to >= end) return " From the archive.";
-  return ` From the archive: ${dayTime(from)} to ${dayTime(to)} ${zone(to)}.`;
+  return ` From the archive: ${dayTime(from)} to ${when(to)}.`;
 }

@@ -1,7 +1,7 @@
 // The slider through a range, and its playback, slower or faster than it was driven.
 
 import { el, setAttribute, Text } from "../base/dom";
-import { dayTime, zone } from "../base/format";
+import { when } from "../base/format";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8, 16];
 const STEP_MS = 50;
@@ -53,7 +53,7 @@ export class Playback {
     const at = this.times[index];
     if (at === undefined) return;
     this.slider.value = String(index);
-    const text = `${dayTime(at, { fractionalSecondDigits: 1 })} ${zone(at)}`;
+    const text = when(at, { fractionalSecondDigits: 1 });
     this.at.set(text);
     setAttribute(this.slider, "aria-valuetext", text);
   }

@@ -2,7 +2,7 @@
 
 import type { Extent, Run, RunsAnswer } from "../base/contract";
 import { el } from "../base/dom";
-import { age, dayTime, number, zone } from "../base/format";
+import { age, number, when } from "../base/format";
 import { writeTime, type Range } from "../base/range";
 import { MOST_PARTS, route, writeParts } from "../base/route";
 
@@ -97,5 +97,3 @@ export class RunsList {
 }
 
 const range = ({ from_us, to_us }: Extent): Range => [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000];
-
-const when = (at_s: number): string => `${dayTime(at_s)} ${zone(at_s)}`;

@@ -2,7 +2,7 @@
 
 import type { DriveEntry } from "../base/contract";
 import { el } from "../base/dom";
-import { age, dayTime, number, zone } from "../base/format";
+import { age, number, when } from "../base/format";
 import { writeTime } from "../base/range";
 import { route } from "../base/route";
 
@@ -21,7 +21,7 @@ export function drivesTable(drives: readonly DriveEntry[], robot: string | undef
 function row(drive: DriveEntry, named: boolean, chosen: boolean): HTMLElement {
   const { robot, from_us, to_us, samples, failed, repairs, estimates } = drive;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
-  const at = el("a", { href: route({ view: "history", robot, query: { from: writeTime(from), to: writeTime(to) } }) }, `${dayTime(from)} ${zone(from)}`);
+  const at = el("a", { href: route({ view: "history", robot, query: { from: writeTime(from), to: writeTime(to) } }) }, when(from));
   const repaired = Object.entries(repairs).map(([kind, count]) => `${kind.replaceAll("_", " ")} ${number(count)}`);
   const best = estimates["lap_best_s"];
   const laps = el("a", { class: "tool", href: route({ view: "insights", robot, query: { drive: writeTime(from) } }), ...(chosen ? { "aria-current": "true" } : {}) }, best ? `best ${number(best.value, 2)} s` : "look for laps");

@@ -2,7 +2,7 @@
 
 import { ANALYSIS_FAILED, type FindingEntry } from "../base/contract";
 import { el, marked } from "../base/dom";
-import { capital, dayTime, number, zone } from "../base/format";
+import { capital, number, when } from "../base/format";
 import { writeTime } from "../base/range";
 import { route } from "../base/route";
 import { changed, intervalBar, words } from "./figures";
@@ -30,7 +30,7 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
       el("h3", {}, capital(meaning)),
       el("span", { class: "severity" }, severity),
       ...(named ? [el("a", { class: "tool", href: route({ view: "insights", robot }) }, robot)] : []),
-      el("span", { class: "note" }, `${dayTime(from)} ${zone(from)}`),
+      el("span", { class: "note" }, when(from)),
     ),
     el("p", {}, ...marked(capital(text))),
     ...(effect ? [size(finding)] : []),

@@ -2,7 +2,7 @@
 
 import type { DeltaAnswer, Lap, LapsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { clockTime, number } from "../base/format";
+import { number, when } from "../base/format";
 import type { Range } from "../base/range";
 import { MOST_PARTS, route, writeParts } from "../base/route";
 import { dash, hue } from "../history/compare_charts";
@@ -85,7 +85,7 @@ export class LapsPanel {
     });
     const known = (value: number | null, digits: number, unit: string): string => (value === null ? "" : `${number(value, digits)} ${unit}`);
     const behind = lap.best ? "best" : lap.complete ? `+${number(lap.time_s - least, 3)} s` : "not complete";
-    const cells = [clockTime(lap.from_us / 1e6), `${number(lap.time_s, 3)} s`, behind, known(lap.distance_m, 1, "m"), known(lap.energy_wh, 3, "Wh"), known(lap.energy_wh_per_km, 2, "Wh"), known(lap.mean_speed_mps, 2, "m/s")];
+    const cells = [when(lap.from_us / 1e6), `${number(lap.time_s, 3)} s`, behind, known(lap.distance_m, 1, "m"), known(lap.energy_wh, 3, "Wh"), known(lap.energy_wh_per_km, 2, "Wh"), known(lap.mean_speed_mps, 2, "m/s")];
     return el("tr", { "data-lap": String(lap.lap), "data-best": String(lap.best), "data-complete": String(lap.complete) }, el("td", {}, el("label", {}, check)), el("th", { scope: "row" }, String(lap.lap)), ...cells.map((text) => el("td", {}, text)));
   }
 

@@ -2,7 +2,7 @@
 
 import type { DriveEntry, ParameterEntry } from "../base/contract";
 import { el } from "../base/dom";
-import { capital, dayTime, number } from "../base/format";
+import { capital, number, when } from "../base/format";
 
 const COLOURS = ["--line", "--hue-5", "--hue-3", "--hue-2", "--hue-4", "--hue-1", "--hue-6"];
 // Bars of older drives show how the style changes.
@@ -18,7 +18,7 @@ export function styles(drives: readonly DriveEntry[], group: Readonly<Record<str
     const shares = names.map((name) => drive.estimates[name]?.value ?? 0);
     const said = names.flatMap((name, i) => (shares[i]! >= LEAST ? [`${label(name)} ${percent(shares[i]!)}`] : []));
     const bar = el("span", { class: "shares", role: "img", "aria-label": said.join(", ") }, ...shares.map((share, i) => piece(share, i, percent(share))));
-    return el("div", { class: "style-row" }, el("span", { class: "note" }, dayTime(drive.from_us / 1e6, { second: undefined })), bar);
+    return el("div", { class: "style-row" }, el("span", { class: "note" }, when(drive.from_us / 1e6, { second: undefined })), bar);
   });
   const newest = known[0]!.estimates;
   const keys = names.flatMap((name, i) => {

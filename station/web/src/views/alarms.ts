@@ -3,7 +3,7 @@
 import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
 import { el, marked, Text } from "../base/dom";
-import { capital, clockTime, dayTime, zone } from "../base/format";
+import { capital, when } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { route } from "../base/route";
 import type { Alarms, CarState, Raised } from "../live/alarms";
@@ -56,7 +56,7 @@ export class AlarmsView {
   clock(now: number): void {
     const { entries, error, askedAt, user } = this.alarms;
     this.name.placeholder = user;
-    this.note.set(this.failure || error || (entries ? `as of ${clockTime(askedAt)} ${zone(askedAt)}` : this.config.answers ? "Loading …" : ""));
+    this.note.set(this.failure || error || (entries ? `as of ${when(askedAt)}` : this.config.answers ? "Loading …" : ""));
     const raised = this.alarms.raised(now);
     if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt) void this.find(askedAt);
     this.none.hidden = raised.length > 0 || (this.config.answers && entries === undefined);
@@ -90,7 +90,7 @@ export class AlarmsView {
     const seen = entry?.acknowledged;
     const button = el("button", { type: "button", class: "tool" }, "Acknowledge");
     button.addEventListener("click", () => entry && void this.acknowledge(entry, button));
-    const since = entry?.state === "ALARM" ? `raised since ${dayTime(entry.since_s)} ${zone(entry.since_s)}` : "raised by live values";
+    const since = entry?.state === "ALARM" ? `raised since ${when(entry.since_s)}` : "raised by live values";
     const node = el(
       "li",
       { class: "panel alarm", "data-alarm": key, "data-fresh": String(fresh) },
@@ -101,7 +101,7 @@ export class AlarmsView {
       el(
         "p",
         { class: "seen" },
-        ...(seen ? [`Acknowledged by ${seen.by}, ${dayTime(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])] : []),
+        ...(seen ? [`Acknowledged by ${seen.by}, ${when(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])] : []),
         ...(entry?.state === "ALARM" && fresh ? [button] : []),
       ),
     );
@@ -141,13 +141,13 @@ function live({ robot, text, since }: CarState): HTMLElement {
     {},
     el("a", { class: "tool", href: route({ view: "car", robot }) }, robot),
     el("b", {}, text),
-    ` since ${clockTime(since)} `,
+    ` since ${when(since)} `,
     past(robot, since - BEFORE_S, since + AFTER_S, "That moment"),
   );
 }
 
 function message({ id, robot, topic, source, reason, last_s, seen }: Rejected): HTMLElement {
-  const at = `${dayTime(last_s)}${seen > 1 ? `, ${seen} times` : ""}`;
+  const at = `${when(last_s)}${seen > 1 ? `, ${seen} times` : ""}`;
   return el(
     "li",
     {},
@@ -165,5 +165,5 @@ function past(robot: string, from_s: number, to_s: number, text: string): HTMLEl
 }
 
 function row({ key, meaning, state, since_s, advice }: AlarmEntry): HTMLElement {
-  return el("tr", {}, el("td", {}, el("code", {}, key)), el("td", { class: "words" }, meaning), el("td", {}, `${STATES[state]} since ${dayTime(since_s)}`), el("td", { class: "words" }, ...marked(advice)));
+  return el("tr", {}, el("td", {}, el("code", {}, key)), el("td", { class: "words" }, meaning), el("td", {}, `${STATES[state]} since ${when(since_s)}`), el("td", { class: "words" }, ...marked(advice)));
 }

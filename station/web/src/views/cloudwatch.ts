@@ -3,7 +3,7 @@
 import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
-import { clockTime, dayTime, NOTHING, number, zone } from "../base/format";
+import { NOTHING, number, when } from "../base/format";
 import { route } from "../base/route";
 import { LogTable } from "../widgets/log_table";
 import { RangeChart, type Curve } from "../charts/range_chart";
@@ -72,7 +72,7 @@ export class CloudWatchView {
       this.draw(dashboard);
       // The dashboard ends with the current minute.
       const at = Date.now() / 1000;
-      this.note.set(`as of ${clockTime(at)} ${zone(at)}, again every ${REFRESH_S} s`);
+      this.note.set(`as of ${when(at)}, again every ${REFRESH_S} s`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
@@ -154,7 +154,7 @@ function byUrgency(a: Alarm, b: Alarm): number {
 }
 
 function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
-  const since = `${STATES[state]} since ${dayTime(since_s)} ${zone(since_s)}`;
+  const since = `${STATES[state]} since ${when(since_s)}`;
   return el(
     "li",
     { "data-alarm": name, "data-state": state, title: [about, since, reason].filter(Boolean).join("\n") },

@@ -2,7 +2,7 @@
 
 import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { age, dayTime, number, zone } from "../base/format";
+import { age, number, when } from "../base/format";
 import { same, writeTime, type Range } from "../base/range";
 import { MOST_PARTS, readParts, route, setAddress, writeParts, type Part, type Query } from "../base/route";
 import { AddPart } from "../history/add_part";
@@ -197,5 +197,5 @@ export class CompareView {
 }
 
 function named({ robot, range: [from] }: Part): string {
-  return `${robot}, ${dayTime(from)} ${zone(from)}`;
+  return `${robot}, ${when(from)}`;
 }

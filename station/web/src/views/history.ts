@@ -2,7 +2,7 @@
 
 import type { Config, FieldTable, HistoryAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { age, dayTime, number, zone } from "../base/format";
+import { age, number, when } from "../base/format";
 import { LEAST_S, readRange, readTime, rounded, same, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
 import { RangeForm } from "../history/range_form";
@@ -104,6 +104,7 @@ export class HistoryView {
     try {
       const { streams } = await ask<{ streams: string[] }>("streams", { robot }, loading.signal);
       const stream = [query.stream, this.table.stream, streams[0]].find((name) => name !== undefined && streams.includes(name));
+      this.form.node.hidden = stream === undefined;
       if (stream === undefined) {
         this.note.set("Nothing of this car is stored.");
         return;
@@ -243,7 +244,7 @@ export class HistoryView {
 
   private nothing(): string {
     const extent = this.runs.extent(this.form.stream);
-    const [from, to] = extent?.map((at) => `${dayTime(at)} ${zone(at)}`) ?? [];
+    const [from, to] = extent?.map((at) => when(at)) ?? [];
     return `Nothing was stored in this range.${extent ? ` ${this.form.stream} is stored from ${from} to ${to}.` : ""}`;
   }
 }

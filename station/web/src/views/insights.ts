@@ -2,7 +2,7 @@
 
 import { STYLE_GROUP, type Config, type Extent, type InsightsAnswer, type RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { dayTime, zone } from "../base/format";
+import { when } from "../base/format";
 import { readTime, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
 import { Analyse } from "../insights/analyse";
@@ -91,7 +91,7 @@ export class InsightsView {
     const { findings, drives, groups } = answer;
     const newest = drives[0];
     const of = robot ?? "the fleet";
-    const state = newest ? `The newest analysed drive began ${dayTime(newest.from_us / 1e6)} ${zone(newest.from_us / 1e6)}.` : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
+    const state = newest ? `The newest analysed drive began ${when(newest.from_us / 1e6)}.` : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
     this.note.set(state);
     const list = findingsList(findings, robot === undefined);
     const nothing = el("p", { class: "unserved" }, newest ? `Nothing about ${of} differs from its earlier drives by more than chance.` : "There are no findings without analysed drives.");

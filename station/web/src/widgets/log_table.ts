@@ -3,7 +3,7 @@
 import type { Logs } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
-import { clockTime, dayTime, zone } from "../base/format";
+import { when } from "../base/format";
 
 // AWS bills a query by the bytes that it reads.
 const AGAIN_S = 60;
@@ -47,7 +47,7 @@ export class LogTable {
   }
 
   private draw({ columns, rows, found, to_s }: Logs): void {
-    const until = `until ${clockTime(to_s)} ${zone(to_s)}`;
+    const until = `until ${when(to_s)}`;
     this.note.set(found > rows.length ? `the first ${rows.length} of ${found} lines, ${until}` : found === 0 ? `Nothing in this range, ${until}.` : until);
     this.host.replaceChildren(
       ...(rows.length === 0
@@ -68,7 +68,7 @@ function cell(column: string, value: string): HTMLElement {
   if (column === "@timestamp") {
     // "2026-05-04 10:00:00.123", in UTC.
     const at = Date.parse(`${value.replace(" ", "T")}Z`) / 1000;
-    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : dayTime(at));
+    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : when(at));
   }
   // "123456789012:/aws/lambda/name": the account is the viewer's own.
   if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));

@@ -2,7 +2,7 @@
 
 import { MAX_NOTE_CHARACTERS, type Config, type NoteEntry, type NotesAnswer } from "../base/contract";
 import { el } from "../base/dom";
-import { dayTime, zone } from "../base/format";
+import { when } from "../base/format";
 import { writeTime, type Range } from "../base/range";
 import { route } from "../base/route";
 import { may } from "../server/admission";
@@ -98,8 +98,8 @@ export class NotesPanel {
     const { robot, t_us, text, by } = note;
     const at = t_us / 1e6;
     const query = { from: writeTime(at - AROUND_S), to: writeTime(at + AROUND_S), at: writeTime(at) };
-    const when = el("a", { href: route({ view: "history", robot, query }) }, `${dayTime(at)} ${zone(at)}`);
-    const item = el("li", { "data-note": note.id }, ...(this.options.shown ? [el("b", { class: "mark" }, String(number))] : []), el("span", { class: "note-text" }, text), el("span", { class: "note" }, when, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`));
+    const moment = el("a", { href: route({ view: "history", robot, query }) }, when(at));
+    const item = el("li", { "data-note": note.id }, ...(this.options.shown ? [el("b", { class: "mark" }, String(number))] : []), el("span", { class: "note-text" }, text), el("span", { class: "note" }, moment, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`));
     if (!may(this.config, "delete_note")) return item;
     const remove = el("button", { type: "button", class: "tool", "aria-label": `Delete the note: ${text.slice(0, 60)}` }, "Delete");
     remove.addEventListener("click", () => {

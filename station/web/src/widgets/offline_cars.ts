@@ -2,7 +2,7 @@
 
 import type { Config, RobotPresence } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { dayTime, zone } from "../base/format";
+import { when } from "../base/format";
 import { route } from "../base/route";
 import type { Robot } from "../live/robot";
 
@@ -22,7 +22,7 @@ export class OfflineCars {
   /** List the cars with what is known of each; the list is open while there is nothing else to see. */
   show(cars: readonly (readonly [string, RobotPresence | Robot])[], alone: boolean): void {
     if (!this.chosen) this.node.open = alone;
-    const rows = cars.map(([name, known]) => [name, "heardAt" in known ? `last heard ${at(known.heardAt)}` : presence(known)] as const);
+    const rows = cars.map(([name, known]) => [name, "heardAt" in known ? `last heard ${when(known.heardAt)}` : presence(known)] as const);
     const drawn = JSON.stringify(rows);
     if (drawn === this.drawn) return;
     this.drawn = drawn;
@@ -38,7 +38,5 @@ export class OfflineCars {
 /** What the registry says of a car that sends nothing. */
 export function presence({ online, since_ms }: RobotPresence): string {
   if (online) return "connected, and sends nothing live";
-  return since_ms === null ? "never connected" : `offline since ${at(since_ms / 1000)}`;
+  return since_ms === null ? "never connected" : `offline since ${when(since_ms / 1000)}`;
 }
-
-const at = (seconds: number): string => `${dayTime(seconds)} ${zone(seconds)}`;

@@ -33,7 +33,7 @@ export class Waiting {
 function registered(names: readonly string[]): string {
   if (names.length === 0) return "No robot is registered yet: iort robots add NAME registers one.";
   const shown = [...names].sort(byName).slice(0, MOST_NAMES);
-  return `Registered are ${shown.join(", ")}${names.length > shown.length ? ` and ${names.length - shown.length} more` : ""}.`;
+  return `Registered: ${shown.join(", ")}${names.length > shown.length ? ` and ${names.length - shown.length} more` : ""}.`;
 }
 
 function write(id: string, text: string): void {

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.errors import ConfigError
-from tests.unit.agent.control.downlink_rig import T0, Rig, doubles
+from tests.agent_fakes import ManualClock
+from tests.unit.agent.control.downlink_rig import T0, FakeGuard, Rig, doubles
 
 POSE: dict[str, Any] = {
     "cmd": {
@@ -119,6 +124,16 @@ def test_the_emergency_stop_stops_at_once_and_refuses_until_it_is_released() -> 
     assert rig.downlink.alarms() == []
 
 
+def test_an_agent_that_ends_by_itself_leaves_an_emergency_stop_to_the_guard() -> None:
+    guard = FakeGuard(ManualClock(now_us=T0))
+    rig = Rig(guard=guard)
+    rig.downlink.set_stopped(True)
+    rig.downlink.halt(keep_stop=True)
+    rig.downlink.close(keep_stop=True)
+    assert guard.left
+    assert [held for _, _, held in guard.told] == [True]
+
+
 def test_a_stopped_robot_ends_in_good_order() -> None:
     rig = Rig()
     rig.downlink.set_stopped(True)
@@ -160,3 +175,21 @@ def test_a_message_with_other_fields_needs_partial() -> None:
     pose = {**POSE["cmd"]["pose"], "partial": False}
     with pytest.raises(ConfigError, match=r"z: is missing; downlink\.cmd\.pose\.partial must be true"):
         Rig(cmd={"pose": pose}, drive=POSE["drive"])
+
+
+def test_an_emergency_stop_is_kept_once_the_disk_works_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = tmp_path / "queue.db"
+    kept = KeptStop(queue)
+    with monkeypatch.context() as full:
+        full.setattr(Path, "touch", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        kept.keep(stopped=True)
+        kept.tick()
+        assert "No space left" in (kept.alarm or "")
+        assert not KeptStop(queue).stopped
+    kept.tick()
+    assert kept.alarm is None
+    assert KeptStop(queue).stopped
+    kept.keep(stopped=False)
+    assert not KeptStop(queue).stopped

@@ -218,6 +218,15 @@ def test_what_a_session_sent_before_the_stop_moves_nothing_after_it() -> None:
     assert leases.offer(soon, LIMITS, **times) is None
 
 
+def test_a_command_that_waited_in_a_frozen_agent_beside_the_stop_moves_nothing() -> None:
+    leases = Leases()
+    assert offered(leases, A, seq=0) is None
+    waited = command(1, session=A, started_us=T0, sent_us=T0 + 150_000)
+    times = {"now_us": T0 + 350_000, "uncertainty_us": 0, "now": 0.35}
+    assert leases.offer(waited, LIMITS, **times) == LEASE_OVER
+    assert leases.stop_due(0.35)
+
+
 def test_cut_and_closed() -> None:
     leases = Leases()
     leases.cut(0)

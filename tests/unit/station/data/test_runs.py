@@ -145,3 +145,4 @@ def test_the_page_gets_the_newest_runs_and_then_the_older_ones():
 def test_an_unknown_robot_has_no_runs():
     with pytest.raises(StationError, match="robot cra is not registered"):
         runs(cloud_of(), "cra")
+    assert answers(cloud_of())["runs"]({"robot": "cra", "count": "3"})["runs"] == []
