@@ -15,7 +15,6 @@ import signal
 import ssl
 import sys
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -35,6 +34,7 @@ from iort_station.page.keys import PubNubKeys
 from local.deployment import ROOT, deploy
 from local.emulator import first_calls, patched
 from local.errors import EmulatorError, LocalError
+from local.keeping.ledger import settle
 from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
 from local.network.listen import Listen
@@ -121,6 +121,8 @@ class EmbeddedCloud:
         without_proxy(self.host)
         self.ports = self._find_ports()
         self.authority = Authority(self.folder if self.kept else None)
+        if self.authority.is_new and self.ledger.exists():
+            self._progress("a new authority: every car needs a new bundle")
         # Only this machine reaches the gateway, and it reads its certificate once.
         certificate, key = self.authority.write(self.folder, "gateway", self.host)
         robots = self.listen.hosts if self.listen else ()
@@ -138,6 +140,8 @@ class EmbeddedCloud:
         )
         self._progress("emulator")
         self.start_emulator(certificate, key, broker)
+        for name in ("gateway", "mqtt"):
+            self.state.remember_port(name, self.ports[name])
         gateway = self.cloud.endpoint_url or ""
         relay = Relay(self.host, self.ports["relay"], gateway=gateway, authority=str(certificate))
         self.state.serve(self._exit, "relay", relay)
@@ -268,8 +272,8 @@ class EmbeddedCloud:
             self.emulator.check()
             try:
                 self._get("/_ministack/ready")
-            except (urllib.error.URLError, ConnectionError):
-                # The emulator gives no other signal that it listens.
+            except OSError:
+                # The emulator gives no other signal that it listens; on a slow machine it answers too late.
                 self.emulator.wait(_POLL_S)
             else:
                 return
@@ -281,6 +285,8 @@ class EmbeddedCloud:
         # Its sockets close a moment before it has ended.
         status = self.emulator.wait(_END_S) if isinstance(error, Exception) else None
         self.emulator.kill()
+        if self.kept:
+            settle(self.ledger)
         if status not in {None, _REFUSES}:
             raise EmulatorError(self.emulator.ended()) from error
 

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import json
 import os
+import pwd
+import re
 import secrets
 import shutil
 import socket
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from iort_station.kept import lock_of
+from iort_station.kept import LEDGER, lock_of
 from iort_station.page.background import BackgroundServer
 from local.errors import LocalError
 from local.network.certificates import write_private
+from local.settings import FILE, Settings
 
 # Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.
 VERSION = 1
@@ -34,11 +37,12 @@ class StateFolder:
 
     def __init__(self, path: Path, *, kept: bool, any_ports: bool = False) -> None:
         self.path, self.kept, self._any_ports = path, kept, any_ports
-        self._settings_path = path / "settings.json"
 
     def take(self, stack: ExitStack) -> None:
         """Lock the folder until the stack closes, and clean it. Raises `LocalError` if that is not
         possible."""
+        if self.kept:
+            self._check_owner()
         try:
             self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
             # The file stays open and locked while this cloud runs. Nobody else may lock it.
@@ -73,7 +77,8 @@ class StateFolder:
 
     def prepare(self) -> None:
         """Make the folder of a kept cloud, for its owner alone. Raises `LocalError` if it is another folder,
-        or of a newer version."""
+        of a newer version, not its user's, or damaged."""
+        self._check_owner()
         self.path.mkdir(parents=True, exist_ok=True)
         version = self.path / "VERSION"
         if not version.exists():
@@ -83,65 +88,92 @@ class StateFolder:
                 )
             self.path.chmod(0o700)
             version.write_text(f"{VERSION}\n")
-        found = version.read_text().strip()
-        if not found.isdecimal() or int(found) > VERSION:
+        found = version.read_text(errors="replace").strip()
+        if not found.isdecimal():
+            raise LocalError(
+                f"{version} must have the state's version, got {found!r}: write {VERSION} into it unless a "
+                "newer iort has used this folder"
+            )
+        if int(found) > VERSION:
             raise LocalError(
                 f"{self.path} must have version {VERSION} or older, got {found}: a newer iort wrote it; "
                 "update this checkout, or name another folder with STATE="
             )
+        self._check_whole()
 
-    def settings(self) -> dict[str, Any]:
-        """What a kept cloud remembers of its last start. Raises `LocalError` if somebody has broken it."""
-        if not self.kept or not self._settings_path.exists():
-            return {}
-        try:
-            found: dict[str, Any] = json.loads(self._settings_path.read_text())
-            ports = found.get("ports", {})
-            wrong = [(name, port) for name, port in ports.items() if port not in range(1, 65_536)]
-        except (ValueError, AttributeError) as error:
-            raise LocalError(f"{self._settings_path} must be a JSON object: {error}") from error
-        if wrong:
-            [(name, port), *_] = wrong
+    def _check_owner(self) -> None:
+        """Raise `LocalError` if the folder or a file in it is not for this user."""
+        with suppress(FileNotFoundError, NotADirectoryError):
+            try:
+                _check_own(self.path)
+                for one in self.path.iterdir():
+                    # A file that is made anew may go meanwhile.
+                    with suppress(FileNotFoundError):
+                        _check_own(one)
+            except PermissionError as error:
+                raise LocalError(f"you must be able to read {self.path}: {error}") from error
+
+    def _check_whole(self) -> None:
+        """Raise `LocalError` if a file is missing without which a start would begin anew."""
+        ledger, settings = self.path / LEDGER, self.path / FILE
+        has_ledger = ledger.exists() and ledger.stat().st_size > 0
+        if self.settings().ports and not has_ledger:
             raise LocalError(
-                f"{self._settings_path}: the port {name} must be a number from 1 to 65535, got {port!r}"
+                f"{ledger} must be there with all that this cloud keeps, got "
+                f"{'an empty file' if ledger.exists() else 'no such file'}: put it back, or `iort restore` a "
+                "backup; another folder (STATE=) begins anew"
             )
-        return found
+        if has_ledger and not settings.exists():
+            raise LocalError(
+                f"{settings} must be there with the ports that the cars use, got no such file: put it back, "
+                "or write {} into it and name LISTEN= and PAGE= again"
+            )
+        if not settings.exists():
+            Settings().save(self.path)
+
+    def settings(self) -> Settings:
+        """What a kept cloud remembers of its last start. Raises `LocalError` if somebody has broken it."""
+        return Settings.load(self.path) if self.kept else Settings()
 
     def remember(self, **settings: Any) -> None:
         """Change what `settings` returns."""
         if self.kept:
-            text = json.dumps({**self.settings(), **settings}, indent=2)
-            write_private(self._settings_path, f"{text}\n".encode())
+            replace(self.settings(), **settings).save(self.path)
+
+    def remember_port(self, server: str, port: int) -> None:
+        """Remember the port at which a server listens. One that has only been free may be another cloud's by
+        now."""
+        if self.kept:
+            self.settings().with_port(server, port).save(self.path)
 
     def port(self, name: str, *hosts: str, wanted: int = 0) -> int:
         """The port ``wanted``, or the one of the last start, or the usual one if it is free, unless any will
-        do, or a free one, on every host. Raises `LocalError` if it is in use."""
-        known = self.settings().get("ports", {})
-        asked = wanted or known.get(name, 0)
+        do, or a free one, on every host. Raises `LocalError` if it is in use. See `remember_port`."""
+        asked = wanted or self.settings().ports.get(name, 0)
         usual = 0 if self._any_ports else USUAL_PORTS.get(name, 0)
         found = _lasting(hosts, usual) if self.kept and not asked else _free(hosts, asked)
         if found is None:
             raise self._in_use(name, asked, hosts)
-        self.remember(ports={**known, name: found})
         return found
 
     def serve(self, stack: ExitStack, name: str, server: BackgroundServer) -> None:
-        """Start a server at the port that `port` has found, until the stack closes. Raises `LocalError` if
-        somebody else has taken it since."""
+        """Start a server at the port that `port` has found, until the stack closes, and remember the port.
+        Raises `LocalError` if somebody else has taken it since."""
         try:
             stack.enter_context(server)
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise self._in_use(name, server.port, [server.host]) from error
             raise LocalError(f"cannot listen on {server.host}:{server.port}: {error}") from error
+        self.remember_port(name, server.port)
 
     def _in_use(self, name: str, port: int, hosts: Sequence[str]) -> LocalError:
-        advice = "free it, give another, or none"
-        if port == self.settings().get("ports", {}).get(name):
+        advice = "start again, which takes another" if self.kept else "free it, give another, or none"
+        if port == self.settings().ports.get(name):
             advice = (
                 f"`sudo ss -tanp 'sport = :{port}'` names the program. End it (another cloud of this "
                 "machine by `make down STATE=its folder`), or choose another port for this one in "
-                f"{self._settings_path}"
+                f"{self.path / FILE}"
             )
             if name == "mqtt":
                 # It is in the bundles.
@@ -149,11 +181,35 @@ class StateFolder:
         return LocalError(f"port {port} ({name}) is in use on {' or '.join(hosts)}: {advice}")
 
     def secret(self, name: str, size: int = 20) -> str:
-        """A random text, the same one at each start of a kept cloud."""
+        """A random text, the same one at each start of a kept cloud as long as its file is whole."""
         path = self.path / name
-        if not path.exists():
+        # Only `cloud.json` tells it, which is made anew at each start.
+        if not path.exists() or not re.fullmatch(rb"[0-9a-f]{%d}" % (2 * size), path.read_bytes()):
             write_private(path, secrets.token_hex(size).encode())
         return path.read_text()
+
+
+def _check_own(path: Path) -> None:
+    """Raise `LocalError` if a path is another user's, or if this user cannot use it."""
+    found, own = path.stat(), os.geteuid()
+    if found.st_uid != own:
+        raise LocalError(
+            f"{path} must belong to {_name(own)}, got {_name(found.st_uid)}: only its owner runs this cloud, "
+            f"or `sudo chown -R {_name(own)} {path}` gives it to you"
+        )
+    if not os.access(path, os.R_OK | os.W_OK | (os.X_OK if path.is_dir() else 0)):
+        raise LocalError(
+            f"you must be able to read and write {path}, got mode {found.st_mode & 0o777:o}: "
+            f"`chmod -R u+rwX {path}`"
+        )
+
+
+def _name(uid: int) -> str:
+    """A user's name, or the number of one without a name."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def _lasting(hosts: Sequence[str], usual: int) -> int | None:

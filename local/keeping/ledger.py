@@ -8,7 +8,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +27,15 @@ _LOOK_S = 1.0
 
 class LedgerError(LocalError):
     """The ledger could not be written. All changes that were not committed are undone."""
+
+
+def settle(path: Path) -> None:
+    """Take the write-ahead log into the file, which is whole by itself then: a copy of it, and damage to it,
+    shows. Its process must have ended."""
+    # Not on a full disk, nor while a backup reads: the log stays, and the next start goes on from it.
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"{path.as_uri()}?mode=rw", uri=True)) as last:
+        # Whoever closes it last takes the log in.
+        last.execute("PRAGMA user_version").fetchone()
 
 
 class Ledger:

@@ -14,6 +14,9 @@ from pathlib import Path
 import trustme
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from local.errors import LocalError
 
 # A server's certificate in the network, and what is left of it when it gets a new one.
 LASTS_S = 90 * 86_400.0
@@ -21,18 +24,19 @@ RENEWED_S = 30 * 86_400.0
 
 
 class Authority:
-    """Signs certificates that nobody trusts unless told to. With a ``folder`` it is kept there."""
+    """Signs certificates that nobody trusts unless told to. With a ``folder`` it is kept there; raises
+    `LocalError` if it is damaged there."""
 
     def __init__(self, folder: Path | None = None) -> None:
-        if folder is None or not (folder / "authority.key").exists():
-            self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
-            if folder is not None:
-                write_private(folder / "authority.pem", self.pem.encode())
-                # The key last: without it both are made anew.
-                write_private(folder / "authority.key", self._authority.private_key_pem.bytes())
-        else:
-            own, key = (folder / f"authority.{kind}" for kind in ("pem", "key"))
-            self._authority = trustme.CA.from_pem(own.read_bytes(), key.read_bytes())
+        own, key = ((folder or Path()) / f"authority.{kind}" for kind in ("pem", "key"))
+        self.is_new = folder is None or not (own.exists() or key.exists())
+        if not self.is_new:
+            self._authority = _read_authority(own, key)
+            return
+        self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
+        if folder is not None:
+            write_private(own, self.pem.encode())
+            write_private(key, self._authority.private_key_pem.bytes())
 
     @property
     def pem(self) -> str:
@@ -68,6 +72,21 @@ class Authority:
         except (ValueError, TypeError, InvalidSignature):
             return False
         return True
+
+
+def _read_authority(own: Path, key: Path) -> trustme.CA:
+    try:
+        texts = own.read_bytes(), key.read_bytes()
+        public = load_pem_private_key(texts[1], None).public_key()
+        wrong = "" if x509.load_pem_x509_certificate(texts[0]).public_key() == public else "another's key"
+    except (FileNotFoundError, ValueError, TypeError) as error:
+        wrong = str(error)
+    if wrong:
+        raise LocalError(
+            f"{own} and {key.name} must be the certificate that the cars trust and its key, got {wrong}: "
+            "`iort restore` a backup, or remove both, and then each car needs a new bundle"
+        )
+    return trustme.CA.from_pem(*texts)
 
 
 @dataclass(frozen=True)

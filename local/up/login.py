@@ -6,9 +6,10 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from argon2 import PasswordHasher
+from argon2 import PasswordHasher, extract_parameters
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from local.errors import LocalError
@@ -36,8 +37,10 @@ class Password:
         self._path, self._hasher = folder / _FILE, hasher or PasswordHasher()
 
     def make(self) -> str | None:
-        """Make a random password unless there is one; returns a new one, which nobody can read later."""
+        """Make a random password unless there is one; returns a new one, which nobody can read later. Raises
+        `LocalError` if the file is damaged."""
         if self._path.exists():
+            self._check()
             return None
         new = secrets.token_urlsafe(12)
         self.set(new)
@@ -59,6 +62,15 @@ class Password:
             return self._hasher.verify(self._path.read_text(), told)
         except (VerificationError, InvalidHashError):
             return False
+
+    def _check(self) -> None:
+        text = self._path.read_text(errors="replace")
+        with suppress(InvalidHashError):
+            if extract_parameters(text).hash_len == self._hasher.hash_len:
+                return
+        raise LocalError(
+            f"{self._path} must have a hash of argon2, got {text[:40]!r}: `make up-password` sets another"
+        )
 
     def version(self) -> int:
         """Changes with the password."""

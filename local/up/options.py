@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 
 from iort_station import kept
+from local.settings import NO
 
-# Closes again what an earlier start has opened.
-NO = "no"
 _REMEMBERED = ("listen", "page", "power_cut", "ports")
 _WORDS = "[LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1] [PORTS=any]"
 

@@ -38,24 +38,24 @@ class Pages:
         embedded, listen = self._embedded, self._listen
         with ExitStack() as stack:
             port = embedded.state.port("page", embedded.host)
-            self.here = stack.enter_context(PageServer(port=port, **shown(embedded.cloud)))
+            self.here = PageServer(port=port, **shown(embedded.cloud))
+            embedded.state.serve(stack, "page", self.here)
             if listen is not None:
                 port = embedded.state.port("network page", listen.address)
                 password = Password(embedded.folder)
                 self.new_password = password.make()
                 # The broker is at the page's own address, behind the same login.
                 socket = f"wss://{listen.at(port)}{SOCKET}"
-                self.network = stack.enter_context(
-                    NetworkPage(
-                        listen,
-                        port,
-                        password=password,
-                        gateway=embedded.cloud.endpoint_url or "",
-                        trusts=ssl.create_default_context(cafile=embedded.cloud.ca_bundle),
-                        context=embedded.certificate("page", listen.hosts).context(),
-                        **shown(replace(embedded.cloud, websocket=socket)),
-                    )
+                self.network = NetworkPage(
+                    listen,
+                    port,
+                    password=password,
+                    gateway=embedded.cloud.endpoint_url or "",
+                    trusts=ssl.create_default_context(cafile=embedded.cloud.ca_bundle),
+                    context=embedded.certificate("page", listen.hosts).context(),
+                    **shown(replace(embedded.cloud, websocket=socket)),
                 )
+                embedded.state.serve(stack, "network page", self.network)
             self._exit = stack.pop_all()
         return self
 

@@ -13,7 +13,9 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any, NoReturn
 
@@ -28,12 +30,13 @@ from local.errors import EmulatorError, LocalError
 from local.network.addresses import is_ipv6
 from local.network.certificates import write_private
 from local.network.listen import Listen
+from local.settings import FILE, NO, Settings
 from local.state import VERSION, StateFolder
 from local.up import notify, options
-from local.up.options import NO
 from local.up.pages import Pages
 
-_PAGE = "PAGE"
+_LISTEN, _PAGE = "LISTEN", "PAGE"
+_HOSTS = ("listen", "page")
 _LOOK_S = 1.0
 _RENEW_S = 3600.0
 # An emulator that ends by itself is started again, unless that happens so often in this time.
@@ -62,6 +65,8 @@ def main() -> None:
         sys.exit(f"up: {error}")
     except (BotoCoreError, ClientError) as error:
         sys.exit(f"up: the embedded cloud refused a call: {error}")
+    except OSError as error:
+        sys.exit(f"up: {error}; {given.state} must be yours, whole, and on a disk with room")
     except KeyboardInterrupt:
         _say("stopped; everything is kept")
 
@@ -72,6 +77,7 @@ class _Kept:
         self._state = StateFolder(given.state, kept=True)
         # Of this start, and of the first one.
         self._began, self._started_s = time.monotonic(), time.time()
+        self._ports: Mapping[str, int] = {}
 
     def run(self) -> None:
         """Run the cloud, and start it again when its emulator has ended."""
@@ -90,20 +96,26 @@ class _Kept:
     def _once(self) -> None:
         self._began = time.monotonic()
         settings = self._settings()
-        listen, page = (_listen(settings[name.lower()], name) for name in ("LISTEN", _PAGE))
+        listen, page = self._listen(settings.listen, _LISTEN), self._listen(settings.page, _PAGE)
         embedded = EmbeddedCloud(
             self._state.path,
             live=IOT,
             progress=self._step,
             kept=True,
-            any_ports=settings["any_ports"],
-            power_cut=settings["power_cut"],
+            any_ports=settings.any_ports,
+            power_cut=settings.power_cut,
             listen=listen,
             # systemd tells a service so that its output is the journal's.
             journal="JOURNAL_STREAM" in os.environ,
         )
         with embedded, Pages(embedded, page) as pages, ExitStack() as stack:
-            self._state.remember(**settings)
+            self._state.remember(
+                listen=settings.listen,
+                page=settings.page,
+                power_cut=settings.power_cut,
+                any_ports=settings.any_ports,
+            )
+            self._ports = self._state.settings().ports
             stack.callback((embedded.folder / kept.UP).unlink, missing_ok=True)
             self._write(embedded, page)
             _say(f"\n{self._told(embedded, pages)}\n")
@@ -128,14 +140,26 @@ class _Kept:
             # A month is left to try again; on a full disk the cloud must go on and refuse records.
             _say(f"the certificates are renewed later: {error}")
 
-    def _settings(self) -> dict[str, Any]:
+    def _settings(self) -> Settings:
         """The options, and what an earlier start remembers where they say nothing."""
         given, known = self._given, self._state.settings()
-        hosts = {"listen": given.listen, "page": given.page}
-        found = {name: known.get(name, NO) if text is None else text for name, text in hosts.items()}
-        power_cut = known.get("power_cut", False) if given.power_cut is None else given.power_cut == "1"
-        any_ports = known.get("any_ports", False) or given.ports == "any"
-        return {**found, "power_cut": power_cut, "any_ports": any_ports}
+        hosts = {name: getattr(given, name) for name in _HOSTS}
+        told: dict[str, Any] = {name: text for name, text in hosts.items() if text is not None}
+        if given.power_cut is not None:
+            told["power_cut"] = given.power_cut == "1"
+        if given.ports == "any":
+            told["any_ports"] = True
+        return replace(known, **told)
+
+    def _listen(self, text: str, what: str) -> Listen | None:
+        try:
+            return _listen(text, what)
+        except LocalError as error:
+            if getattr(self._given, what.lower()) is not None:
+                raise
+            raise LocalError(
+                f"{error}. {self._state.path / FILE} remembers it: give another {what}=, or {what}={NO}"
+            ) from error
 
     def _write(self, embedded: EmbeddedCloud, page: Listen | None) -> None:
         up = kept.Up(
@@ -147,7 +171,7 @@ class _Kept:
             },
             started_s=self._started_s,
             pids={"up": os.getpid(), "emulator": embedded.emulator.pid},
-            ports=embedded.state.settings()["ports"],
+            ports=dict(self._ports),
             listen=list(embedded.listen.hosts) if embedded.listen else [],
             page=list(page.hosts) if page else [],
             certificates=[

@@ -11,10 +11,10 @@ from string import Template
 
 from local.deployment import ROOT
 from local.errors import LocalError
+from local.settings import NO
 from local.state import StateFolder
 from local.up import options
 from local.up.login import Password
-from local.up.options import NO
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -95,7 +95,7 @@ def _make_password(folder: Path, page: str | None) -> None:
     """Make the page's first password here: the service would write it into the journal."""
     state = StateFolder(folder, kept=True)
     state.prepare()
-    if (page or state.settings().get("page", NO)) != NO and (made := Password(folder).make()):
+    if (page or state.settings().page) != NO and (made := Password(folder).make()):
         _say(f"the page's password is {made} (shown once; `make up-password` sets another)")
 
 

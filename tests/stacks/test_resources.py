@@ -224,14 +224,6 @@ def test_the_stream_never_blocks_for_good(synthesized, reader):
     assert mapping["StartingPosition"] == "TRIM_HORIZON"
 
 
-def test_every_taggable_resource_is_tagged_with_the_project(synthesized):
-    for template in synthesized.templates.values():
-        for resource in template["Resources"].values():
-            tags = resource.get("Properties", {}).get("Tags")
-            if tags is not None:
-                assert {"Key": "project", "Value": "iort"} in tags
-
-
 def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
     """Every name that CloudFormation does not generate contains the namespace."""
     from aws_cdk import App

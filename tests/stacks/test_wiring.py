@@ -3,13 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
-import json
-import os
-import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from aws_cdk import App
@@ -18,23 +11,6 @@ from iort_contract.catalog import environments
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.topics import (
-    BROKER,
-    CMD,
-    FILE,
-    FLEET,
-    LAMBDA,
-    LIVE,
-    PING,
-    PONG,
-    RECORD,
-    RULE,
-    SHADOW,
-    build_topic,
-    live_topic,
-    record_topic,
-    rule_name,
-)
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
@@ -56,8 +32,6 @@ HANDLERS = (
 )
 CONTRACT = sorted((ROOT / "contract" / "iort_contract").rglob("*"))
 ANALYSIS = sorted((ROOT / "analysis" / "iort_analysis").rglob("*"))
-# Lambda's Python has boto3 and what boto3 needs.
-RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
 
 
 @pytest.fixture(scope="module")
@@ -82,68 +56,6 @@ def test_the_asset_holds_exactly_the_functions_the_contract_and_the_analysis(syn
         for path, home in expected.items()
         if path.is_file() and "__pycache__" not in path.parts
     }
-
-
-@pytest.fixture(scope="module")
-def runtime(tmp_path_factory):
-    """Lambda's Python beside the asset: only boto3 from this environment."""
-    folder = tmp_path_factory.mktemp("runtime")
-    for package in RUNTIME_PACKAGES:
-        spec = importlib.util.find_spec(package)
-        assert spec is not None
-        assert spec.origin is not None
-        origin = Path(spec.origin)
-        origin = origin.parent if origin.name == "__init__.py" else origin
-        (folder / origin.name).symlink_to(origin)
-    return folder
-
-
-@pytest.mark.parametrize("function", HANDLERS)
-def test_every_handler_imports_from_its_asset_alone(synthesized, functions, runtime, tmp_path, function):
-    properties = functions[function]
-    asset = synthesized.asset(properties["Code"])
-    path = [str(asset)]
-    if "Layers" in properties:
-        layer = ROOT / "build" / "layer" / "local" / "python"
-        if not layer.is_dir():
-            pytest.skip(f"{layer} is not there: run `make setup`")
-        (tmp_path / "layer").symlink_to(layer)
-        path.append(str(tmp_path / "layer"))
-    path.append(str(runtime))
-    program = """
-import importlib, json, sys
-sys.path[:0] = json.loads(sys.argv[1])
-module, _, attribute = sys.argv[2].rpartition(".")
-handler = getattr(importlib.import_module(module), attribute)
-assert callable(handler)
-files = {n: m.__file__ for n, m in sys.modules.items() if getattr(m, "__file__", None)}
-print(json.dumps(files))
-"""
-    # -I and -S: neither this environment's packages nor the checkout are on the path.
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-B", "-c", program, json.dumps(path), properties["Handler"]],
-        cwd=tmp_path,
-        env={"PATH": os.environ["PATH"]},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    files = json.loads(done.stdout)
-    own = {
-        module: file
-        for module, file in files.items()
-        if module.split(".")[0] in ("functions", "iort_contract")
-    }
-    assert {"iort_contract", "functions", properties["Handler"].rpartition(".")[0]} <= own.keys()
-    for file in own.values():
-        assert Path(file).is_relative_to(asset)
-    assert not [
-        file for file in files.values() if Path(file).is_relative_to(ROOT) and asset not in Path(file).parents
-    ]
-    # pubnub takes 240 ms to load: only the function that publishes pays for it.
-    assert ("pubnub" in files) == (function == "Live")
 
 
 def test_every_function_module_with_a_handler_is_deployed(functions):
@@ -252,66 +164,3 @@ def test_lambdas_own_lines_are_logged_on_request(tmp_path):
     assert made["LoggingConfig"].keys() == {"LogGroup"}
     with pytest.raises(SettingsError, match="function_logs must be own or all, got 'none'"):
         Settings.from_context(App(context={"function_logs": "none", **layers(tmp_path)}))
-
-
-def matches(topic_filter, topic):
-    """MQTT 5, 4.7: + is one level, # the rest."""
-    levels, wanted = topic.split("/"), topic_filter.split("/")
-    if wanted[-1] == "#":
-        levels, wanted = levels[: len(wanted) - 1], wanted[:-1]
-    return len(levels) == len(wanted) and all(
-        w in ("+", level) for w, level in zip(wanted, levels, strict=True)
-    )
-
-
-@pytest.fixture(scope="module")
-def filters(synthesized):
-    found = {}
-    for rule in synthesized.resources("AWS::IoT::TopicRule").values():
-        (topic_filter,) = re.findall(r"FROM '([^']+)'", rule["TopicRulePayload"]["Sql"])
-        found[rule["RuleName"]] = topic_filter
-    return found
-
-
-def test_every_topic_of_the_agent_matches_exactly_its_rule(filters):
-    for ruled, lane, straight in (
-        ("record", RECORD, record_topic("car", "vesc")),
-        ("live", LIVE, live_topic("car", "vesc")),
-    ):
-        rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", straight).groups()
-        # Basic Ingest passes the rest of the topic to the named rule, which filters it as usual.
-        assert rule == rule_name(ruled)
-        assert topic == build_topic(lane, "car", "vesc")
-    expected = {
-        build_topic(RECORD, "car", "vesc"): {"iort_record"},
-        build_topic(LIVE, "car", "vesc"): {"iort_live", "iort_fault", "iort_battery"},
-        build_topic(PING, "car", RULE): {"iort_pong"},
-        build_topic(PING, "car", LAMBDA): {"iort_echo"},
-        build_topic(PING, "car", FILE): {"iort_upload"},
-        build_topic(PING, "car", BROKER): set(),
-        build_topic(PONG, "car", RULE): set(),
-        build_topic(PONG, "car", LAMBDA): set(),
-        build_topic(PONG, "car", FILE): set(),
-        build_topic(FLEET, "car", "pose"): set(),
-        build_topic(CMD, "car", "stop"): set(),
-        build_topic(LIVE, "car", "vesc", "lab2"): set(),
-        "$aws/events/presence/connected/car": {"iort_presence"},
-        "$aws/events/presence/disconnected/car": {"iort_presence"},
-        f"$aws/things/car/shadow/name/{SHADOW}/update/accepted": {"iort_version"},
-        f"$aws/things/car/shadow/name/{SHADOW}/update/documents": set(),
-        "$aws/things/car/shadow/update/accepted": set(),
-    }
-    for one, rules in expected.items():
-        assert {rule for rule, topic_filter in filters.items() if matches(topic_filter, one)} == rules, one
-
-
-def test_the_pongs_topic_is_the_agents(synthesized):
-    topics = {
-        rule["RuleName"]: action["Republish"]["Topic"]
-        for rule in synthesized.resources("AWS::IoT::TopicRule").values()
-        for action in rule["TopicRulePayload"]["Actions"]
-        if "Republish" in action
-    }
-    ping = build_topic(PING, "car", RULE).split("/")
-    expanded = re.sub(r"\$\{topic\((\d)\)\}", lambda m: ping[int(m[1]) - 1], topics["iort_pong"])
-    assert expanded == build_topic(PONG, "car", RULE)

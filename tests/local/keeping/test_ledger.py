@@ -15,7 +15,7 @@ import pytest
 
 from local.deployment import ROOT
 from local.keeping import ledger as ledger_module
-from local.keeping.ledger import VERSION, Ledger, LedgerError
+from local.keeping.ledger import VERSION, Ledger, LedgerError, settle
 
 
 @pytest.fixture
@@ -140,13 +140,15 @@ for n in range(1_000_000):
 """
 
 
-def test_what_was_committed_survives_sigkill(tmp_path):
+def test_what_was_committed_survives_sigkill_and_damage_to_the_settled_file_shows(tmp_path):
     path = tmp_path / "ledger.db"
     command = [sys.executable, "-c", KILLED, str(path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as writer:
         said = [next(writer.stdout) for _ in range(200)]
         writer.send_signal(signal.SIGKILL)
         said += writer.stdout.read().splitlines()
+    settle(path)
+    assert [one.name for one in tmp_path.iterdir()] == ["ledger.db"]
     with closing(sqlite3.connect(path)) as opened:
         found = [n for (n,) in opened.execute("SELECT n FROM n ORDER BY n")]
     # The last line may be cut; a commit may have been stored that nobody was told of.
@@ -154,6 +156,9 @@ def test_what_was_committed_survives_sigkill(tmp_path):
     assert told >= 199
     assert found == list(range(len(found)))
     assert len(found) >= told
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(LedgerError, match=r"cannot open .*ledger\.db: .*malformed"):
+        Ledger(path)
 
 
 def test_one_fsync_serves_all_who_wait(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -47,3 +48,26 @@ def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_fe
     ):
         run._Kept(given, threading.Event()).run()
     assert len(starts) == 3
+
+
+def test_a_cloud_that_loses_its_port_at_the_first_start_takes_and_keeps_another(tmp_path, monkeypatch):
+    others = []
+
+    class Second(EmbeddedCloud):
+        def start_emulator(self, *given):
+            if not others:
+                # Another cloud that has found the same port free.
+                others.append(socket.create_server((self.host, self.ports["mqtt"])))
+            super().start_emulator(*given)
+
+    def deploy(*_given, **_settings):
+        raise LocalError("cdk deploy failed")
+
+    monkeypatch.setattr(run, "EmbeddedCloud", Second)
+    monkeypatch.setattr("local.cloud.deploy", deploy)
+    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
+    with pytest.raises(LocalError, match="cdk deploy failed"):
+        run._Kept(given, threading.Event()).run()
+    with others[0] as other:
+        kept = json.loads((tmp_path / "settings.json").read_text())["ports"]["mqtt"]
+        assert kept != other.getsockname()[1]

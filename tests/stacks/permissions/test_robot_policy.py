@@ -1,4 +1,4 @@
-"""The IoT permissions of a robot and a claim: every statement, and its evaluation by IoT Core's rules."""
+"""The IoT permissions of a robot and a claim: every statement. test_isolation.py evaluates them."""
 
 from __future__ import annotations
 
@@ -8,27 +8,8 @@ import re
 import pytest
 from aws_cdk import Stack
 
-from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.topics import (
-    ANSWER,
-    ASK,
-    BROKER,
-    CMD,
-    FILE,
-    FLEET,
-    LIVE,
-    PING,
-    PING_PATHS,
-    PONG,
-    RECORD,
-    VIEW,
-    build_topic,
-    check_namespace,
-    live_topic,
-    record_topic,
-    rule_name,
-)
+from iort_contract.topics import check_namespace
 from stacks.parts.documents import claim_policy
 from stacks.parts.documents import robot_policy as robots_policy
 from tests.stacks.permissions.roles import IOT
@@ -140,104 +121,3 @@ def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy)
 def actions(statement):
     given = statement["Action"]
     return {given} if isinstance(given, str) else set(given)
-
-
-def allows(policy, action, kind, topic, thing="car"):
-    """IoT Core's rule: * and ? are wildcards in a policy, + and # are plain characters."""
-    for statement in policy:
-        if f"iot:{action}" not in actions(statement):
-            continue
-        for resource in statement["Resource"]:
-            pattern = re.escape(resource.removeprefix(f"{IOT}:").replace(ME, thing))
-            if re.fullmatch(pattern.replace(r"\*", ".*").replace(r"\?", "."), f"{kind}/{topic}"):
-                return True
-    return False
-
-
-def test_a_robot_may_publish_on_the_agents_topics_under_its_own_name_only(robot_policy):
-    own = [
-        record_topic("car", "vesc"),
-        live_topic("car", "vesc"),
-        build_topic(LIVE, "car", "vesc"),
-        build_topic(FLEET, "car", "pose"),
-        *(build_topic(PING, "car", path) for path in (*PING_PATHS, FILE)),
-        build_topic(ASK, "car", "calibration"),
-    ]
-    for topic in own:
-        assert allows(robot_policy, "Publish", "topic", topic), topic
-        for other in ("car2", "ca", "Car", "*", "+", "other/car"):
-            assert not allows(robot_policy, "Publish", "topic", topic.replace("/car/", f"/{other}/")), other
-        assert not allows(robot_policy, "Publish", "topic", topic, "car2"), topic
-        assert not allows(robot_policy, "Publish", "topic", topic.replace("iort", "lab2"))
-
-
-def test_a_robot_may_not_publish_on_the_topics_of_others(robot_policy):
-    for topic in (
-        build_topic(CMD, "car", "stop"),
-        build_topic(PONG, "car", "rule"),
-        build_topic(ANSWER, "car", "calibration"),
-        build_topic(VIEW, "car2", "lease"),
-        # The record lane costs messaging unless it is sent by Basic Ingest.
-        build_topic(RECORD, "car", "vesc"),
-        "$aws/things/car/shadow/update",
-        "$aws/things/car/shadow/name/other/update",
-        "$aws/things/car2/shadow/name/agent/update",
-        *(f"$aws/rules/{rule_name(rule)}/dt/iort/car/vesc" for rule in RULES if rule != "record"),
-        *(f"$aws/rules/{rule_name(rule)}/live/iort/car/vesc" for rule in RULES if rule != "live"),
-    ):
-        assert not allows(robot_policy, "Publish", "topic", topic), topic
-
-
-def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
-    for topic_filter in (
-        "cmd/iort/car/#",
-        "cmd/iort/car/+",
-        "pong/iort/car/+",
-        "answer/iort/car/+",
-        "view/iort/car/lease",
-        "fleet/iort/+/#",
-        "fleet/iort/car2/pose",
-    ):
-        assert allows(robot_policy, "Subscribe", "topicfilter", topic_filter), topic_filter
-    assert allows(robot_policy, "Subscribe", "topicfilter", build_topic(PING, "car", BROKER))
-    for topic_filter in (
-        "#",
-        "+/iort/car/#",
-        "cmd/iort/+/#",
-        "cmd/iort/car2/#",
-        "pong/iort/+/rule",
-        "ping/iort/+/broker",
-        "answer/iort/+/calibration",
-        "view/iort/car2/lease",
-        "view/iort/+/lease",
-        "+/aw/iort/car2/x",
-        "ask/iort/car/#",
-        "dt/iort/car/#",
-        "live/iort/car/#",
-        "$aws/#",
-        "fleet/lab2/+/#",
-        "fleet/#",
-    ):
-        assert not allows(robot_policy, "Subscribe", "topicfilter", topic_filter), topic_filter
-    for topic in (
-        build_topic(CMD, "car", "stop"),
-        build_topic(FLEET, "car2", "pose"),
-        build_topic(PONG, "car", "rule"),
-        build_topic(ANSWER, "car", "calibration"),
-        build_topic(VIEW, "car", "lease"),
-    ):
-        assert allows(robot_policy, "Receive", "topic", topic), topic
-    for topic in (
-        build_topic(CMD, "car2", "stop"),
-        build_topic(LIVE, "car2", "vesc"),
-        build_topic(PONG, "car2", "rule"),
-        build_topic(ANSWER, "car2", "calibration"),
-        build_topic(VIEW, "car2", "lease"),
-    ):
-        assert not allows(robot_policy, "Receive", "topic", topic), topic
-
-
-def test_a_robot_connects_only_as_its_own_thing(robot_policy):
-    assert allows(robot_policy, "Connect", "client", "car")
-    assert not allows(robot_policy, "Connect", "client", "car2")
-    assert not allows(robot_policy, "Connect", "client", "car/2")

@@ -1,5 +1,4 @@
-"""No rule mistakes a key of a robot's message for a key that the cloud adds: neither
-where the rule's keys stay beside the payload's of the same name, nor where the payload's do."""
+"""No rule mistakes a key of a robot's message for a key that the cloud adds."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
-from tests.iot_sql import Message, evaluate
+from tests.rule_sql import evaluate
 from verify.tools.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
@@ -55,15 +54,9 @@ SENT = {
 WHOSE = {rule: build_topic(lane, "a", name) for rule, (lane, name, _) in SENT.items()}
 
 
-@pytest.fixture(params=[False, True], ids=["rule-wins", "payload-wins"])
-def of_rule(request):
+def of_rule(rule, topic, payload):
     """The event or item that a rule makes from a message on a topic."""
-
-    def run(rule, topic, payload):
-        sql = RULES[rule].statement(retention_s=RETENTION_S)
-        return evaluate(sql, Message(topic, payload, NOW_MS), payload_wins=request.param)
-
-    return run
+    return evaluate(RULES[rule].statement(retention_s=RETENTION_S), topic, payload, NOW_MS)
 
 
 def test_every_rule_has_a_spoofed_message():
@@ -71,7 +64,7 @@ def test_every_rule_has_a_spoofed_message():
 
 
 @pytest.mark.parametrize("rule", SENT)
-def test_a_rule_handles_a_spoofed_message_like_an_honest_one(of_rule, rule):
+def test_a_rule_handles_a_spoofed_message_like_an_honest_one(rule):
     lane, name, message = SENT[rule]
     honest = of_rule(rule, WHOSE[rule], message)
     told = of_rule(rule, WHOSE[rule], spoofed(message, "b", lane, name))
@@ -86,21 +79,21 @@ def test_a_rule_handles_a_spoofed_message_like_an_honest_one(of_rule, rule):
     assert told.get(EXPIRES_S) == (NOW_MS // 1000 + RETENTION_S if rule == "record" else None)
 
 
-def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
+def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch():
     item = of_rule("record", WHOSE["record"], spoofed(BATCH, "b", RECORD, "vesc"))
     topic, batch = decode_item(item)
     assert (topic.robot, batch) == ("a", decode_batch(BATCH))
     assert set(item) == {*ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
 
 
-def test_a_batch_without_nonfinite_is_stored_without_it(of_rule):
+def test_a_batch_without_nonfinite_is_stored_without_it():
     message = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
     item = of_rule("record", WHOSE["record"], message)
     assert not {NONFINITE, PREVIOUS} & set(item)
     assert decode_item(item)[1] == decode_batch(message)
 
 
-def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time(of_rule):
+def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time():
     event = of_rule("echo", WHOSE["echo"], spoofed(PING_MESSAGE, "b", PING, LAMBDA))
     topic, payload = echo.pong(event)
     assert topic == build_topic(PONG, "a", LAMBDA)
@@ -108,13 +101,13 @@ def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time(of_rule):
     assert json.loads(payload) == {**json.loads(PING_MESSAGE), RECEIVED_MS: NOW_MS}
 
 
-def test_the_rules_pong_has_the_clouds_time(of_rule):
+def test_the_rules_pong_has_the_clouds_time():
     answer = of_rule("pong", WHOSE["pong"], spoofed(PING_MESSAGE, "b", PING, RULE))
     assert decode_pong(json.dumps(answer)) == (7, T_US, NOW_MS)
 
 
 @pytest.mark.parametrize("rule", ["fault", "battery"])
-def test_an_alert_names_the_robot_of_the_topic(of_rule, rule):
+def test_an_alert_names_the_robot_of_the_topic(rule):
     event = of_rule(rule, WHOSE[rule], spoofed(LIVE_MESSAGE, "b", LIVE, "vesc"))
     told = []
 
@@ -131,7 +124,7 @@ def test_an_alert_names_the_robot_of_the_topic(of_rule, rule):
     assert "2023-11-14 22:13:20 UTC" in text
 
 
-def test_a_version_belongs_to_the_robot_of_the_shadows_topic(of_rule):
+def test_a_version_belongs_to_the_robot_of_the_shadows_topic():
     topic = f"$aws/things/a/shadow/name/{SHADOW}/update/accepted"
     document = json.loads(spoofed(REPORT, "b", LIVE, "vesc"))
     event = of_rule("version", topic, json.dumps(document).encode())
@@ -140,7 +133,7 @@ def test_a_version_belongs_to_the_robot_of_the_shadows_topic(of_rule):
     assert of_rule("version", topic, b'{"state": {"reported": {}}}') is None
 
 
-def test_the_brokers_own_event_is_passed_on_unchanged(of_rule):
+def test_the_brokers_own_event_is_passed_on_unchanged():
     event = of_rule("presence", "$aws/events/presence/connected/a", CONNECTED)
     assert event == json.loads(CONNECTED)
     assert presence.change(event)["Key"] == {ROBOT: {"S": "a"}}

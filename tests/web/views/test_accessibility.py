@@ -48,6 +48,13 @@ def violations(page: Page) -> list[str]:
     ]
 
 
+def silent(page: Page, car: Car, state: str) -> int:
+    """Whether a car that has sent is stale or gone; on a slow machine a car that is gone sends again."""
+    if state == "stale" and page.locator("[data-state=gone]").count():
+        show(page, car.send({**SAMPLE, "fault_code": 2}))
+    return page.locator(f"[data-state={state}]").count()
+
+
 @pytest.mark.parametrize("theme", ["dark", "light"])
 @pytest.mark.parametrize("device", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_every_view_is_accessible(
@@ -88,7 +95,7 @@ def test_every_view_is_accessible(
             show(page, car.send({**SAMPLE, "fault_code": 2}))
             for view, state in (("car", "stale"), ("fleet", "gone"), ("car", "gone")):
                 page.goto(server.url + VIEWS[view].address)
-                until(page.locator(f"[data-state={state}]").count, f"{view} to be {state}")
+                until(lambda state=state: silent(page, car, state), f"{view} to be {state}")
                 found[f"{view}, {state}"] = violations(page)
     assert {view: faults for view, faults in found.items() if faults} == {}
 
