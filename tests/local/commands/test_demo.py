@@ -87,6 +87,8 @@ def test_the_demo_runs_until_ctrl_c_and_leaves_no_process(tmp_path):
     first = terminal.process
     try:
         until(lambda: "The car drives on" in terminal.text, seconds=300)
+        # `iort findings` links to it.
+        assert f"{json.loads((folder / 'cloud.json').read_text())['page']}#/" in terminal.text
         second = demo(folder)
         output, _ = second.communicate(timeout=TIMEOUT_S)
         assert second.returncode == 2
