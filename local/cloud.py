@@ -191,6 +191,11 @@ class EmbeddedCloud:
         self.certificates.append(made)
         return made
 
+    def show_page(self, url: str) -> None:
+        """Tell the commands of this machine where the page is."""
+        self.cloud = replace(self.cloud, page=url)
+        self.cloud.save(self.folder / EMBEDDED.name)
+
     def renew(self) -> bool:
         """Renew the certificates that end soon; whether there was one. Servers notice a new file by
         themselves."""

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from iort_station.kept import LEDGER, lock_of
+from iort_station.kept import LEDGER, START_BYTES, lock_of
 from iort_station.page.background import BackgroundServer
 from local.errors import LocalError
 from local.network.certificates import write_private
@@ -24,7 +24,6 @@ from local.settings import FILE, Settings
 
 # Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.
 VERSION = 1
-_LEAST_FREE_BYTES = 500 * 1024 * 1024
 # The ports that a new kept cloud takes if they are free.
 USUAL_PORTS = {"mqtt": 8883, "files": 8443, "page": 8080, "network page": 8444}
 # The system gives ports of this range to programs that ask for any, so a kept port is outside of it.
@@ -52,8 +51,8 @@ class StateFolder:
             raise LocalError(
                 f"you must be able to write {self.path} and the folder that it is in: {error}"
             ) from error
-        if shutil.disk_usage(self.path).free < _LEAST_FREE_BYTES:
-            raise LocalError(f"{self.path} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
+        if shutil.disk_usage(self.path).free < START_BYTES:
+            raise LocalError(f"{self.path} must have {START_BYTES // 2**20} MB free: free some space")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

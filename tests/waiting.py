@@ -3,4 +3,4 @@
 from __future__ import annotations
 
 # It only ends a test that hangs: CI's machine is shared, and may stand still for a minute.
-GUARD_S = 240.0
+GUARD_S = 240

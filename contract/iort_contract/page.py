@@ -47,7 +47,8 @@ def security_policy(*addresses: str) -> str:
 
 
 def history_link(page_url: str, finding: Finding) -> str:
-    """The address of the page's history at the evidence of a finding."""
+    """The address of the page's history at the evidence of a finding; without ``page_url`` its part within
+    the page."""
     if not finding.stream:
         return f"{page_url}#/car/{quote(finding.drive.robot)}"
     around_us = max(0, _AROUND_US - (finding.to_us - finding.from_us) // 2)

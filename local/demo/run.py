@@ -120,6 +120,7 @@ class _Demo:
                     port=self._options.port,
                 )
             )
+            embedded.show_page(page.url)
             listener = stack.enter_context(listening(embedded.cloud, live, robot=ROBOT))
             self._step("car")
             bundle = robots.add(

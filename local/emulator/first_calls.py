@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -13,6 +14,7 @@ from typing import Any
 from iort_contract.cloud import PUBNUB
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.messages.requests.files import File, FileRequest, encode_file_request
 from iort_contract.tables import CONNECTED_MS, ONLINE, ROBOT, SESSION_VERSION
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import Cloud
@@ -21,9 +23,11 @@ from local.errors import LocalError
 
 
 def warm_up(cloud: Cloud, live: str) -> None:
-    """Invoke every function once, with an event that has no effect.
+    """Invoke every function for which a robot or the page waits, with an event that it takes and that has no
+    effect.
 
-    A first invocation takes seconds on a small machine, and a live message that waits for it is stale.
+    A first invocation takes seconds on a small machine, and a live message that waits for it is stale. Admit
+    is not among them: it counts each call as a robot that is admitted or refused, and a claim can wait.
     """
 
     def event(message: bytes, lane: str, name: str) -> dict[str, Any]:
@@ -31,15 +35,15 @@ def warm_up(cloud: Cloud, live: str) -> None:
 
     # A sample of 1970 is stale and is dropped.
     stale = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
+    file = File("warm-up", "other", "text/plain", 0, hashlib.sha256(b"").hexdigest(), 0)
     events: dict[tuple[str, str], dict[str, Any]] = {
         ("processing", "Live"): event(encode_live(stale), LIVE, "warm-up"),
         ("processing", "Summarize"): {"Records": []},
         ("processing", "Echo"): event(encode_ping(0, 0), PING, LAMBDA),
         # An event without a fault and without a low voltage.
         ("processing", "Alert"): event(b"", LIVE, "warm-up"),
-        # Refused without a listener. Without an id it would go to quarantine.
-        ("processing", "Upload"): event(b'{"id": "00000000"}', PING, FILE),
-        ("fleet", "Admit"): {},
+        # Asks for no address, so that nothing counts for a quota.
+        ("processing", "Upload"): event(encode_file_request(FileRequest("00000000", file, {})), PING, FILE),
         ("fleet", "Presence"): {},
         ("processing", "Query"): {},
     }

@@ -12,13 +12,13 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
+from iort_station.kept import FLOOR_BYTES
 from local.errors import LocalError
 
 Sync = Literal["off", "normal", "full"]
 Row = tuple[Any, ...]
 
 VERSION = 1
-FLOOR_BYTES = 200 * 1024 * 1024
 _log = logging.getLogger(__name__)
 # The write-ahead log is copied into the file from this size on.
 _WAL_BYTES = 4 * 1024 * 1024

@@ -118,6 +118,7 @@ class _Kept:
             self._ports = self._state.settings().ports
             stack.callback((embedded.folder / kept.UP).unlink, missing_ok=True)
             self._write(embedded, page)
+            embedded.show_page(pages.here.url)
             _say(f"\n{self._told(embedded, pages)}\n")
             notify.tell("READY=1")
             self._watch(embedded, page)

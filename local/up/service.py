@@ -107,16 +107,19 @@ def _install(text: str, *, of_machine: bool) -> None:
     _systemctl("enable", NAME, of_machine=of_machine)
     _say(f"{path} is written; starting it (the first time takes a minute or two)")
     _systemctl("restart", NAME, of_machine=of_machine)
-    user = "" if of_machine else " --user"
+    user, lingers = "" if of_machine else " --user", of_machine or _lingers()
     _say(
-        f"up, and started with the machine from now on\n"
+        f"up{', and started with the machine from now on' if lingers else ''}\n"
         f"  its state   systemctl{user} status {NAME}\n"
         f"  its log     journalctl{user} --unit {NAME} --follow\n"
         f"  to stop     systemctl{user} stop {NAME}\n"
         f"  to remove   make up-service REMOVE=1"
     )
-    if not of_machine:
-        _linger()
+    if not lingers:
+        _say(
+            f"After a reboot it starts when {getpass.getuser()} logs in, and it ends at the logout: "
+            f"`sudo loginctl enable-linger {getpass.getuser()}` changes both"
+        )
 
 
 def _remove(*, of_machine: bool) -> None:
@@ -133,11 +136,10 @@ def _folder(*, of_machine: bool) -> Path:
     return Path(home) / "systemd" / "user"
 
 
-def _linger() -> None:
-    """A user's services end with the last login, unless the user lingers."""
-    user = getpass.getuser()
-    if subprocess.run(["loginctl", "enable-linger", user], check=False, capture_output=True).returncode:  # noqa: S603, S607 - systemd's own
-        _say(f"It ends when {user} logs out: `sudo loginctl enable-linger {user}` changes that")
+def _lingers() -> bool:
+    """Let the user linger: without that its services run only while it is logged in. Whether it does."""
+    command = ["loginctl", "enable-linger", getpass.getuser()]
+    return subprocess.run(command, check=False, capture_output=True).returncode == 0  # noqa: S603 - systemd's own
 
 
 def _systemctl(*arguments: str, of_machine: bool) -> None:

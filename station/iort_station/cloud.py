@@ -66,6 +66,8 @@ class Cloud:
     root_ca_pem: str | None = None
     # A browser does not trust the embedded cloud's authority; this address has no TLS, and is on loopback.
     websocket: str | None = None
+    # Where the embedded cloud's page is served on this machine, with a slash at the end.
+    page: str | None = None
 
     @classmethod
     def load(cls, path: Path) -> Cloud:
@@ -80,9 +82,11 @@ class Cloud:
         return cloud
 
     def save(self, path: Path) -> None:
-        """Write the file that `load` reads; it has a secret."""
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+        """Write the file that `load` reads, whole at any moment; it has a secret."""
+        part = path.with_name(f".{path.name}.{os.getpid()}")
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump(asdict(self), file)
+        part.replace(path)
 
     @cached_property
     def _session(self) -> boto3.Session:

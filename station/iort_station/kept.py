@@ -15,6 +15,8 @@ from iort_station.errors import StationError
 UP = "up.json"
 CLOUD = "cloud.json"
 LEDGER = "ledger.db"
+# Free space of the disk: a start needs the first, and below the second the record lane is refused.
+START_BYTES, FLOOR_BYTES = 500 * 1024 * 1024, 200 * 1024 * 1024
 
 
 def folder(environment: Mapping[str, str] = os.environ) -> Path:

@@ -25,8 +25,7 @@ from iort_station.upkeep.finding import FAIL, OK, WARN, Finding, graded
 from iort_station.upkeep.state import LAST_BACKUP
 
 _CONNECT_S = 3.0
-# `make up` needs the second to start; below 200 MB the record lane is refused, and the cars keep it.
-_LOW_BYTES, _FULL_BYTES = 5_000_000_000, 500_000_000
+_LOW_BYTES = 5_000_000_000
 # Shares of the machine's memory.
 _LEAST_AVAILABLE, _MOST_OURS = 0.1, 0.5
 # The share of a core, or of all cores, at which summaries begin to fall behind ("How much one machine takes"
@@ -42,6 +41,8 @@ def of_kept(folder: Path) -> Iterator[Finding]:
         up = Up.load(folder)
     except StationError as error:
         yield Finding("processes", FAIL, str(error), "`make up`")
+        if folder.is_dir():
+            yield _disk(folder)
         yield _backup(folder)
         return
     runs = kept.owner(folder) is not None and all(map(machine.runs, up.pids.values()))
@@ -51,16 +52,27 @@ def of_kept(folder: Path) -> Iterator[Finding]:
         yield _version(up)
         yield from _addresses(up)
         busy = yield from _emulator(up.pids["emulator"])
-    yield _disk(folder, up)
+    safe = "survives a power cut" if up.power_cut else "survives a kill, not a power cut (POWER_CUT=1)"
+    yield _disk(folder, f" and {safe}")
     yield from _certificates(up)
     yield _clock()
     yield _backup(folder)
     if not runs:
         return
+    full = shutil.disk_usage(folder).free < kept.FLOOR_BYTES
+    yield from map(_on_a_full_disk, _deployment(folder, busy)) if full else _deployment(folder, busy)
+
+
+def _deployment(folder: Path, busy: float | None) -> Iterator[Finding]:
     try:
         yield from deployment.findings(Cloud.load(folder / kept.CLOUD), busy)
     except (StationError, ClientError, BotoCoreError) as error:
         yield Finding("deployment", FAIL, f"does not answer: {error}", "`make down`, then `make up`")
+
+
+def _on_a_full_disk(found: Finding) -> Finding:
+    """Records are refused then, and any call while another one cannot be written: other advice misleads."""
+    return found._replace(todo="free some of the disk, and look again") if found.todo else found
 
 
 def of_cloud(cloud: Cloud) -> Iterator[Finding]:
@@ -140,19 +152,19 @@ def _shown_end_s(host: str, port: int) -> float | None:
     return None
 
 
-def _disk(folder: Path, up: Up) -> Finding:
+def _disk(folder: Path, safe: str = "") -> Finding:
     free = shutil.disk_usage(folder).free
-    ledger = Path(up.ledger)
+    ledger = folder / kept.LEDGER
     wal = ledger.with_name(f"{ledger.name}-wal")
     parts = [one.stat().st_size for one in (ledger, wal) if one.exists()]
-    safe = "survives a power cut" if up.power_cut else "survives a kill, not a power cut (POWER_CUT=1)"
     return graded(
         "disk",
-        f"{free / 1e9:,.1f} GB free for {folder}; the ledger has {sum(parts) / 1e6:,.1f} MB and {safe}",
-        "free some of it, or move the state: `make down`, `iort backup`, `iort restore`. A full disk loses "
-        "nothing: recordings are refused, and the cars keep them",
+        f"{free / 1e9:,.1f} GB free for {folder}; the ledger has {sum(parts) / 1e6:,.1f} MB{safe}",
+        "free some of it, or move the state: `make down`, `iort backup`, `iort restore`. Below "
+        f"{kept.FLOOR_BYTES / 1e9:.1f} GB recordings are refused, and the cars keep them; a start needs "
+        f"{kept.START_BYTES / 1e9:.1f} GB",
         warn=free < _LOW_BYTES,
-        fail=free < _FULL_BYTES,
+        fail=free < kept.START_BYTES,
     )
 
 

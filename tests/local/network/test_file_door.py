@@ -163,20 +163,33 @@ def test_no_body_passes_that_is_larger_than_a_part_of_a_file(door, presigned, em
 
 def test_addresses_with_many_requests_leave_places_to_others(door, presigned, embedded, send):
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+
+    def begin(stack: ExitStack, own: str) -> None:
+        """A request of an address whose body does not come."""
+        raw = stack.enter_context(
+            socket.create_connection((HOST, door.port), timeout=GUARD_S, source_address=(own, 0))
+        )
+        slow = stack.enter_context(trusts.wrap_socket(raw, server_hostname=HOST))
+        head = f"PUT {presigned()} HTTP/1.1\r\nHost: {HOST}:{door.port}\r\nContent-Length: 9\r\n\r\n"
+        slow.sendall(head.encode())
+
     with ExitStack() as stack:
-        # One address takes all that one may have, and two take all that are for requests after the first.
-        for number in range(2 * file_door._MOST_OF_ONE):
-            own = ("127.0.0.8", 0) if number < file_door._MOST_OF_ONE else ("127.0.0.9", 0)
-            raw = stack.enter_context(
-                socket.create_connection((HOST, door.port), timeout=GUARD_S, source_address=own)
-            )
-            slow = stack.enter_context(trusts.wrap_socket(raw, server_hostname=HOST))
-            head = f"PUT {presigned()} HTTP/1.1\r\nHost: {HOST}:{door.port}\r\nContent-Length: 9\r\n\r\n"
-            slow.sendall(head.encode())
-        until(lambda: door._passing.total() == file_door._MOST - file_door._FIRST)
+        for _ in range(file_door._MOST_OF_ONE):
+            begin(stack, "127.0.0.8")
+        until(lambda: door._passing.total() == file_door._MOST_OF_ONE)
+        # All that one may have, though half of the places are free.
         assert send("PUT", presigned(), own="127.0.0.8")[0] == 503
-        # The first request of another address.
+        for _ in range(file_door._MOST_OF_ONE - 1):
+            begin(stack, "127.0.0.9")
+        begin(stack, "127.0.0.10")
+        until(lambda: door._passing.total() == file_door._MOST - file_door._FIRST)
+        # All that are for requests after the first; the first request of another address.
+        assert send("PUT", presigned(), own="127.0.0.9")[0] == 503
         assert send("PUT", presigned(), own="127.0.0.7")[0] == 200
+        for number in range(file_door._FIRST):
+            begin(stack, f"127.0.1.{number + 1}")
+        until(lambda: door._passing.total() == file_door._MOST)
+        assert send("PUT", presigned(), own="127.0.0.7")[0] == 503
     until(lambda: send("PUT", presigned(), own="127.0.0.8")[0] == 200)
 
 

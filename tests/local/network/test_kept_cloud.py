@@ -26,6 +26,7 @@ from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
 from local.up import service
 from local.up.down import stop
+from tests.waiting import GUARD_S
 
 
 @pytest.fixture
@@ -235,6 +236,27 @@ def test_the_unit_starts_this_checkout_with_the_options(of_machine):
     assert Path(re.search(r'ExecStart="([^"]+)"', text)[1]).exists()
 
 
+@pytest.mark.parametrize("may_linger", [True, False])
+def test_who_has_a_service_of_its_own_is_told_if_it_does_not_outlast_the_login(
+    tmp_path, monkeypatch, capsys, may_linger
+):
+    called = []
+
+    def run(command, **_given):
+        called.append(command)
+        refused = command[0] == "loginctl" and not may_linger
+        return subprocess.CompletedProcess(command, int(refused), "", "")
+
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setattr(service.subprocess, "run", run)
+    service._install("unit", of_machine=False)
+    told = capsys.readouterr().out
+    assert (tmp_path / "systemd" / "user" / service.NAME).read_text() == "unit"
+    assert ["loginctl", "enable-linger"] in [one[:2] for one in called]
+    assert ("started with the machine" in told) == may_linger
+    assert ("After a reboot it starts when" in told and "sudo loginctl enable-linger" in told) != may_linger
+
+
 def test_a_full_disk_shortens_a_log_all_the_same(tmp_path):
     log = tmp_path / "log"
     child = Child("child", ["true"], environment=os.environ, cwd=tmp_path, log=log)
@@ -248,7 +270,7 @@ def test_a_full_disk_shortens_a_log_all_the_same(tmp_path):
 
 def test_a_page_at_an_ipv6_address_needs_a_name_that_a_browsers_policy_can_have(tmp_path):
     up = [sys.executable, "-m", "local.up.run", "--state", str(tmp_path / "cloud"), "--page", "::1"]
-    done = subprocess.run(up, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(up, cwd=ROOT, capture_output=True, text=True, timeout=GUARD_S, check=False)
     assert (done.returncode, done.stderr) == (
         1,
         "up: PAGE must have a name after an IPv6 address, such as PAGE=::1,iort.lab\n",

@@ -7,10 +7,12 @@ import time
 
 import pytest
 
+from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations.monitoring import cloudwatch, cloudwatch_logs
+from local.emulator import first_calls
 from tests.local.conftest import run_agent, until
 from verify.tools.robot import Robot
 
@@ -146,3 +148,35 @@ def test_an_alert_fires_when_another_field_is_null(bundle, inbox, tmp_path, driv
         return [line for mail in inbox() if (line := mail["Message"].splitlines()[0]).startswith(car.robot)]
 
     assert until(lines) == [f"{car.robot}: {told}"]
+
+
+def test_the_first_calls_of_a_cloud_count_as_no_refusal_and_warn_of_nothing(embedded):
+    cloud, began_ms = embedded.cloud, time.time_ns() // 1_000_000
+    client, logs = cloud.client("cloudwatch"), cloud.client("logs")
+
+    def counted(name):
+        of = {METRIC_DEPLOYMENT: cloud.namespace, METRIC_FUNCTION: METRICS[name].function}
+        points = client.get_metric_statistics(
+            Namespace=METRIC_NAMESPACE,
+            MetricName=name,
+            Dimensions=[{"Name": key, "Value": value} for key, value in of.items()],
+            StartTime=began_ms / 1000 - 3600,
+            EndTime=began_ms / 1000 + 3600,
+            Period=3600,
+            Statistics=["Sum"],
+        )
+        return sum(point["Sum"] for point in points["Datapoints"])
+
+    refusals = [name for name in METRICS if name.endswith("Refused")]
+    asked, before = counted("FilesAsked"), [counted(name) for name in refusals]
+    first_calls.warm_up(cloud, embedded.live)
+    until(lambda: counted("FilesAsked") == asked + 1)
+    assert [counted(name) for name in refusals] == before
+    warned = [
+        event["message"]
+        for group in logs.describe_log_groups()["logGroups"]
+        for event in logs.filter_log_events(
+            logGroupName=group["logGroupName"], startTime=began_ms, filterPattern="WARNING"
+        )["events"]
+    ]
+    assert warned == []

@@ -381,7 +381,7 @@ def test_a_phone_needs_no_sideways_scrolling(
     for name in ("car-1", "a-car-with-a-name-as-long-as-names-may-be-" + "x" * 21):
         car = Car(car.pubnub, name)
         show(page, car.send({**SAMPLE, "fault_code": 5}))
-        show(page, car.send({"text": "y" * 4000, "number": -1.2345e-300}, stream="odom"))
+        show(page, car.send({"text": "y" * 4000, "number": -1.2345e-300, "w" * 99: 1}, stream="s" * 64))
         page.goto(f"{url}#/")
         assert page.evaluate("document.documentElement.scrollWidth") == 375
         page.tap(f"[data-robot={name}]")

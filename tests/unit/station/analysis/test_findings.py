@@ -7,9 +7,10 @@ from typer.testing import CliRunner
 
 from iort_contract.messages.analysis.findings import DriveKey, Estimate
 from iort_contract.messages.analysis.run import AnalysedDrive
-from iort_contract.page import PAGE_URL, history_link
+from iort_contract.page import history_link
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
+from iort_station.cloud import Cloud
 from iort_station.data.analysis import findings
 from iort_station.fleet import registry
 from tests.unit.functions.test_analysis import finding
@@ -42,12 +43,22 @@ def test_a_reason_that_many_share_is_said_once_and_a_share_is_in_percent(iort):
     assert f"missing temperature_drift_k, controller_lag_s: {TOO_SHORT}" in " ".join(said)
 
 
-def test_the_link_to_the_evidence_is_in_one_piece(monkeypatch):
-    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: None)
+@pytest.mark.parametrize(
+    ("served", "options", "page"),
+    [
+        ("http://127.0.0.1:21047/", [], "http://127.0.0.1:21047/"),
+        ("http://127.0.0.1:21047/", ["--page", "https://iort.lab:8444"], "https://iort.lab:8444/"),
+        (None, [], ""),
+    ],
+)
+def test_the_link_to_the_evidence_is_in_one_piece_and_names_the_page_that_is_served(
+    monkeypatch, served, options, page
+):
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: Cloud(page=served))
     one = finding()
     monkeypatch.setattr(findings, "findings", lambda *_given, most: [one][:most])
-    done = CliRunner().invoke(app, ["findings", "car7"], env={"COLUMNS": "60"})
-    assert f" evidence {history_link(PAGE_URL, one)}\n" in done.output
+    done = CliRunner().invoke(app, ["findings", "car7", *options], env={"COLUMNS": "60"})
+    assert f" evidence {history_link(page, one)}\n" in done.output
 
 
 def test_a_range_without_an_analysed_drive_says_so(iort):

@@ -133,7 +133,10 @@ def test_a_cloud_that_was_killed_is_told_from_one_that_was_stopped(folder):
     with held(folder):
         assert looked(doctor.of_kept(folder))["processes"].level == FAIL
     (folder / kept.UP).unlink()
-    assert "no cloud is up" in looked(doctor.of_kept(folder))["processes"].text
+    found = looked(doctor.of_kept(folder))
+    assert "no cloud is up" in found["processes"].text
+    # It may be why.
+    assert "GB free" in found["disk"].text
 
 
 @pytest.mark.parametrize(("free", "level"), [(6e9, OK), (4e9, WARN), (4e8, FAIL)])
@@ -142,6 +145,29 @@ def test_a_disk_that_fills_up_is_told_before_it_is_full(folder, monkeypatch, fre
     disk = looked(doctor.of_kept(folder))["disk"]
     assert disk.level == level
     assert f"{free / 1e9:.1f} GB free" in disk.text
+
+
+class Refusing:
+    """A cloud that cannot write, and whose reads are refused beside writes."""
+
+    namespace = "iort"
+
+    def output(self, noun, _name):
+        raise StationError(f"stack iort-{noun} cannot be read: ServiceUnavailable: disk is full")
+
+
+@pytest.mark.parametrize(("free", "advice"), [(1e8, "free some of the disk"), (1e9, "deploy them")])
+def test_a_full_disk_is_the_only_advice_while_calls_are_refused(folder, monkeypatch, free, advice):
+    up = json.loads((folder / kept.UP).read_text()) | {"pids": {"emulator": os.getpid()}}
+    (folder / kept.UP).write_text(json.dumps(up))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    monkeypatch.setattr(doctor.Cloud, "load", lambda _: Refusing())
+    monkeypatch.setattr(doctor.kept, "owner", lambda _: os.getpid())
+    monkeypatch.setattr(doctor, "_addresses", lambda _: [])
+    monkeypatch.setattr(doctor, "_emulator", lambda _: iter(()))
+    found = looked(doctor.of_kept(folder))
+    assert found["stacks"].todo.startswith(advice)
+    assert "free some of it" in found["disk"].todo
 
 
 @pytest.mark.parametrize(("robots", "level"), [(200, OK), (275, OK), (325, WARN), (375, WARN)])

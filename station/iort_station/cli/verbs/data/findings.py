@@ -11,7 +11,7 @@ from rich.text import Text
 from iort_contract.catalog.analysis.kinds import KINDS
 from iort_contract.messages.analysis.findings import Estimate, Finding, encode_finding
 from iort_contract.messages.analysis.run import AnalysedDrive, encode_analysed
-from iort_contract.page import PAGE_URL, history_link
+from iort_contract.page import history_link
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, When, ranged
@@ -37,12 +37,20 @@ def findings(
         bool, typer.Option("--drives", help="List the analysed drives, and what could not be computed.")
     ] = False,
     count: Annotated[int, typer.Option(min=1, max=10_000, help="The most to list; the newest.")] = 50,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="The page for the links, such as http://localhost:8080/. Default: the embedded cloud's.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List what the analysis found about drives, the newest first, with its evidence and what to do.
 
-    An interval holds the truth in 90 of 100 cases. The link opens the page's history at the evidence, where
-    `iort dashboard` serves it.
+    An interval holds the truth in 90 of 100 cases. The link opens the page's history at the evidence. Without
+    a known page it begins with #: `iort dashboard` serves the page that it belongs to.
     """
     cloud, within = context.obj.cloud(), when.range()
     if drives:
@@ -53,11 +61,14 @@ def findings(
             _show_drive(one)
         found: list[Any] = list(analysed)
     else:
+        # The embedded cloud serves one.
+        page = page or cloud.page or ""
+        page += "/" if page and not page.endswith("/") else ""
         found = stored.findings(cloud, robot, within.start_us, within.end_us, most=count)
         if as_json:
-            print_json([{**encode_finding(one), "link": history_link(PAGE_URL, one)} for one in found])
+            print_json([{**encode_finding(one), "link": history_link(page, one)} for one in found])
         for finding in () if as_json else found:
-            _show(finding)
+            _show(finding, page)
     if not found and robot is not None:
         registry.get(cloud, robot)
     if not found and not as_json:
@@ -65,7 +76,7 @@ def findings(
         errors.print(f"{what}; `iort analyse` looks now")
 
 
-def _show(one: Finding) -> None:
+def _show(one: Finding, page: str) -> None:
     kind = KINDS.get(one.kind)
     out.print(
         Text.assemble(
@@ -87,7 +98,7 @@ def _show(one: Finding) -> None:
         rows.add_row("to do", kind.action)
     out.print(rows)
     # In one piece, to be clicked or copied.
-    out.print(Text(f" evidence {history_link(PAGE_URL, one)}"), soft_wrap=True)
+    out.print(Text(f" evidence {history_link(page, one)}"), soft_wrap=True)
 
 
 def _interval(estimate: Estimate) -> str:
