@@ -28,7 +28,6 @@ from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, dec
 # The newest drives of a robot before those of the run, and of each other robot up to its end, with which a
 # drive is compared.
 _OWN, _OTHERS = 300, 20
-_NEVER_US = 2**53
 _NO_ANSWER = {"Cause": "they ended without an answer"}
 
 
@@ -145,10 +144,8 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
         event["end_us"],
     )
     job, made, gone = event["job"], [], []
-    # A run that an older version began does not tell when: only what it has made itself is its own.
-    began_us = event.get("began_us", _NEVER_US)
     for robot in event["robots"]:
-        found, replaced = evaluated(drives, job, robot, began_us)
+        found, replaced = evaluated(drives, job, robot, event["began_us"])
         made += [
             {"drive": vars(drive), "findings": [encode_finding(one) for one in some]}
             for drive, some in chain(found.items(), drives.lost(job, robot, found.keys()))

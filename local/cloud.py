@@ -15,7 +15,6 @@ import signal
 import ssl
 import sys
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -278,8 +277,8 @@ class EmbeddedCloud:
             self.emulator.check()
             try:
                 self._get("/_ministack/ready")
-            except (urllib.error.URLError, ConnectionError):
-                # The emulator gives no other signal that it listens.
+            except OSError:
+                # The emulator gives no other signal that it listens; on a slow machine it answers too late.
                 self.emulator.wait(_POLL_S)
             else:
                 return

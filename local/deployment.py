@@ -17,7 +17,7 @@ from local.processes import run
 
 ROOT = Path(__file__).resolve().parent.parent
 _ACCOUNT = "000000000000"
-_STEP_S = 180.0
+_STEP_S = 600.0
 # The sources of a synthesized assembly. If they have not changed, the kept assembly is deployed.
 _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract", "analysis/iort_analysis")

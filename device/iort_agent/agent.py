@@ -105,6 +105,7 @@ class Agent:
             operator=Operator(self.shadow.answer, self._drove(config), self.shadow.known),
             uploader=uploader,
             root_ca=config.root_ca,
+            queue=config.queue.path,
         )
         self.uploads = make_uploads(config.files, uploader, clock)
         self.attachments = make_attachments(

@@ -15,6 +15,10 @@ class NotRunningError(AgentError):
     """No agent answers on the status socket."""
 
 
+class BusyError(AgentError):
+    """The running agent has not answered on the status socket in time."""
+
+
 class SourceError(AgentError):
     """A source cannot give samples, or cannot give more of them."""
 

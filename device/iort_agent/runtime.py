@@ -29,8 +29,12 @@ class Runtime:
     def __init__(self, agent: Agent) -> None:
         self.agent = agent
         self._stop = threading.Event()
-        # Ends the run in good order; may be called from any thread and from a signal handler.
-        self.stop = self._stop.set
+        self._asked = False
+
+    def stop(self) -> None:
+        """End the run in good order; may be called from any thread and from a signal handler."""
+        self._asked = True
+        self._stop.set()
 
     def run(self, *, drain_s: float) -> int:
         """Run until every source has ended or `stop` is called, then deliver the rest.
@@ -56,7 +60,8 @@ class Runtime:
         uploader = None if uploads is None else _start("uploads", lambda: uploads.run(uploads_stop))
         self._stop.wait()
         if agent.downlink is not None:
-            agent.downlink.halt()
+            # An agent that ends by itself must not end an emergency stop.
+            agent.downlink.halt(keep_stop=not self._asked)
         agent.pings.wake()
         for thread in (*sources, watcher, ticker, pinger):
             thread.join()
@@ -66,7 +71,7 @@ class Runtime:
         self._send_log()
         delivered = self._drain(drain_s)
         if agent.downlink is not None:
-            agent.downlink.close()
+            agent.downlink.close(keep_stop=not self._asked)
         self._end_uploads(uploader, uploads_stop, drain_s)
         record_stop.set()
         agent.record.wake()

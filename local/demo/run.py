@@ -60,7 +60,7 @@ DOWNLINK = {
     },
     "drive": {"max_speed_mps": 2.0, "max_steering_rad": 0.4},
 }
-_CATCH_UP_S = 30.0
+_STANDS_S = 60.0
 _STATUS_S = 1.0
 _LOOK_S = 1.0
 
@@ -197,14 +197,16 @@ class _Demo:
         )
 
     def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:
-        """Read the tables until Lambda 2 has summarised every sample, for at most 30 s."""
+        """Read the tables until Lambda 2 has summarised every sample, or has done nothing for a minute."""
         streams = [name for name in report["streams"] if name not in OWN_STREAMS]
         sent = sum(report["streams"][name]["samples"] for name in streams)
-        deadline = time.monotonic() + _CATCH_UP_S
+        before, deadline = -1, 0.0
         while True:
             found = [counts.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
             summarized = sum(one.samples_summarized for one in found)
             stored = sum(one.samples_stored for one in found)
+            if summarized > before:
+                before, deadline = summarized, time.monotonic() + _STANDS_S
             if summarized >= sent or time.monotonic() > deadline:
                 break
             # No event tells that the stream of Lambda 2 is empty.

@@ -28,6 +28,7 @@ from local.deployment import ROOT
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import sdk
 from tests.ports import free_port
+from tests.waiting import GUARD_S
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +83,7 @@ def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any
     return written
 
 
-def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
+def until(condition: Callable[[], Any], *, seconds: float = GUARD_S) -> Any:
     """Poll for the condition's first true value; tables notify nobody of changes."""
     deadline = time.monotonic() + seconds
     while not (value := condition()):

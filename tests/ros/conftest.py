@@ -60,6 +60,7 @@ class Process:
         self.lines: list[str] = []
         self.errors: list[str] = []
         self._news = threading.Condition()
+        self._unread = 2  # streams
         self._readers = [
             threading.Thread(target=self._read, args=(stream, lines), daemon=True)
             for stream, lines in ((self._process.stdout, self.lines), (self._process.stderr, self.errors))
@@ -73,15 +74,21 @@ class Process:
                 lines.append(line.rstrip("\n"))
                 self._news.notify_all()
         with self._news:
-            self._news.notify_all()  # the process may have ended
+            self._unread -= 1
+            self._news.notify_all()
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for output that makes the condition true."""
-        with self._news:
-            self._news.wait_for(lambda: condition() or self._process.poll() is not None, WAIT_S)
-            found = condition()
+        found = self.within(WAIT_S, condition)
         assert found, f"no {what}; {self.lines[-3:]}\n" + "\n".join(self.errors[-25:])
         return found
+
+    def within(self, seconds: float, condition: Callable[[], Any]) -> Any:
+        """Wait for output that makes the condition true, but no longer than that."""
+        with self._news:
+            # A process that has ended may have written more than is read yet.
+            self._news.wait_for(lambda: condition() or not self._unread, seconds)
+            return condition()
 
     def alive(self) -> bool:
         """Whether it still runs."""

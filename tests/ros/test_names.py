@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import xmlrpc.client
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from tests.unit.agent.test_agent import config_file
 
 WAITS = "another node is called /iort_agent at http://127.0.0.1:"
 WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "header"}}}
-WAIT_S = 60
+WAIT_S = 120
 
 
 def test_a_second_node_waits_until_the_first_has_ended(graph: Graph) -> None:
@@ -58,12 +59,15 @@ def test_one_of_two_simultaneous_nodes_waits_and_neither_ends(graph: Graph) -> N
     cars = Cars(graph)
     cars.publisher("pub")
     both = [cars.collector() for _ in range(2)]
-    until(lambda: newest(*both) >= 300, seconds=WAIT_S)
-    # The outcome is final now: one has the name and all messages, the other waits.
-    holder, before = registered(graph, "/iort_agent"), [newest(one) for one in both]
-    until(lambda: newest(*both) >= 500, seconds=WAIT_S)
-    assert registered(graph, "/iort_agent") == holder
-    assert [newest(one) > n for one, n in zip(both, before, strict=True)].count(True) == 1
+
+    def settled() -> bool:
+        """Whether one has the name and all messages during 200 of them."""
+        holder, before = registered(graph, "/iort_agent"), [newest(one) for one in both]
+        until(lambda: newest(*both) >= max(before) + 200, seconds=WAIT_S)
+        heard = [newest(one) > n for one, n in zip(both, before, strict=True)]
+        return heard.count(True) == 1 and registered(graph, "/iort_agent") == holder
+
+    until(settled, seconds=WAIT_S)
     assert sum(said(one, WAITS) for one in both) >= 1
     assert [one.alive() for one in both] == [True, True]
 
@@ -73,7 +77,11 @@ def test_a_shut_down_node_ends_the_source(graph: Graph) -> None:
     cars.publisher("pub")
     collector = cars.collector()
     until_turns(collector, 5)
-    with xmlrpc.client.ServerProxy(registered(graph, "/iort_agent")) as node:
+    with (
+        xmlrpc.client.ServerProxy(registered(graph, "/iort_agent")) as node,
+        # It may end before its answer is written.
+        suppress(OSError),
+    ):
         node.shutdown("/rosnode-1-2", "user request")
     collector.until_said("the ROS node /iort_agent has ended: it was shut down from outside")
 
@@ -82,13 +90,13 @@ def test_the_status_names_the_waiting_source_and_other_sources_continue(graph: G
     taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
     until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
     agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
-    (alarm,) = until(lambda: agent.status().get("alarms"), seconds=WAIT_S)
+    (alarm,) = until(agent.waits, seconds=WAIT_S)
     assert alarm.startswith(f"source waits: {WAITS}")
     assert alarm.endswith("set sources[].node")
     before = agent.samples("vesc")
     until(lambda: agent.samples("vesc") > before, seconds=WAIT_S)
     taker.kill()
-    until(lambda: agent.status()["alarms"] == [], seconds=WAIT_S)
+    until(lambda: agent.waits() == [], seconds=WAIT_S)
     assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
 
 
@@ -149,6 +157,11 @@ class Agent(NamedTuple):
             return fetch(self.folder / "agent.sock")
         except AgentError:
             return {}  # no status yet
+
+    def waits(self) -> list[str] | None:
+        """Return the alarms of waiting sources; None without a status."""
+        alarms = self.status().get("alarms")
+        return None if alarms is None else [one for one in alarms if one.startswith("source waits")]
 
     def samples(self, stream: str) -> int:
         return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))

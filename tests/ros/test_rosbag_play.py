@@ -18,6 +18,7 @@ from iort_contract.ros1.message import RosMessage
 from iort_station.recordings import recordings
 from tests.recordings import recording
 from tests.ros.conftest import Graph
+from tests.ros.test_source import emitted
 
 VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
 STREAMS = {VESC: "vesc", SERVO: "servo"}
@@ -64,10 +65,12 @@ def test_rosbag_play_replays_every_message(graph: Graph, player: list[str], tmp_
     collector = graph.run("collector.py", config)
 
     def came(stream: str) -> list[bytes]:
-        found = [json.loads(line) for line in list(collector.lines)]
-        return [base64.b64decode(one[3]) for one in found if isinstance(one, list) and one[0] == stream]
+        return [base64.b64decode(one[3]) for one in emitted(collector, stream)]
 
-    playing = graph.start([*player, "--quiet", "--rate", "5", "--wait-for-subscribers", str(ride)])
+    # The player drops what its queue cannot hold; its own holds 100 messages.
+    playing = graph.start(
+        [*player, "--quiet", "--rate=5", f"--queue={COUNT}", "--wait-for-subscribers", str(ride)]
+    )
     for stream in STREAMS.values():
         collector.until(lambda stream=stream: len(came(stream)) >= COUNT, f"{COUNT} messages of {stream}")
     playing.wait()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import itertools
 import json
 import time
 from typing import Any
@@ -37,6 +38,7 @@ class Cars:
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
+        self._numbers = itertools.count()
 
     def publisher(self, name: str, definition: str = WHEEL, topic: str = "/wheel", **options: Any) -> Process:
         file = self.graph.folder / f"{name}.msg"
@@ -47,7 +49,8 @@ class Cars:
         )
 
     def collector(self, *topics: str, **settings: Any) -> Process:
-        file = self.graph.folder / "source.json"
+        # A file of its own: an earlier collector may be reading the other.
+        file = self.graph.folder / f"source{next(self._numbers)}.json"
         each = {"time": "header", **settings}
         file.write_text(json.dumps({"topics": {t: {"stream": t[1:], **each} for t in topics or ("/wheel",)}}))
         return self.graph.run("collector.py", file)
@@ -58,10 +61,14 @@ def cars(graph: Graph) -> Cars:
     return Cars(graph)
 
 
-def samples(collector: Process, stream: str = "wheel") -> list[tuple[int, dict[str, Any]]]:
-    # rospy prints a line of its own when it is asked to end.
+def emitted(collector: Process, stream: str) -> list[list[Any]]:
+    """Return the lines of the collector's samples; rospy prints lines of its own."""
     found = [json.loads(line) for line in list(collector.lines) if line.startswith("[")]
-    return [(s[1], s[2]) for s in found if s[0] == stream]
+    return [one for one in found if one[0] == stream]
+
+
+def samples(collector: Process, stream: str = "wheel") -> list[tuple[int, dict[str, Any]]]:
+    return [(one[1], one[2]) for one in emitted(collector, stream)]
 
 
 def turns(collector: Process, stream: str = "wheel") -> list[int]:
@@ -108,8 +115,7 @@ def test_a_topic_with_upload_hands_over_its_bytes(cars: Cars) -> None:
         cars.graph.run("publisher.py", topic[1:], topic, "strange_msgs/Picture", message, *arguments)
         until_turns(collector, 4, topic[1:])
     content = bytes(i % 251 for i in range(300_000))
-    lines = [json.loads(line) for line in list(collector.lines)]
-    of = {stream: [line for line in lines if line[0] == stream] for stream in ("upload", "refuse")}
+    of = {stream: emitted(collector, stream) for stream in ("upload", "refuse")}
     assert [line[4] for line in of["upload"]] == [{"data": hashlib.sha256(content).hexdigest()}] * 5
     assert [line[4] for line in of["refuse"]] == [{}] * 5
     # The message is available either way, and the view has the columns of a table.

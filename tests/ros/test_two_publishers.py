@@ -4,6 +4,7 @@ few batches as possible for these clocks and seconds.
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,9 @@ from tests.ros.mixed.robot import TOPICS
 SECONDS = 10
 NAMES = ("/beacons", "/joint_states")
 SENT = {"beacons": 2 * 50 * SECONDS, "joint_states": (50 + 20) * SECONDS}
-# A batch covers one second of the samples' time, and the first is cut. The beacons' clocks are 2 s apart.
-MOST_PER_S = {"beacons": 2.3, "joint_states": 1.3}
+# A batch covers one second of a clock, and there are two; a machine that stalls divides some. A batch for
+# each change from one publisher to the other would be at least 20 a second.
+MOST_PER_S = 4
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +31,8 @@ def stored(
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
-) -> dict[str, counts.Delivery]:
-    """Return the stored batches of either stream."""
+) -> tuple[dict[str, counts.Delivery], float]:
+    """Return the stored batches of either stream, and the seconds that the publishers took."""
     folder = tmp_path_factory.mktemp("two")
     topics = {name: {"stream": TOPICS[name].stream, "time": "header"} for name in NAMES}
     settings = {"sources": [{"type": "ros1", "topics": topics}], "queue": {"path": "spool.db"}}
@@ -42,10 +44,13 @@ def stored(
         publishers = [_publisher(graph, node, folder) for node in ("base", "rear")]
         for publisher in publishers:
             publisher.until(lambda publisher=publisher: "ready" in publisher.lines, "connections")
+        began = time.monotonic()
         for publisher in publishers:
             publisher.say("begin")
         for publisher in publishers:
             publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
+        # On a busy machine the publishers are late.
+        took_s = time.monotonic() - began
 
         def samples_by_stream() -> dict[str, int]:
             try:
@@ -54,11 +59,11 @@ def stored(
                 return {}  # the agent is too busy to answer
             return {name: streams.get(name, {}).get("samples", 0) for name in SENT}
 
-        until(lambda: samples_by_stream() == SENT)
+        until(lambda: samples_by_stream() == SENT, seconds=300)
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()
-    return {name: counts.delivery(embedded.cloud, car.robot, name) for name in SENT}
+    return {name: counts.delivery(embedded.cloud, car.robot, name) for name in SENT}, took_s
 
 
 def _publisher(graph: Graph, node: str, folder: Path):
@@ -69,12 +74,13 @@ def _publisher(graph: Graph, node: str, folder: Path):
 
 
 @pytest.mark.parametrize("stream", SENT)
-def test_every_message_is_stored(stored: dict[str, counts.Delivery], stream: str) -> None:
-    assert stored[stream].samples_stored == SENT[stream]
+def test_every_message_is_stored(stored: tuple[dict[str, counts.Delivery], float], stream: str) -> None:
+    assert stored[0][stream].samples_stored == SENT[stream]
 
 
 @pytest.mark.parametrize("stream", SENT)
 def test_batches_per_second_stay_within_the_number_of_clocks(
-    stored: dict[str, counts.Delivery], stream: str
+    stored: tuple[dict[str, counts.Delivery], float], stream: str
 ) -> None:
-    assert stored[stream].batches_stored <= MOST_PER_S[stream] * (SECONDS + 2)
+    found, took_s = stored
+    assert found[stream].batches_stored <= MOST_PER_S * (took_s + 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 
 import pytest
 from aws_cdk import App
@@ -12,23 +11,6 @@ from iort_contract.catalog import environments
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.topics import (
-    BROKER,
-    CMD,
-    FILE,
-    FLEET,
-    LAMBDA,
-    LIVE,
-    PING,
-    PONG,
-    RECORD,
-    RULE,
-    SHADOW,
-    build_topic,
-    live_topic,
-    record_topic,
-    rule_name,
-)
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
@@ -182,66 +164,3 @@ def test_lambdas_own_lines_are_logged_on_request(tmp_path):
     assert made["LoggingConfig"].keys() == {"LogGroup"}
     with pytest.raises(SettingsError, match="function_logs must be own or all, got 'none'"):
         Settings.from_context(App(context={"function_logs": "none", **layers(tmp_path)}))
-
-
-def matches(topic_filter, topic):
-    """MQTT 5, 4.7: + is one level, # the rest."""
-    levels, wanted = topic.split("/"), topic_filter.split("/")
-    if wanted[-1] == "#":
-        levels, wanted = levels[: len(wanted) - 1], wanted[:-1]
-    return len(levels) == len(wanted) and all(
-        w in ("+", level) for w, level in zip(wanted, levels, strict=True)
-    )
-
-
-@pytest.fixture(scope="module")
-def filters(synthesized):
-    found = {}
-    for rule in synthesized.resources("AWS::IoT::TopicRule").values():
-        (topic_filter,) = re.findall(r"FROM '([^']+)'", rule["TopicRulePayload"]["Sql"])
-        found[rule["RuleName"]] = topic_filter
-    return found
-
-
-def test_every_topic_of_the_agent_matches_exactly_its_rule(filters):
-    for ruled, lane, straight in (
-        ("record", RECORD, record_topic("car", "vesc")),
-        ("live", LIVE, live_topic("car", "vesc")),
-    ):
-        rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", straight).groups()
-        # Basic Ingest passes the rest of the topic to the named rule, which filters it as usual.
-        assert rule == rule_name(ruled)
-        assert topic == build_topic(lane, "car", "vesc")
-    expected = {
-        build_topic(RECORD, "car", "vesc"): {"iort_record"},
-        build_topic(LIVE, "car", "vesc"): {"iort_live", "iort_fault", "iort_battery"},
-        build_topic(PING, "car", RULE): {"iort_pong"},
-        build_topic(PING, "car", LAMBDA): {"iort_echo"},
-        build_topic(PING, "car", FILE): {"iort_upload"},
-        build_topic(PING, "car", BROKER): set(),
-        build_topic(PONG, "car", RULE): set(),
-        build_topic(PONG, "car", LAMBDA): set(),
-        build_topic(PONG, "car", FILE): set(),
-        build_topic(FLEET, "car", "pose"): set(),
-        build_topic(CMD, "car", "stop"): set(),
-        build_topic(LIVE, "car", "vesc", "lab2"): set(),
-        "$aws/events/presence/connected/car": {"iort_presence"},
-        "$aws/events/presence/disconnected/car": {"iort_presence"},
-        f"$aws/things/car/shadow/name/{SHADOW}/update/accepted": {"iort_version"},
-        f"$aws/things/car/shadow/name/{SHADOW}/update/documents": set(),
-        "$aws/things/car/shadow/update/accepted": set(),
-    }
-    for one, rules in expected.items():
-        assert {rule for rule, topic_filter in filters.items() if matches(topic_filter, one)} == rules, one
-
-
-def test_the_pongs_topic_is_the_agents(synthesized):
-    topics = {
-        rule["RuleName"]: action["Republish"]["Topic"]
-        for rule in synthesized.resources("AWS::IoT::TopicRule").values()
-        for action in rule["TopicRulePayload"]["Actions"]
-        if "Republish" in action
-    }
-    ping = build_topic(PING, "car", RULE).split("/")
-    expanded = re.sub(r"\$\{topic\((\d)\)\}", lambda m: ping[int(m[1]) - 1], topics["iort_pong"])
-    assert expanded == build_topic(PONG, "car", RULE)

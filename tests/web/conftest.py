@@ -8,6 +8,7 @@ import pytest
 
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
+from tests.ports import free_port
 from tests.web.cars import GAIN, PUBLISH_KEY, SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def pubnub() -> Iterator[PubNubStandIn]:
-    with PubNubStandIn(publish_key=PUBLISH_KEY, subscribe_key=SUBSCRIBE_KEY) as pubnub:
+    # A test may start it again.
+    port = free_port()
+    with PubNubStandIn(publish_key=PUBLISH_KEY, subscribe_key=SUBSCRIBE_KEY, port=port) as pubnub:
         yield pubnub
 
 

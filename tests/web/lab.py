@@ -47,6 +47,7 @@ TRACEBACK = """[ERROR] ValueError: the gain of car-7 must not be 0
   File "/var/task/functions/live.py", line 61, in handler
     publish(event)"""
 NOW_S = time.time()
+_LONG = "a_field_" + "x" * 99
 
 
 def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
@@ -267,7 +268,7 @@ def history(asked: Mapping[str, str]) -> HistoryAnswer:
     times = [start_s + (end_s - start_s) * i / 200 for i in range(200)]
     fields = {
         name: {"mean": [value * math.sin(i / 9) for i in range(200)]}
-        for name, value in SAMPLE.items()
+        for name, value in {**SAMPLE, _LONG: 1.5}.items()
         if isinstance(value, (int, float))
     }
     return {"times_s": times, "fields": fields, "samples": 200, "ros2": False, "archive": None, "row_s": 2}  # type: ignore[typeddict-item]  # means alone

@@ -72,26 +72,28 @@ class Downlink:
         """Begin or release the emergency stop."""
         self._commands.set_stopped(stopped)
 
-    def halt(self) -> None:
-        """Stop all motion, and let no further command pass. Stops are repeated until `close`."""
-        self._commands.halt()
+    def halt(self, *, keep_stop: bool = False) -> None:
+        """Stop all motion, and let no further command pass. Stops are repeated until `close`; those of an
+        emergency stop only with ``keep_stop``."""
+        self._commands.halt(keep_stop=keep_stop)
         if self._asks is not None:
             self._asks.halt()
         self._wake.set()
 
-    def close(self) -> None:
-        """Stop all motion, publish every repeated stop, and leave the ROS graph."""
-        self.halt()
+    def close(self, *, keep_stop: bool = False) -> None:
+        """Stop all motion, publish every repeated stop, and leave the ROS graph; with ``keep_stop``, leave an
+        emergency stop to the guard."""
+        self.halt(keep_stop=keep_stop)
         self._end.set()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
         if self._asks is not None:
             self._asks.close()
-        while (due := self._commands.tick()) is not None:
+        while (due := self._commands.tick()) is not None and not self._commands.held():
             self._clock.wait(threading.Event(), max(0.0, due - self._clock.monotonic()))
         if self._guard is not None:
-            self._guard.close()
+            self._guard.close(leave=self._commands.held())
         self._graph.close()
 
     def tick(self) -> float:
@@ -145,6 +147,7 @@ def make_downlink(
     operator: Operator,
     uploader: Uploader | None = None,
     root_ca: Path | None = None,
+    queue: Path | None = None,
 ) -> Downlink | None:
     """The downlink of a configuration that has one: in the ROS node of the sources, or in a ``graph`` that is
     no ROS graph if they need no node.
@@ -158,7 +161,7 @@ def make_downlink(
         graph = shared(node or DEFAULT_NODE, link.clock)
     guard = None
     if isinstance(graph, Node) and config.moves():
-        guard = Guard(graph.base, config.motions(), link.clock)
+        guard = Guard(graph.base, config.motions(), link.clock, queue)
     questions = None
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)

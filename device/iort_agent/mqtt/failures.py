@@ -8,7 +8,7 @@ from typing import Any, Callable
 from awscrt import mqtt5
 
 from iort_agent.identity.certificate import Validity
-from iort_agent.mqtt.reconnect import Cause
+from iort_agent.mqtt.reconnect import Cause, Hangups
 
 _TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
 _HUNG_UP = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP"
@@ -48,13 +48,13 @@ def why_not_connected(
     client_id: str,
     validity: Callable[[], Validity | None],
     now_us: int,
-    hung_up: Callable[..., bool],
+    hung_up: Callable[..., Hangups],
 ) -> Cause:
     """Explain why a connection failed.
 
     ``validity`` reads the validity of the robot's certificate (None: it cannot be read), and is called only
     if the certificate may be the cause. ``now_us`` is the robot's clock. ``hung_up`` tells whether the broker
-    disconnects again and again (`iort_agent.mqtt.reconnect.Causes.hung_up`).
+    disconnects again and again, or refuses (`iort_agent.mqtt.reconnect.Causes.hung_up`).
     """
     packet = data.connack_packet
     code = packet.reason_code if packet is not None else None
@@ -69,8 +69,12 @@ def why_not_connected(
             f"or its policy does not let it connect. {_ADVICE}"
         )
         return Cause("refused", text, slow=True)
-    if suspicious and hung_up(before_tls=name == _CLOSED):
-        if name == _TLS_FAILED:
+    if suspicious:
+        hangups = hung_up(before_tls=name == _CLOSED)
+        if not hangups.often:
+            # One cause, whether TLS had begun or not.
+            return Cause("hangup", words)
+        if hangups.refused and name == _TLS_FAILED:
             text = f"{words}: the broker's certificate does not fit root_ca, or the broker refuses ours"
         else:
             text = (
@@ -78,7 +82,8 @@ def why_not_connected(
                 "inactive or revoked"
             )
         # Before TLS, the broker may just as well be down behind a proxy.
-        return Cause(f"hangup {name}", f"{text}. {_ADVICE}", slow=name != _CLOSED)
+        kind = f"hangup {name if hangups.refused else _CLOSED}"
+        return Cause(kind, f"{text}. {_ADVICE}", slow=hangups.refused)
     return Cause(words, words)
 
 

@@ -26,6 +26,13 @@ class Cause(NamedTuple):
     slow: bool = False
 
 
+class Hangups(NamedTuple):
+    """Disconnects without an answer: whether they came again and again, and whether they are a refusal."""
+
+    often: bool
+    refused: bool
+
+
 class Backoff:
     """The wait before the next attempt: random between a floor and a ceiling that doubles."""
 
@@ -53,25 +60,24 @@ class Causes:
 
     def __init__(self) -> None:
         self._logged: str | None = None
-        self._hangups = 0
-        self._before_tls = False
+        self._hangups = self._in_tls = 0
 
     def connected(self) -> None:
         """Forget everything: the next cause is news."""
         self._logged = None
-        self._hangups = 0
+        self._hangups = self._in_tls = 0
 
     def is_news(self, cause: Cause) -> bool:
         """Whether the cause differs from the last one."""
         news, self._logged = cause.kind != self._logged, cause.kind
         return news
 
-    def hung_up(self, *, before_tls: bool) -> bool:
-        """Count a disconnect without an answer; whether there are enough in a row for a refusal.
+    def hung_up(self, *, before_tls: bool) -> Hangups:
+        """Count a disconnect without an answer.
 
-        Disconnects before TLS and during TLS count separately: a proxy without a broker behind it resets
-        connections, some of them while TLS begins, which the client reports as a failure of TLS.
+        Only those during TLS, in a row, are a refusal: a proxy without a broker behind it resets connections,
+        some of them while TLS begins, which the client reports as a failure of TLS.
         """
-        self._hangups = self._hangups + 1 if before_tls == self._before_tls else 1
-        self._before_tls = before_tls
-        return self._hangups >= HANGUPS
+        self._hangups += 1
+        self._in_tls = 0 if before_tls else self._in_tls + 1
+        return Hangups(self._hangups >= HANGUPS, self._in_tls >= HANGUPS)

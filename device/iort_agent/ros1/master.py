@@ -44,13 +44,17 @@ class Master:
         return None
 
 
-def proxy(uri: str) -> Any:
+def proxy(uri: str, timeout_s: float = _TIMEOUT_S) -> Any:
     """A master's or a node's calls. Raises `OSError` for an invalid address."""
-    return xmlrpc.client.ServerProxy(uri, transport=_Transport())
+    return xmlrpc.client.ServerProxy(uri, transport=_Transport(timeout_s))
 
 
 class _Transport(xmlrpc.client.Transport):
+    def __init__(self, timeout_s: float) -> None:
+        super().__init__()
+        self._timeout_s = timeout_s
+
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
-        connection.timeout = _TIMEOUT_S
+        connection.timeout = self._timeout_s
         return connection

@@ -20,7 +20,7 @@ from typing import Any, Mapping
 
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.errors import SourceError
-from iort_agent.ros1 import master
+from iort_agent.ros1 import connecting, master
 from iort_agent.ros1.graph import OnBytes
 from iort_agent.ros1.trigger import OnTrigger, trigger
 from iort_agent.ros1.types import Installed, installed, rospy
@@ -89,6 +89,8 @@ class Node:
         self._services: dict[str, Any] = {}
         self._types: dict[str, tuple[Installed, Definition]] = {}
         self._absent = False
+        # Registered again since the last poll that came to its end.
+        self._restored: list[str] = []
         self._displaced = False
         self._losses = 0
         # The address of another node of our name.
@@ -324,6 +326,7 @@ class Node:
         for name, level in _LOGGERS.items():
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
+        connecting.mend(self._me)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
             self.base, argv=[self.base], disable_signals=True, disable_rosout=True, disable_rostime=True
@@ -379,34 +382,38 @@ class Node:
                 # To register again would end the other one.
                 self._displaced = True
                 return
-            forgotten = self._register_again(dict(publishers), dict(subscribers), dict(services))
+            self._register_again(dict(publishers), dict(subscribers), dict(services))
             self._connect(dict(publishers))
         except master.ERRORS as error:
             if not self._absent:
                 _log.warning("the ROS master at %s does not answer: %s", self._uri, error)
             self._absent = True
         else:
-            if forgotten:
-                _log.warning("the ROS master had forgotten %s: registered again", ", ".join(forgotten))
+            if self._restored:
+                _log.warning("the ROS master had forgotten %s: registered again", ", ".join(self._restored))
+            self._restored = []
 
     def _register_again(
         self, publishers: Mapping[str, Any], subscribers: Mapping[str, Any], services: Mapping[str, Any]
-    ) -> list[str]:
+    ) -> None:
         me, api = self._me, self._rospy.get_node_uri()
         unheard = [topic for topic in self._subscribers if me not in subscribers.get(topic, ())]
         unpublished = [topic for topic in self._publishers if me not in publishers.get(topic, ())]
         for topic in unheard:
-            self._tell(topic, self._master.ask("registerSubscriber", topic, _ANY_TYPE, api))
+            publishing = self._master.ask("registerSubscriber", topic, _ANY_TYPE, api)
+            self._restored.append(topic)
+            self._tell(topic, publishing)
         for topic in unpublished:
             kind = self._wanted[topic]._type  # noqa: SLF001 - genpy's own name for it
             self._master.ask("registerPublisher", topic, kind, api)
-        unoffered = [service for service in self._services if me not in services.get(service, ())]
-        for service in unoffered:
-            self._master.ask("registerService", service, self._services[service].uri, api)
-        return unheard + unpublished + unoffered
+            self._restored.append(topic)
+        for service in self._services:
+            if me not in services.get(service, ()):
+                self._master.ask("registerService", service, self._services[service].uri, api)
+                self._restored.append(service)
 
     def _connect(self, publishers: Mapping[str, Any]) -> None:
-        """Try again if there are more publishers than connections, because rospy tries each only once."""
+        """Try again if there are more publishers than connections, because each is tried only once."""
         for topic, subscriber in self._subscribers.items():
             names = publishers.get(topic, ())
             if len(names) > _connections(subscriber):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping
 
 from iort_agent.common.state import Status, read
-from iort_agent.errors import AgentError, NotRunningError
+from iort_agent.errors import AgentError, BusyError, NotRunningError
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class StatusServer:
         self._server: _Server | None = None
 
     def start(self) -> None:
-        """Listen. Raises `AgentError` if an agent already answers there. If the socket cannot be made, the
+        """Listen. Raises `AgentError` if an agent already runs there. If the socket cannot be made, the
         agent runs without it."""
         try:
             if self._path.is_socket():
@@ -105,8 +105,8 @@ def _address(path: Path) -> Iterator[str]:
 
 
 def ask(path: Path) -> Status:
-    """The status of the running agent. Raises `NotRunningError` if none answers, and `AgentError` if the
-    answer cannot be read."""
+    """The status of the running agent. Raises `NotRunningError` if none runs, `BusyError` if it does not
+    answer in time, and `AgentError` if the answer cannot be read."""
     try:
         return read(Status, fetch(path))
     except (KeyError, TypeError) as error:
@@ -128,6 +128,10 @@ def fetch(path: Path) -> dict[str, Any]:
                 connection.connect(address)
             while chunk := connection.recv(65536):
                 chunks.append(chunk)
+        except (socket.timeout, BlockingIOError) as error:
+            raise BusyError(
+                f"the agent at {path} runs, and has not answered within {_TIMEOUT_S:g} s: try again"
+            ) from error
         except OSError as error:
             raise NotRunningError(f"no agent is running: {path}: {error.strerror or error}") from error
     try:

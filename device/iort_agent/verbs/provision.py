@@ -17,7 +17,7 @@ import yaml
 
 from iort_agent.common.private_files import write_below
 from iort_agent.config import Config, load_config
-from iort_agent.errors import ConfigError, IdentityError, NotRunningError
+from iort_agent.errors import BusyError, ConfigError, IdentityError, NotRunningError
 from iort_agent.identity.certificate import parse_certificate
 from iort_agent.identity.claim import load_claim
 from iort_agent.identity.pending import forget
@@ -103,9 +103,13 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
         except NotRunningError:
             _try_alone(config)
             return
-        if connection.connected and connection.certificate_id == certificate_id:
-            return
-        last_error = connection.last_error
+        except BusyError as error:
+            # Alone, this would take the connection from it.
+            last_error = str(error)
+        else:
+            if connection.connected and connection.certificate_id == certificate_id:
+                return
+            last_error = connection.last_error
         # The agent checks its files now and then, and tells nobody.
         time.sleep(_LOOK_S)
     raise IdentityError(f"the running agent did not connect with the new certificate: {last_error}")

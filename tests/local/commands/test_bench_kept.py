@@ -13,6 +13,7 @@ import pytest
 from bench.meters import usage
 from local.deployment import ROOT
 from tests.local.conftest import until
+from tests.waiting import GUARD_S
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler makes the clock: apt install gcc")
@@ -27,7 +28,7 @@ def test_a_bench_that_is_ended_leaves_no_process_behind(tmp_path):
 
         started = until(running)
         bench.terminate()
-        _, told = bench.communicate(timeout=60)
+        _, told = bench.communicate(timeout=GUARD_S)
     assert (bench.returncode, told) == (1, "bench-kept: ended\n")
     until(lambda: all(_command(pid) != command for pid, command in started.items()))
 

@@ -18,6 +18,7 @@ from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud
 from iort_station.cost.usage import Usage
 from tests.local.conftest import run_agent, until
 from tests.ports import free_port
+from tests.waiting import GUARD_S
 
 
 def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
@@ -136,7 +137,12 @@ def tab(embedded, tmp_path):
         }
         command = Path(sys.executable).parent / "iort"
         done = subprocess.run(
-            [command], env={**os.environ, **asked}, capture_output=True, text=True, timeout=60, check=True
+            [command],
+            env={**os.environ, **asked},
+            capture_output=True,
+            text=True,
+            timeout=GUARD_S,
+            check=True,
         )
         assert done.stderr == ""
         return done.stdout.split()

@@ -21,6 +21,7 @@ from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until
 from tests.local.faults.test_uplink import self_signed, set_status
+from tests.waiting import GUARD_S
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 
@@ -117,14 +118,15 @@ def test_a_running_agent_reports_its_status(embedded, bundle):
         try:
             state = until(lambda: _state(car.config))
             assert state["robot"] == car.robot
-            until(lambda: _state(car.config)["clock"])
-            state = until(lambda: (now := _state(car.config))["streams"]["vesc"]["per_s"] > 0 and now)
+            until(lambda: (now := _state(car.config)) and now["clock"])
+            state = until(lambda: (now := _state(car.config)) and now["streams"]["vesc"]["per_s"] > 0 and now)
             assert state["connection"]["connected"]
             # The emulator and the test share one clock.
             assert abs(state["clock"]["offset_ms"]) <= state["clock"]["uncertainty_ms"] + 1
             found = findings(car.config, status=0)
             assert found["broker"]["text"] == "the running agent is connected"
-            assert _state(car.config)["connection"]["connects"] == 1, "check took the connection"
+            state = until(lambda: _state(car.config))
+            assert state["connection"]["connects"] == 1, "check took the connection"
             shown = subprocess.run(
                 [AGENT, "status", "--config", car.config], capture_output=True, text=True, check=True
             )
@@ -136,7 +138,7 @@ def test_a_running_agent_reports_its_status(embedded, bundle):
             samples = until(lambda: _own_samples(embedded, car.robot))
         finally:
             agent.terminate()
-            assert agent.wait(120) == 0
+            assert agent.wait(GUARD_S) == 0
     assert samples.keys() == AGENT_FIELDS.keys()
     assert samples["connects"][-1] == 1
     assert 1 < samples["rss_mb"][-1] < 200

@@ -15,6 +15,8 @@ from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
+from tests.local.conftest import until
+from tests.waiting import GUARD_S
 
 RATE_HZ = 50
 # The log's column and the contract's field of the counter.
@@ -78,8 +80,13 @@ class Agent:
     def status(self) -> dict[str, Any]:
         """Return the output of `iort-agent status`; empty while no agent answers."""
         command = [*self._command, "status", *self._config, "--json"]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=120)
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=GUARD_S)
         answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
+        return answer
+
+    def told(self) -> dict[str, Any]:
+        """Return the status as soon as it answers: a busy machine may leave it no time."""
+        answer: dict[str, Any] = until(self.status)
         return answer
 
     def stop(self) -> None:

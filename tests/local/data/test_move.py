@@ -56,6 +56,7 @@ from tests.local.conftest import until
 from tests.local.data.drives import Agent
 from tests.local.data.test_archive import HOUR_US, START, stored
 from tests.ports import free_port
+from tests.waiting import GUARD_S
 from verify.tools.robot import Robot
 
 ROBOT, STREAM = "moving", "vesc"
@@ -299,9 +300,9 @@ def audited(side: EmbeddedCloud, robot: str) -> dict[str, Any]:
 
 
 @contextmanager
-def running(car: robots.Bundle) -> Iterator[Agent]:
+def running(car: robots.Bundle, *, drain_s: float = GUARD_S) -> Iterator[Agent]:
     """The installed agent, killed at the end."""
-    agent = Agent(car, drain_s=1)
+    agent = Agent(car, drain_s=drain_s)
     try:
         yield agent
     finally:
@@ -320,11 +321,12 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     )
     with Proxy("127.0.0.1", source.mqtt_port) as proxy:
         robots.configure(car, {"port": proxy.port})
-        with running(car) as agent:
+        # What is left when it ends stays in the queue.
+        with running(car, drain_s=1) as agent:
             until(lambda: len(list(counts.batches(source, robot, STREAM))) >= 2)
             proxy.mode = REFUSE
             # These stay in the queue on the robot's disk.
-            until(lambda: agent.status()["spool"]["batches"] >= 6)
+            until(lambda: agent.told()["spool"]["batches"] >= 6)
             agent.stop()
             agent.process.wait()
     there = {(batch.boot, batch.seq) for batch in counts.batches(source, robot, STREAM)}

@@ -18,6 +18,7 @@ from iort_contract.topics import build_topic
 from iort_station import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
+from tests.waiting import GUARD_S
 
 START = 1_700_000_000_000_000
 BATCHES, EACH, FIELDS = 80, 150, 50
@@ -83,7 +84,7 @@ def test_a_result_of_many_pages_is_complete(embedded, noise, on):
 def iort(*arguments: str, embedded: EmbeddedCloud, **how):
     command = [Path(sys.executable).parent / "iort", "--embedded", embedded.folder / "cloud.json", "--local"]
     return subprocess.run(
-        [*command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120, **how
+        [*command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, timeout=GUARD_S, **how
     )
 
 
@@ -109,7 +110,7 @@ def test_a_closed_pipe_is_not_an_error(embedded):
     done = subprocess.run(
         f"'{iort_}' --local --embedded '{embedded.folder}/cloud.json' "
         f"query {ROBOT} {STREAM} --last all --json | head -c 10",
-        shell=True, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120,
+        shell=True, cwd=ROOT, capture_output=True, text=True, check=False, timeout=GUARD_S,
     )  # fmt: skip
     assert done.stdout == '{"time": "'
     assert "Traceback" not in done.stderr

@@ -147,27 +147,28 @@ def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, 
 @pytest.mark.parametrize("broker", [PASS, REFUSE])
 def test_a_killed_agent_resumes_its_queue(embedded, bundle, proxy, tmp_path, broker):
     """Closed batches survive; at most the open batch, one second long, is lost."""
-    log = counter_log(tmp_path / "counter.csv", 10)
-    car = bundle(**_settings(log, proxy.port))
+    car = bundle(**_settings(counter_log(tmp_path / "long.csv", 600), proxy.port))
     first = Agent(car)
     until(lambda: first.said("connected to"))
     proxy.mode = broker
-    taken = until(lambda: first.status().get("streams", {}).get("vesc", {}).get("samples", 0))
-    # The second's batch closes and is written meanwhile.
-    threading.Event().wait(3)
+    closed = until(lambda: first.told()["streams"].get("vesc", {}).get("stored", 0))
+    # Then it has been written, and the next one, too.
+    until(lambda: first.told()["streams"]["vesc"]["stored"] >= closed + RATE_HZ)
     first.kill()
     proxy.mode = PASS
+    log = counter_log(tmp_path / "counter.csv", 10)
+    robots.configure(car, {"sources": [{"type": "bag", "path": str(log)}]})
     Agent(car).report()
     found = counted(embedded, car.robot)
     restart = found.index(0, 1)
     assert found[:restart] == list(range(restart))
-    assert restart >= taken
+    assert restart >= closed
     assert found[restart:] == list(range(10 * RATE_HZ))
 
 
 @pytest.mark.skipif(FAKETIME is None, reason="libfaketime is not installed: apt install faketime")
 def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
-    log = counter_log(tmp_path / "counter.csv", 10)
+    log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(
         queue={"path": "spool.db"}, sources=[{"type": "bag", "path": str(log)}], metrics={"every_s": 1}
     )
@@ -182,17 +183,20 @@ def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
         },
     )
-    until(lambda: agent.said("connected to"))
-    threading.Event().wait(3)
+    until(lambda: list(counts.batches(embedded.cloud, car.robot, "vesc")))
     clock.write_text("-1h")
+
+    def offsets_ms():
+        own = counts.batches(embedded.cloud, car.robot, AGENT_STREAM)
+        return [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
+
+    # The clock is really set, and the car measures the change.
+    until(lambda: max(offsets_ms(), default=0) > 3_590_000)
+    agent.stop()
     report = agent.report()
     batches = list(counts.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
-    assert values == list(range(10 * RATE_HZ))
-    # The clock was really set, and the car measured the change.
-    own = counts.batches(embedded.cloud, car.robot, AGENT_STREAM)
-    offsets_ms = [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
-    assert max(offsets_ms) > 3_590_000, offsets_ms
+    assert values == list(range(report["streams"]["vesc"]["samples"]))
     assert report["spool"]["left_samples"] == 0
 
 
@@ -202,7 +206,7 @@ def test_recording_recovers_from_a_full_disk(embedded, bundle, proxy, tmp_path):
     disk.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=True)
     try:
-        log = counter_log(tmp_path / "counter.csv", 12)
+        log = counter_log(tmp_path / "counter.csv", 600)
         settings = _settings(log, proxy.port, queue={"path": str(disk / "spool.db")})
         car = bundle(**settings)
         agent = Agent(car)
@@ -213,11 +217,13 @@ def test_recording_recovers_from_a_full_disk(embedded, bundle, proxy, tmp_path):
             filler.write_bytes(bytes(4 * 1024 * 1024))
         until(lambda: agent.status().get("alarms"))
         filler.unlink()
+        until(lambda: not agent.told()["alarms"])
         proxy.mode = PASS
-        agent.report()
+        agent.stop()
+        taken = agent.report()["streams"]["vesc"]["samples"]
     finally:
         subprocess.run(["umount", str(disk)], check=True)
-    assert counted(embedded, car.robot) == list(range(12 * RATE_HZ))
+    assert counted(embedded, car.robot) == list(range(taken))
 
 
 @pytest.mark.parametrize("damage", ["payloads", "header"])
@@ -284,10 +290,10 @@ def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, 
     until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc"))
     # The revocation also ends the session; on AWS, within minutes.
     set_status(embedded, car.robot, "REVOKED")
-    until(lambda: agent.said("inactive or revoked"), seconds=120)
-    waiting = until(agent.status)["spool"]["samples"]
+    until(lambda: agent.said("inactive or revoked"))
+    waiting = agent.told()["spool"]["samples"]
     until(lambda: agent.status().get("spool", {}).get("samples", 0) >= waiting + 2 * RATE_HZ)
-    status = until(agent.status)
+    status = agent.told()
     assert status["connection"]["connected"] is False
     assert any("inactive or revoked" in trouble["text"] for trouble in status["troubles"])
 
@@ -301,7 +307,7 @@ def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, 
     for name, content in contents.items():
         (car.folder / "new").write_text(content)
         (car.folder / "new").replace(car.folder / name)
-    until(lambda: agent.status().get("connection", {}).get("connected"), seconds=120)
+    until(lambda: agent.status().get("connection", {}).get("connected"))
     agent.stop()
     report = agent.report()
     assert report["spool"]["dropped_samples"] == report["spool"]["left_samples"] == 0

@@ -46,7 +46,7 @@ class UplinkLog:
 
     def echo(self, payload: bytes) -> None:
         """Send a message and receive it again, by a subscription."""
-        until(lambda: self.uplink.subscribed(self.topic), seconds=120)
+        until(lambda: self.uplink.subscribed(self.topic))
         self.uplink.publish(self.topic, payload, qos=1, done=lambda _: None)
         until(lambda: payload in self.messages)
 
@@ -143,7 +143,8 @@ def test_the_uplink_detects_a_frozen_broker(bundle, proxy):
     with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as log:
         log.echo(b"before")
         proxy.mode = FREEZE
-        until(lambda: log.connections == [True, False])
+        # On a slow machine the broker may have been too late before.
+        until(lambda: log.connections[-1] is False)
         assert "no longer answers" in (log.uplink.status().last_error or "")
         proxy.mode = PASS
         log.echo(b"after")

@@ -19,6 +19,7 @@ from iort_station.fleet.identity import claims
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import run_agent, until
+from tests.waiting import GUARD_S
 from verify.tools.robot import WAIT_S, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
@@ -148,7 +149,7 @@ def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_pat
         try:
             until(lambda: _connected(car.config))
             command("renew", "--config", car.config, "--claim", claim)
-            state = json.loads(command("status", "--config", car.config, "--json").stdout)
+            state = until(lambda: _status(car.config))
             # The old certificate is no longer needed.
             old, new = sorted(
                 certificates(embedded, car.robot),
@@ -160,13 +161,18 @@ def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_pat
             )
         finally:
             agent.terminate()
-            assert agent.wait(120) == 0
+            assert agent.wait(GUARD_S) == 0
     sent = json.loads(report.read_text())["streams"]["vesc"]["samples"]
     until(lambda: counts.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
 
 
 def _connected(config: Path) -> bool:
+    state = _status(config)
+    return state is not None and bool(state["connection"]["connected"])
+
+
+def _status(config: Path) -> Any:
     done = subprocess.run(
         [AGENT, "status", "--config", config, "--json"], capture_output=True, text=True, check=False
     )
-    return done.returncode == 0 and bool(json.loads(done.stdout)["connection"]["connected"])
+    return json.loads(done.stdout) if done.returncode == 0 else None

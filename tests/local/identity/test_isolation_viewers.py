@@ -17,6 +17,7 @@ from yarl import URL
 
 from iort_contract.topics import LIVE, build_topic
 from iort_station.errors import StationError
+from iort_station.fleet import broker
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role, signed_url
 from iort_station.page.answers import socket
@@ -31,8 +32,8 @@ from tests.isolation import (
     VIEWER,
     Row,
 )
+from tests.waiting import GUARD_S
 
-WAIT_S = 30
 PEOPLE = (VIEWER, DRIVER, EVERYBODY)
 
 
@@ -61,6 +62,12 @@ class Everybody(Person):
         return ReadOnlyCredentials(got["AccessKeyId"], got["SecretKey"], got["SessionToken"])
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A slow answer is no refusal."""
+    monkeypatch.setattr(broker, "_CONNECT_S", GUARD_S)
+
+
 @pytest.fixture(scope="module")
 def people(embedded):
     cloud = embedded.cloud
@@ -70,11 +77,11 @@ def people(embedded):
 def may(cloud: Any, person: Person, row: Row) -> bool:
     person.as_client = row.what if row.does == CONNECT else ""
     try:
-        with Broker(cloud, person, filters=[row.what] if row.does == SUBSCRIBE else []) as broker:
+        with Broker(cloud, person, filters=[row.what] if row.does == SUBSCRIBE else []) as connected:
             if row.does != PUBLISH:
                 return True
             packet = mqtt5.PublishPacket(topic=row.what, payload=b"{}", qos=mqtt5.QoS.AT_LEAST_ONCE)
-            answer = broker._client.publish(packet).result(WAIT_S).puback
+            answer = connected._client.publish(packet).result(GUARD_S).puback
             return bool(answer.reason_code < mqtt5.PubackReasonCode.UNSPECIFIED_ERROR)
     except StationError:
         return False
@@ -107,7 +114,7 @@ def test_whoever_watches_hears_live_messages_and_no_other(embedded, people, who)
     with Broker(embedded.cloud, people[who], filters=filters, on_message=hear):
         for topic in (*(row.what for row in rows), last):
             data.publish(topic=topic, qos=1, payload=b"{}")
-        assert ended.wait(WAIT_S)
+        assert ended.wait(GUARD_S)
     assert heard == {row.what for row in rows if row.allowed} | {last}
 
 

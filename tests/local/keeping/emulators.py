@@ -9,7 +9,6 @@ import resource
 import signal
 import ssl
 import sys
-import urllib.error
 import urllib.request
 import zipfile
 from collections.abc import Iterator
@@ -143,7 +142,7 @@ class Emulator:
 
     def _ready(self) -> bool:
         context = ssl.create_default_context(cafile=str(self.certificate))
-        with suppress(urllib.error.URLError, ConnectionError):
+        with suppress(OSError):
             url = f"https://127.0.0.1:{self.port}/_ministack/ready"
             with urllib.request.urlopen(url, timeout=5, context=context):
                 return True

@@ -9,6 +9,7 @@ from botocore.exceptions import BotoCoreError
 
 from tests.local.conftest import until
 from tests.local.keeping.emulators import Emulator
+from tests.waiting import GUARD_S
 
 
 class Failing(Emulator):
@@ -47,7 +48,7 @@ def test_a_disk_that_fails_ends_the_emulator_and_the_next_one_goes_on(tmp_path):
             return False
 
         until(is_refused)
-        assert emulator.process.wait(60.0) == os.EX_IOERR
+        assert emulator.process.wait(GUARD_S) == os.EX_IOERR
         assert "fails: [Errno 5] Input/output error; start again" in emulator.process.tail()
         emulator.restart()
         assert emulator.client("ssm").get_parameter(Name="before")["Parameter"]["Value"] == "kept"

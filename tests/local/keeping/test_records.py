@@ -13,6 +13,7 @@ import pytest
 
 from tests.local.conftest import until
 from tests.local.keeping.emulators import ROLE, Emulator
+from tests.waiting import GUARD_S
 
 TABLE = "records"
 _EVERYTHING = {
@@ -76,7 +77,7 @@ def robot(emulator, tmp_path):
 def _root(emulator):
     context = ssl.create_default_context(cafile=str(emulator.certificate))
     url = f"https://127.0.0.1:{emulator.port}/_ministack/iot/ca.pem"
-    with urllib.request.urlopen(url, timeout=5, context=context) as answer:
+    with urllib.request.urlopen(url, timeout=GUARD_S, context=context) as answer:
         return answer.read().decode()
 
 
@@ -86,7 +87,7 @@ def stored(emulator):
 
 def test_a_robot_keeps_a_record_that_the_full_disk_refused(emulator, robot):
     with robot() as car:
-        car.publish("record", b'{"key": "before"}', qos=1).wait_for_publish(60)
+        car.publish("record", b'{"key": "before"}', qos=1).wait_for_publish(GUARD_S)
         lost = []
         car.on_disconnect = lambda *_: lost.append(time.monotonic())
         with emulator.full_disk():
@@ -95,7 +96,7 @@ def test_a_robot_keeps_a_record_that_the_full_disk_refused(emulator, robot):
             assert not refused.is_published()
             assert stored(emulator) == {"before"}
         # The client sends it again by itself.
-        refused.wait_for_publish(60)
+        refused.wait_for_publish(GUARD_S)
         assert refused.is_published()
         emulator.restart()
     assert stored(emulator) == {"before", "refused"}

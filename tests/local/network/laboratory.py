@@ -23,6 +23,7 @@ from local.deployment import ROOT
 from local.processes import Child
 from tests.local.conftest import until
 from tests.local.network.namespaces import ANY, Machine
+from tests.waiting import GUARD_S
 
 BIN = Path(sys.executable).parent
 
@@ -69,7 +70,7 @@ class Laboratory:
         for pid in (self.up.pid, *usage.descendants(self.up.pid)):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        self.up.wait(10.0)
+        self.up.wait(GUARD_S)
 
     def _is_ready(self, told_by: socket.socket) -> bool:
         self.up.check()

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from local.processes import Child
+from tests.waiting import GUARD_S
 
 ANY = -1
 TOOLS = ("ip", "nsenter", "unshare")
@@ -39,7 +40,7 @@ class Machine:
             env={**os.environ, **(environment or {})},
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=GUARD_S,
             check=False,
         )
         assert status in (done.returncode, ANY), f"{command}: {done.stdout}{done.stderr}"

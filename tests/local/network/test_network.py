@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,9 +22,7 @@ from tests.local.conftest import until
 from tests.local.network.booted import booted
 from tests.local.network.laboratory import BIN, Laboratory, waiting
 from tests.local.network.namespaces import two_machines
-
-# The issue asks for 20 s on a machine that does nothing else.
-SECOND_START_S = 60.0
+from tests.waiting import GUARD_S
 
 
 @pytest.fixture(scope="module")
@@ -131,10 +128,11 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
             assert agent.poll() is None
         until(lambda: waiting(bundle) < 2)
         laboratory.kill()
-    began = time.monotonic()
+    deployed_ns = (laboratory.state / "cdk-deploy.log").stat().st_mtime_ns
     # What was opened stays open, and the ports are those of the bundle.
     with laboratory.running():
-        assert time.monotonic() - began < SECOND_START_S
+        # A second start deploys nothing, so that it is short.
+        assert (laboratory.state / "cdk-deploy.log").stat().st_mtime_ns == deployed_ns
         assert laboratory.listeners() == reached
         # It is back by itself; the batches in between have waited in its queue.
         until(lambda: "online since" in laboratory.iort("robots", "list"))
@@ -145,13 +143,13 @@ def test_a_car_in_another_namespace_drives_through_kills_and_loses_nothing(labor
         refused = laboratory.iort("restore", str(laboratory.backup), "--force", status=1)
         assert "stop it first" in refused
         agent.interrupt()
-        assert agent.wait(30.0) == 0, agent.tail()
+        assert agent.wait(GUARD_S) == 0, agent.tail()
         until(lambda: "offline since" in laboratory.iort("robots", "list"))
         until(lambda: "vesc: complete" in laboratory.iort("audit", "car1"))
         upload = laboratory.folder / "drive.bag"
         upload.write_bytes(os.urandom(100_000))
         sent = car(bundle, "upload", str(upload))
-        assert sent.wait(60.0) == 0, sent.tail()
+        assert sent.wait(GUARD_S) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car1")
         shows_the_ways(laboratory, bundle)
         is_well(laboratory, f"{address}:{ports['mqtt']}")
@@ -175,7 +173,7 @@ def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
         upload = laboratory.folder / "drive.bag"
         upload.write_bytes(b"samples")
         sent = car(bundle, "upload", str(upload))
-        assert sent.wait(60.0) == 0, sent.tail()
+        assert sent.wait(GUARD_S) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car6")
         assert f"cars connect to [{address}]:{ports['mqtt']}" in laboratory.iort("doctor")
 

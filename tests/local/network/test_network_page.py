@@ -20,6 +20,7 @@ from local.up.network_page import COOKIE, SOCKET, NetworkPage
 from local.up.pages import shown
 from tests.browser import until
 from tests.ports import free_port
+from tests.waiting import GUARD_S
 
 ADDRESS = Listen("127.0.0.3", ("127.0.0.3",))
 NAMED = Listen("::1", ("::1", "localhost"))
@@ -56,7 +57,7 @@ def ask(embedded, page) -> Callable[..., Answer]:
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
 
     def request(method: str, path: str, body: str | None = None, **headers: str) -> Answer:
-        connection = http.client.HTTPSConnection(ADDRESS.host, page.port, context=trusts, timeout=30)
+        connection = http.client.HTTPSConnection(ADDRESS.host, page.port, context=trusts, timeout=GUARD_S)
         connection.request(
             method, path, body, {name.replace("_", "-"): value for name, value in headers.items()}
         )
@@ -139,12 +140,11 @@ def test_guesses_come_to_an_end(ask, log_in):
 
 
 def test_a_password_may_come_in_pieces_but_not_for_ever(page, embedded, monkeypatch):
-    monkeypatch.setattr(network_page, "_FORM_S", 1.0)
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
     body = f"password={RIGHT.replace(' ', '+')}".encode()
 
     def post(*parts: bytes) -> int:
-        connection = http.client.HTTPSConnection(ADDRESS.host, page.port, context=trusts, timeout=30)
+        connection = http.client.HTTPSConnection(ADDRESS.host, page.port, context=trusts, timeout=GUARD_S)
         connection.putrequest("POST", "/login")
         connection.putheader("Origin", page.url.rstrip("/"))
         connection.putheader("Content-Length", str(len(body)))
@@ -158,6 +158,7 @@ def test_a_password_may_come_in_pieces_but_not_for_ever(page, embedded, monkeypa
         return status
 
     assert post(body[:15], body[15:]) == 303
+    monkeypatch.setattr(network_page, "_FORM_S", 1.0)
     assert post(body[:15]) == 408
 
 

@@ -40,7 +40,7 @@ def entry_of(embedded):
     """Wait for a robot's only entry; return it with its bytes."""
 
     def wait(robot):
-        (listed,) = until(lambda: list(quarantine.entries(embedded.cloud, robot=robot)), seconds=60)
+        (listed,) = until(lambda: list(quarantine.entries(embedded.cloud, robot=robot)))
         return quarantine.load(embedded.cloud, listed)
 
     return wait
@@ -117,7 +117,7 @@ def test_a_stored_batch_that_lambda_2_cannot_read_is_kept(bundle, entry_of, chan
 def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, entry_of):
     car = bundle()
     send(car, batch(0), batch(1, samples="AAAA"), batch(2))
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2, seconds=60)
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2)
     assert json.loads(entry_of(car.robot).payload)["batch"]["S"].endswith("-1")
 
 
@@ -184,7 +184,7 @@ def test_a_throttled_batch_is_put_back_once_and_then_deleted(embedded, bundle, i
     assert counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 0
     done = iort("replay-errors", "--robot", car.robot)
     assert (done.exit_code, "1 replayed" in done.stdout) == (0, True), done.output
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1, seconds=60)
+    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1)
     assert list(quarantine.entries(embedded.cloud, robot=car.robot)) == []
     assert "nothing in quarantine" in iort("replay-errors", "--robot", car.robot).stdout
 
@@ -231,7 +231,7 @@ def test_a_message_that_quarantine_cannot_keep_is_put_back_from_the_last_queue(e
     sqs.send_message(QueueUrl=last, MessageBody=json.dumps(document))
     assert "did not take" in iort("errors").stderr
     assert "on the way to it again" in iort("replay-errors", "--robot", car.robot).stderr
-    (entry,) = until(lambda: list(quarantine.entries(cloud, robot=car.robot)), seconds=60)
+    (entry,) = until(lambda: list(quarantine.entries(cloud, robot=car.robot)))
     assert quarantine.load(cloud, entry).payload == b"never kept so far"
 
 

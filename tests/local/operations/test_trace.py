@@ -11,6 +11,7 @@ from iort_station.operations.delivery import trace
 from local.deployment import ROOT
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
+from tests.waiting import GUARD_S
 
 
 def _trace(embedded, *arguments):
@@ -21,7 +22,7 @@ def _trace(embedded, *arguments):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=GUARD_S,
     )
 
 
@@ -33,13 +34,13 @@ def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
     )
     agent = Agent(car)
     try:
-        until(agent.status, seconds=60)
+        until(agent.status)
         done = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60")
         # The same car, by the way without PubNub.
         straight = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60", "--live", "iot")
     finally:
         agent.process.terminate()
-        agent.process.wait(60)
+        agent.process.wait(GUARD_S)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["updates"] == 10

@@ -9,7 +9,9 @@ from pubnub.enums import PNReconnectionPolicy
 from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 
-WAIT_S = 60
+from tests.waiting import GUARD_S
+
+WAIT_S = GUARD_S
 
 
 def sdk(standin, *, publish_key="pub", subscribe_key="sub", uuid="car"):

@@ -18,6 +18,7 @@ from iort_station.page.live.listener import Listener
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
+from tests.ports import free_port
 
 
 def subscribe(pubnub, *channels):
@@ -237,7 +238,7 @@ def test_every_answer_allows_cross_origin_reads(standin, path):
 
 
 def test_the_sdk_continues_with_a_restarted_server(client):
-    with PubNubStandIn() as standin:
+    with PubNubStandIn(port=free_port()) as standin:
         received = subscribe(client(standin), "iort.*")
         publish(client(standin), "iort.car", "before")
         assert received.get(timeout=WAIT_S).message == "before"
@@ -250,7 +251,7 @@ def test_the_sdk_continues_with_a_restarted_server(client):
 
 
 def test_the_server_can_stop_twice_and_start_again():
-    standin = PubNubStandIn()
+    standin = PubNubStandIn(port=free_port())
     standin.stop()
     for _ in range(2):
         with standin, pytest.raises(RuntimeError, match="running already"):

@@ -13,6 +13,7 @@ import pytest
 
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, publish
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -63,7 +64,7 @@ def test_the_javascript_sdk_receives_messages_from_python(standin, client, javas
 
 
 def test_the_javascript_sdk_reconnects_to_a_restarted_server(client, javascript):
-    with PubNubStandIn() as standin:
+    with PubNubStandIn(port=free_port()) as standin:
         page = javascript(standin, "iort.*", 2)
         printed = lines(page)
         assert next(printed) == {"status": "PNConnectedCategory"}

@@ -45,6 +45,7 @@ from local.deployment import ROOT
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.data.drives import Agent
+from tests.waiting import GUARD_S
 from verify.tools.robot import Robot
 
 CONTENT = b"a small file"
@@ -84,7 +85,7 @@ def upload(car, *files, env=None):
     """Run the robot's own command."""
     command = [Path(sys.executable).parent / "iort-agent", "upload", "--config", car.config, "--json", *files]
     done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=180, env=env
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=GUARD_S, env=env
     )
     return done.returncode, json.loads(done.stdout or "[]"), done.stderr
 
@@ -121,9 +122,9 @@ def test_a_large_upload_resumes_after_the_agent_is_killed(bundle, bucket, tmp_pa
     large.write_bytes(content)
     watched = {"folder": str(folder), "settle_s": 1, "remove_after_s": 0}
     source = {"type": "sim", "stream": "vesc", "rate_hz": 10}
-    car = bundle(sources=[source], files={**watched, "rate_kb_s": 4000})
+    car = bundle(sources=[source], files={**watched, "rate_kb_s": 1500})
     agent = Agent(car)
-    until(lambda: bucket.parts(car.robot), seconds=120)
+    until(lambda: bucket.parts(car.robot))
     agent.kill()
     there = bucket.parts(car.robot)
     assert not bucket.keys(car.robot)
@@ -131,10 +132,10 @@ def test_a_large_upload_resumes_after_the_agent_is_killed(bundle, bucket, tmp_pa
 
     robots.configure(car, {"files": {**watched, "rate_kb_s": 0}})
     agent = Agent(car)
-    (key,) = until(lambda: bucket.keys(car.robot), seconds=120)
+    (key,) = until(lambda: bucket.keys(car.robot))
     assert bucket.content(key) == content
-    until(lambda: not large.exists(), seconds=60)
-    status = agent.status()["files"]
+    until(lambda: not large.exists())
+    status = agent.told()["files"]
     agent.process.terminate()
     agent.report()
     # Parts that were stored before the kill were not sent again.
@@ -218,7 +219,9 @@ def put(embedded):
 
     def send(address: Address, body: bytes) -> tuple[int, str]:
         url = urlsplit(address.url)
-        connection = http.client.HTTPSConnection(url.hostname or "", url.port, context=context, timeout=60)
+        connection = http.client.HTTPSConnection(
+            url.hostname or "", url.port, context=context, timeout=GUARD_S
+        )
         connection.request("PUT", f"{url.path}?{url.query}", body, dict(address.headers))
         answer = connection.getresponse()
         text = answer.read().decode()
@@ -321,6 +324,6 @@ def test_an_expired_address_is_stale(embedded, bucket, robot, tmp_path):
     def sent():
         return sender.put(address, local, 0, len(CONTENT), threading.Event())
 
-    put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one, seconds=60)
+    put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one)
     assert put.outcome is Outcome.STALE
     assert "403" in put.text

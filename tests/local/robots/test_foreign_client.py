@@ -7,7 +7,9 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +19,7 @@ from iort_station.operations import quarantine
 from iort_station.page.live.listener import Listener
 from local.deployment import ROOT
 from tests.local.conftest import recorded, until
+from tests.waiting import GUARD_S
 
 EXAMPLES = ROOT / "docs" / "examples"
 SMALL = EXAMPLES / "batch_and_live.py"
@@ -40,14 +43,14 @@ def car(request, bundle, embedded, tmp_path):
         return bundle()
     name, folder = f"foreign-{request.param}", tmp_path / "claim"
     claims.claim(embedded.cloud, name, out=folder)
-    subprocess.run([sys.executable, PROVISION, folder, name], check=True, timeout=120)
+    subprocess.run([sys.executable, PROVISION, folder, name], check=True, timeout=GUARD_S)
     return robots.Bundle(name, folder)
 
 
 def test_a_claim_cannot_provision_another_name(embedded, tmp_path):
     claims.claim(embedded.cloud, "foreign-own", out=tmp_path)
     command = [sys.executable, PROVISION, tmp_path, "foreign-other"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=GUARD_S, check=False)
     assert done.returncode == 1
     assert "PermissionError: AccessDenied" in done.stderr
     assert not (tmp_path / "car.yaml").exists()
@@ -63,7 +66,7 @@ def test_a_foreign_client_works_like_any_robot(embedded, car, iort):
         said = [json.loads(client.stdout.readline()) for _ in range(2)]
         live = until(lambda: listener.heard)
         sent = iort("send", car.robot, "grip", '{"close": true}', "--valid-ms", "60000", "--seconds", "60")
-        out, _ = client.communicate(timeout=120)
+        out, _ = client.communicate(timeout=GUARD_S)
     assert client.returncode == 0
     assert sent.exit_code == 0, sent.output
     assert json.loads(out) == {"command": {"grip": {"close": True}}}
@@ -109,12 +112,18 @@ def c(folder):
 def test_a_small_client_stores_a_batch_and_shows_a_live_sample(language, embedded, bundle, tmp_path):
     client, car = language(tmp_path), bundle()
     endpoint = [embedded.cloud.mqtt_endpoint, str(embedded.cloud.mqtt_port)]
+    command = [*client, *endpoint, car.robot, car.folder, car.folder / "root-ca.pem"]
     with Listener(robot=car.robot, namespace=embedded.namespace, **embedded.keys.reading()) as listener:
-        subprocess.run(
-            [*client, *endpoint, car.robot, car.folder, car.folder / "root-ca.pem"], check=True, timeout=60
-        )
-        (live,) = until(lambda: listener.heard)
+
+        def shown() -> list[Any]:
+            # On a slow machine its only live message may be too old to be shown.
+            subprocess.run(command, check=True, timeout=GUARD_S)
+            with suppress(AssertionError):
+                until(lambda: listener.heard, seconds=5)
+            return listener.heard
+
+        live = until(shown)[0]
     found = recorded(embedded, car.robot, "arm")
-    assert found.columns["angle"].tolist() == [0.5, 1.5]
+    assert found.columns["angle"].tolist()[:2] == [0.5, 1.5]
     assert (live.robot, live.stream, live.seq) == (car.robot, "arm", 0)
     assert not list(quarantine.entries(embedded.cloud, robot=car.robot))

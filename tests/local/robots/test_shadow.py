@@ -14,6 +14,7 @@ from iort_contract.topics import SHADOW
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until
+from tests.waiting import GUARD_S
 
 
 @contextmanager
@@ -24,7 +25,7 @@ def driving(bundle: Any) -> Iterator[None]:
             yield
         finally:
             agent.terminate()
-            assert agent.wait(120) == 0
+            assert agent.wait(GUARD_S) == 0
 
 
 class Shadow:

@@ -39,7 +39,7 @@ name, question = sys.argv[1:3]
 rospy.init_node(name, disable_signals=True)
 answers = rospy.Subscriber(f"/iort/answer/{question}", String, lambda message: say(message.data))
 asking = rospy.Publisher(f"/iort/ask/{question}", String, queue_size=10)
-rospy.wait_for_service(f"/iort/ask/{question}", timeout=60)
+rospy.wait_for_service(f"/iort/ask/{question}", timeout=120)
 call = rospy.ServiceProxy(f"/iort/ask/{question}", trigger())
 connected = threading.Event()
 while not (asking.get_num_connections() and answers.get_num_connections()):

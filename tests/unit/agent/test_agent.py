@@ -7,6 +7,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -141,6 +142,19 @@ def test_a_status_is_the_same_after_reading_its_json() -> None:
     del written["connection"]["connects"]
     with pytest.raises(KeyError, match="connects"):
         read(Status, written)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_an_emergency_stop_ends_with_an_agent_that_is_asked_to_end(asked: bool) -> None:
+    def end(_emit: Emit, _stop: threading.Event) -> None:
+        if asked:
+            rig.runtime.stop()
+
+    rig = Rig(end)
+    downlink = rig.agent.downlink = Mock(report=dict, alarms=list, waits=lambda: None)
+    rig.runtime.run(drain_s=10)
+    downlink.halt.assert_called_once_with(keep_stop=not asked)
+    downlink.close.assert_called_once_with(keep_stop=not asked)
 
 
 def test_stop_ends_the_run_in_good_order() -> None:

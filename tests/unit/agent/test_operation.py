@@ -22,12 +22,13 @@ from iort_agent.clock import SystemClock
 from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from iort_agent.common.state import Status, read
 from iort_agent.config import load_config
-from iort_agent.errors import AgentError, NotRunningError
+from iort_agent.errors import AgentError, BusyError, NotRunningError
 from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
+from iort_agent.status import server as status_server
 from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.status.server import StatusServer, ask, fetch
 from iort_agent.status.text import render
@@ -266,6 +267,24 @@ def test_the_socket_of_a_killed_agent_is_replaced(tmp_path: Path) -> None:
     server.start()
     assert fetch(path) == {"pid": 1}
     server.stop()
+
+
+def test_an_agent_that_is_too_busy_to_answer_is_no_stopped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import socket
+
+    monkeypatch.setattr(status_server, "_TIMEOUT_S", 0.01)
+    path = tmp_path / "agent.sock"
+    with socket.socket(socket.AF_UNIX) as busy:
+        busy.bind(str(path))
+        busy.listen()
+        with pytest.raises(BusyError, match="has not answered"):
+            ask(path)
+        # A second agent would take its connection.
+        with pytest.raises(BusyError):
+            StatusServer(path, dict).start()
+    assert path.exists()
 
 
 @pytest.mark.parametrize("name", ["x" * 120, "no/such/folder/agent.sock"])

@@ -51,6 +51,7 @@ function turn() {
 }
 for (const [times, change = {}] of steps) {
   if ("hold" in change) driver.hold(change.hold, now);
+  now += change.pause ?? 0;
   if (change.takeover) driver.askTakeover();
   if ("block" in change) driver.block(change.block);
   if (change.stick) driver.stick = change.stick;
@@ -163,6 +164,13 @@ def test_whatever_stands_against_driving_stops_the_car_until_the_viewer_begins_a
     after = drive([4], [20, {"hold": True, **AHEAD}], [40, change], [40, sound])
     assert after["phase"] == "over"
     assert len(after["sent"]) == len(told["sent"])
+
+
+def test_a_page_that_stood_still_drives_on_in_no_car_however_long_its_leases() -> None:
+    steps = [4], [20, {"hold": True, **AHEAD}], [10, {"pause": 600}]
+    told = run("drive/driver.ts", CAR, {**LIMITS, "lease_ms": 10_000}, steps)
+    assert "stood still for 650 ms" in told["reason"]
+    assert speeds(told)[-4:] == [1, 0, 0, 0]
 
 
 def test_the_limits_are_those_of_the_contract() -> None:

@@ -23,6 +23,7 @@ from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer, on_loopback
+from tests.ports import free_port
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -390,9 +391,9 @@ def test_an_error_explains_how_to_build_the_page(tmp_path: Path) -> None:
 
 
 def test_the_port_is_free_after_the_shutdown(built: Path) -> None:
-    with PageServer(**TOLD, built=built) as page:
+    port = free_port()
+    with PageServer(**TOLD, built=built, port=port) as page:
         ask(page, "/")
-        port = page.port
     with PageServer(**TOLD, built=built, port=port) as page:
         assert page.port == port
         assert ask(page, "/")[0].status == 200

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from iort_station.page.server import PageServer
 from tests.browser import until
+from tests.waiting import GUARD_S
 from tests.web.cars import SUBSCRIBE_KEY
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Logs:
 
     def log(self, asked: Any) -> dict[str, Any]:
         self.queries.append(dict(asked))
-        assert self.done.wait(60)
+        assert self.done.wait(GUARD_S)
         return {
             "columns": ["@message"],
             "rows": [[f"{asked['minutes']}\n  in details"]],

@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 
 # Between two samples of refused motions: others drive meanwhile.
 _REFUSED_S = 0.1
+# rospy hands a stop to threads of its own. An agent that is killed before it is written must leave it to the
+# guard, which publishes its own `STOP_AHEAD_MS` after the agent's.
+_WRITTEN_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -93,11 +96,11 @@ class Commands:
         self.tick()
         self._wake()
 
-    def halt(self) -> None:
-        """Stop all motion, and let no further command pass."""
+    def halt(self, *, keep_stop: bool) -> None:
+        """Stop all motion, and let no further command pass; ``keep_stop`` goes on with an emergency stop."""
         with self._lock:
             for command in self._commands.values():
-                command.leases.close(self._clock.monotonic())
+                command.leases.close(self._clock.monotonic(), free=not keep_stop)
         self.tick()
 
     def tick(self) -> float | None:
@@ -115,9 +118,9 @@ class Commands:
                     # Under the lock, so that no command that has just passed is released.
                     self._graph.release(motion.topic)
                 # A lease whose stop nobody hears ends for the guard, too, which then publishes its own.
-                if not motion.unheard:
+                if not motion.unheard and now >= motion.written:
                     self._tell_guard(motion)
-            found = [motion.leases.next_due() for motion in self._motions.values()]
+            found = [motion.next_due(now) for motion in self._motions.values()]
             # After the stops, since it may have to start a process.
             if self._guard is not None:
                 self._guard.tick(stops=not any(motion.unheard for motion in self._motions.values()))
@@ -132,11 +135,15 @@ class Commands:
     def alarms(self) -> list[str]:
         """Why no motion may pass."""
         found = []
-        if any(motion.leases.held for motion in self._motions.values()):
+        if self.held():
             found.append("emergency stop: no motion until an operator releases it")
         if self.guarded() is False:
             found.append("the guard does not run yet: no motion until it does")
         return found
+
+    def held(self) -> bool:
+        """Whether an emergency stop holds."""
+        return any(motion.leases.held for motion in self._motions.values())
 
     def guarded(self) -> bool | None:
         """Whether the guard would stop the robot; None if it needs none."""
@@ -167,6 +174,8 @@ class Commands:
     def _begin_stop(self, motion: Motion, now: float) -> list[Mapping[str, Value]]:
         """Note that a stop begins; the sample of it, if somebody drove before."""
         motion.stopping = True
+        if self._guard is not None:
+            motion.written = now + _WRITTEN_S
         command, last = motion.last, motion.leases.last
         what = f"command {command.name}" if command is not None else motion.topic
         _log.warning("%s: %s, stopping", what, motion.leases.why_stopped())
@@ -232,6 +241,7 @@ class Commands:
                 )
             if reason is None and motion is not None:
                 motion.last = command
+                motion.stopping = motion.stopping and offered.ends
                 # Before the robot moves.
                 if not self._tell_guard(motion):
                     motion.leases.cut(now)

@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Mapping
 
 from iort_agent.clock import Clock
@@ -30,10 +31,14 @@ _CLOSE_S, _KILLED_S = 3.0, 0.2
 
 class Guard:
     """``agent`` is the name of the agent's node; ``stops`` has the type and the message of each motion's
-    stop, by its topic. Not for several threads at once."""
+    stop, by its topic; ``queue`` is the file beside which an emergency stop is kept. Not for several threads
+    at once."""
 
-    def __init__(self, agent: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock) -> None:
-        self._first = _line({"agent": agent, "stops": stops})
+    def __init__(
+        self, agent: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock, queue: Path | None = None
+    ) -> None:
+        kept = str(queue.absolute()) if queue is not None else None
+        self._first = _line({"agent": agent, "stops": stops, "queue": kept})
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
         # What it must know after a restart, by topic.
@@ -96,13 +101,15 @@ class Guard:
         for line in self._told.values():
             self._write(line)
 
-    def close(self) -> None:
-        """End the process; it publishes the stops that are due before."""
+    def close(self, *, leave: bool = False) -> None:
+        """End the process; it publishes the stops that are due before. ``leave`` an emergency stop to it."""
         self._start_at = None
         if self._process is None:
             return
         assert self._process.stdin is not None
         self._process.stdin.close()
+        if leave:
+            return
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_CLOSE_S)
         self._kill()

@@ -16,9 +16,11 @@ import signal
 import sys
 import threading
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Mapping
 
 from iort_agent.clock import SystemClock
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.motion.stops import Stops
 from iort_agent.ros1.json_message import encode
 from iort_agent.ros1.node import Node, shared
@@ -64,6 +66,7 @@ class _Guard:
         # Stops since the last news of a lease. At its end the agent publishes a stop itself, and tells it.
         self._stops = 0
         self._joined: float | None = None
+        self._queue: str | None = config.get("queue")
 
     def ready(self) -> bool:
         """Whether the stops would be heard: the topics' subscribers have connected, or had the time to."""
@@ -100,7 +103,10 @@ class _Guard:
             motion.stops.put_off(now)
 
     def watch(self, over: threading.Event) -> None:
-        """Set ``over`` once the agent's node is in the graph again."""
+        """Keep an emergency stop for the next agent, and set ``over`` once its node is in the graph."""
+        if self._queue is not None and any(motion.stops.held for motion in self._motions.values()):
+            # The agent may have died before it did. A slow disk delays no stop here.
+            KeptStop(Path(self._queue)).keep(stopped=True)
         seen = 0
         while not over.wait(_LOOK_S):
             seen = seen + 1 if self.node.lives(self._agent) else 0

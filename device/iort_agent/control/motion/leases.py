@@ -104,9 +104,10 @@ class Leases(Stops):
             self._refuse(self.last.session)
         super().hold(now)
 
-    def close(self, now: float) -> None:
-        """End the lease now, and let no further command pass."""
-        self.free()
+    def close(self, now: float, *, free: bool = True) -> None:
+        """End the lease now, and let no further command pass; ``free`` also ends an emergency stop."""
+        if free:
+            self.free()
         self._closed = True
         self.cut(now)
 

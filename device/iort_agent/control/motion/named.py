@@ -29,6 +29,13 @@ class Motion:
         self.stops = 0
         # The newest stop could not be published: the agent is not in the ROS graph.
         self.unheard = False
+        # When the first stop is written, for sure.
+        self.written = 0.0
+
+    def next_due(self, now: float) -> float | None:
+        """When something is to be done next; None while nothing moves."""
+        due = self.leases.next_due()
+        return self.written if now < self.written and (due is None or self.written < due) else due
 
     def stop(self, now_us: int) -> bytes:
         return encode(self._definition, self._stop, now_us=now_us, partial=True)

@@ -28,8 +28,8 @@ export interface LineSpec extends ChartPanelOptions {
   readonly key: string;
   /** A field for each line. */
   readonly fields: readonly string[];
-  /** The scale, and the unit if it depends on the car. */
-  readonly as: (speed: Linear | undefined) => readonly [Linear, string?];
+  /** The scale, and the unit and the digits if they depend on the car. */
+  readonly as: (speed: Linear | undefined) => readonly [Linear, string?, number?];
 }
 
 /** One field over another. */
@@ -98,7 +98,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
     fields: ["speed"],
     readings: [{ name: "speed", unit: "m/s", digits: 2, from: first }],
     chart: { lines: [{ colour: "--speed", fill: true }], span: 1, zero: true },
-    as: (speed) => (speed ? [speed, "m/s"] : [AS_SENT, "erpm"]),
+    as: (speed) => (speed ? [speed, "m/s"] : [AS_SENT, "erpm", 0]),
   },
   {
     kind: "line",

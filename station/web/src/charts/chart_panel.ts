@@ -29,6 +29,7 @@ export class ChartPanel {
   private readonly units: Text[];
   private hovered = false;
   private as: Linear = AS_SENT;
+  private digits: number | undefined;
 
   constructor(
     private readonly options: ChartPanelOptions,
@@ -63,7 +64,7 @@ export class ChartPanel {
       about: {
         title,
         lines: chart.lines.map((_, i) => readings.find(({ line }) => line === i)?.label ?? ""),
-        write: (value) => `${number(value, readings[0]?.digits)} ${this.units[0]?.node.textContent ?? ""}`,
+        write: (value) => `${number(value, this.digits ?? readings[0]?.digits)} ${this.units[0]?.node.textContent ?? ""}`,
       },
       onPoint: (point) => {
         this.hovered = point !== undefined;
@@ -76,9 +77,9 @@ export class ChartPanel {
     });
   }
 
-  /** Set the data, its scale, and the unit if it differs. */
-  show(shown: Shown | undefined, as: Linear, unit?: string): void {
-    this.as = as;
+  /** Set the data, its scale, and the unit and the digits if they differ. */
+  show(shown: Shown | undefined, as: Linear, unit?: string, digits?: number): void {
+    [this.as, this.digits] = [as, digits];
     this.chart.show(shown, as);
     this.options.readings.forEach((reading, i) => this.units[i]!.set(unit ?? reading.unit));
   }
@@ -107,6 +108,6 @@ export class ChartPanel {
   }
 
   private read(values: readonly number[]): void {
-    this.options.readings.forEach(({ digits, from }, i) => this.texts[i]!.set(number(from(values), digits)));
+    this.options.readings.forEach(({ digits, from }, i) => this.texts[i]!.set(number(from(values), this.digits ?? digits)));
   }
 }

@@ -34,8 +34,11 @@ export function driverName(...names: readonly string[]): string {
   return printable.find((name) => name !== "") ?? "somebody";
 }
 
+/** How long a command holds the car at most. */
+export const leaseOf = ({ lease_ms }: DriveLimitsEntry): number => Math.min(DRIVE_LEASE_MS, lease_ms);
+
 export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
-  const lease_ms = Math.max(1, Math.min(DRIVE_LEASE_MS, limits.lease_ms) - MARGIN_MS);
+  const lease_ms = Math.max(1, leaseOf(limits) - MARGIN_MS);
   return {
     v: SCHEMA_VERSION,
     session: session.name,

@@ -6,7 +6,7 @@
 
 import { DRIVE_LEASE_MS, DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, LIVE_MAX_RATE_HZ, type DriveLimitsEntry } from "../base/contract";
 import { CloudClock } from "./cloud_clock";
-import { commandOf, type Command, type Session } from "./command";
+import { commandOf, leaseOf, type Command, type Session } from "./command";
 import type { Driven, LiveMessage } from "./live_message";
 import { CENTRE, meant, type Motion, type Stick } from "./stick";
 import { inWords, TOO_LATE } from "./outcomes";
@@ -118,7 +118,7 @@ export class Driver {
     this.ticked_ms = now_ms;
     if (this.phase === "starting" || this.phase === "driving") {
       // A key may have been let go meanwhile.
-      const frozen = still_ms > this.limits.lease_ms ? `This page stood still for ${Math.round(still_ms)} ms` : "";
+      const frozen = still_ms > leaseOf(this.limits) ? `This page stood still for ${Math.round(still_ms)} ms` : "";
       const against = frozen || this.against(now_ms) || this.unanswered(now_ms);
       if (against !== "") this.end(against);
     }

@@ -66,7 +66,9 @@ export class Inputs {
   /** Where the stick is now, `seconds` after the last call. */
   read(seconds: number): Stick {
     this.byKeys = followed(this.byKeys, keyed(this.keys), seconds);
-    const gamepad = navigator.getGamepads().find((each) => each?.connected && each.mapping === "standard") ?? undefined;
+    // No browser shows gamepads to a page at http:// on another computer.
+    const gamepads = "getGamepads" in navigator ? navigator.getGamepads() : [];
+    const gamepad = gamepads.find((each) => each?.connected && each.mapping === "standard") ?? undefined;
     this.byPad = gamepad ? padded(gamepad.axes) : CENTRE;
     const pressed = SHOULDERS.some((i) => gamepad?.buttons[i]?.pressed);
     this.fresh = gamepad !== undefined && !document.hidden && document.hasFocus() && (this.fresh || !pressed);

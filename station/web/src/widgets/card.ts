@@ -17,8 +17,8 @@ export class Card {
   constructor(readonly name: string) {
     this.node = el(
       "a",
-      { class: "card", href: route({ view: "car", robot: name }), "data-robot": name },
-      el("span", { class: "card-head" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "card-name", title: name }, name), this.state.node),
+      { class: "card", href: route({ view: "car", robot: name }), "data-robot": name, title: name },
+      el("span", { class: "card-head" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "card-name" }, name), this.state.node),
     );
   }
 

@@ -116,6 +116,29 @@ class FakeGraph:
         self.closed = True
 
 
+class FakeGuard:
+    """What the guard was told, and when."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        self.clock = clock
+        self.told: list[tuple[float, float | None, bool]] = []
+        self.stops = True
+        self.left = False
+
+    def ready(self) -> bool:
+        return True
+
+    def tell(self, _topic: str, until: float | None, *, held: bool) -> bool:
+        self.told.append((self.clock.monotonic(), until, held))
+        return True
+
+    def tick(self, *, stops: bool = True) -> None:
+        self.stops = stops
+
+    def close(self, *, leave: bool = False) -> None:
+        self.left = leave
+
+
 CONFIG: dict[str, Any] = {
     "cmd": {
         "speed": {

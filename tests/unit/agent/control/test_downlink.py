@@ -11,7 +11,7 @@ from iort_agent.clock import SystemClock
 from iort_agent.common.state import ClockOffset
 from iort_agent.control.motion.stops import STOP_AHEAD_MS
 from tests.agent_fakes import ManualClock
-from tests.unit.agent.control.downlink_rig import CONFIG, LEASE_MS, T0, Rig, doubles
+from tests.unit.agent.control.downlink_rig import CONFIG, LEASE_MS, T0, FakeGuard, Rig, doubles
 
 
 def test_a_command_becomes_a_ros_message() -> None:
@@ -174,25 +174,6 @@ def test_a_lease_that_ends_stops_the_car(caplog: pytest.LogCaptureFixture) -> No
     assert rig.graph.published[-1][1] == doubles(1.0)
 
 
-class FakeGuard:
-    """What the guard was told, and when."""
-
-    def __init__(self, clock: ManualClock) -> None:
-        self.clock = clock
-        self.told: list[tuple[float, float | None, bool]] = []
-        self.stops = True
-
-    def ready(self) -> bool:
-        return True
-
-    def tell(self, _topic: str, until: float | None, *, held: bool) -> bool:
-        self.told.append((self.clock.monotonic(), until, held))
-        return True
-
-    def tick(self, *, stops: bool = True) -> None:
-        self.stops = stops
-
-
 class DyingError(Exception):
     """The agent's end."""
 
@@ -212,6 +193,11 @@ def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
     rig.send({"data": 2.5})
     rig.send({"data": 2.5}, lease_ms=STOP_AHEAD_MS + 1)
     clock.advance(0.001)
+    # Not before the stop is written, which takes another thread's time.
+    assert rig.downlink.tick() == pytest.approx(0.02)
+    assert rig.graph.published[-1] == STOP
+    assert len(guard.told) == 2
+    clock.advance(0.02)
     rig.downlink.tick()
     # A driver lets go: the guard's stop must not overtake the motion before it.
     rig.send({"data": 1.0})
@@ -219,14 +205,13 @@ def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
     rig.downlink.tick()
     rig.downlink.set_stopped(True)
     at = clock.monotonic()
-    began = at - 0.001
+    began = at - 0.021
     assert guard.told == [
         (began, pytest.approx(began + LEASE_MS / 1000), False),
         (began, pytest.approx(began + 0.001 + ahead_s), False),
         (at, None, False),
         (at, pytest.approx(at + LEASE_MS / 1000), False),
         (at, pytest.approx(at + ahead_s), False),
-        (at, None, False),
         (at, None, True),
     ]
 
@@ -275,6 +260,15 @@ def test_a_motion_whose_stop_fails_keeps_no_other_from_stopping() -> None:
     rig.graph.publish = failing  # type: ignore[method-assign]  # for ever
     rig.downlink.set_stopped(True)
     assert rig.graph.published == [(steer["topic"], STOP[1])]
+
+
+def test_the_end_of_a_lease_that_began_during_stops_is_told() -> None:
+    rig = Rig()
+    for _ in range(2):
+        rig.send({"data": 1.0}, lease_ms=STOP_AHEAD_MS + 10)
+        rig.clock.advance(0.011)
+        rig.downlink.tick()
+    assert [sample["outcome"] for sample in rig.drove] == ["accepted", "stopped"] * 2
 
 
 def test_two_names_of_one_topic_share_its_lease() -> None:

@@ -11,7 +11,8 @@ import pytest
 
 from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.errors import ConfigError
-from tests.unit.agent.control.downlink_rig import T0, Rig, doubles
+from tests.agent_fakes import ManualClock
+from tests.unit.agent.control.downlink_rig import T0, FakeGuard, Rig, doubles
 
 POSE: dict[str, Any] = {
     "cmd": {
@@ -121,6 +122,16 @@ def test_the_emergency_stop_stops_at_once_and_refuses_until_it_is_released() -> 
     rig.send({"data": 1.5}, session="cccccccc")
     assert rig.graph.published[-1] == ("/commands/motor/speed", doubles(1.5))
     assert rig.downlink.alarms() == []
+
+
+def test_an_agent_that_ends_by_itself_leaves_an_emergency_stop_to_the_guard() -> None:
+    guard = FakeGuard(ManualClock(now_us=T0))
+    rig = Rig(guard=guard)
+    rig.downlink.set_stopped(True)
+    rig.downlink.halt(keep_stop=True)
+    rig.downlink.close(keep_stop=True)
+    assert guard.left
+    assert [held for _, _, held in guard.told] == [True]
 
 
 def test_a_stopped_robot_ends_in_good_order() -> None:

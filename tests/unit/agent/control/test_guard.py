@@ -10,12 +10,14 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from iort_agent.control.motion import guard_process
 from iort_agent.control.motion.guard import Guard
+from iort_agent.control.motion.kept_stop import KeptStop
 from iort_contract.ros1.definition import parse
 from tests.agent_fakes import ManualClock
 
@@ -83,13 +85,14 @@ class Node:
     start = close = advertise
 
 
-def guarded(node: Node, monkeypatch: pytest.MonkeyPatch, *told: Any) -> None:
+def guarded(node: Node, monkeypatch: pytest.MonkeyPatch, *told: Any, queue: Path | None = None) -> None:
     """Run the guard's process in the node, for an agent that has told this and was killed."""
     lines, written = os.pipe()
     nobody, answers = os.pipe()
     os.close(nobody)
     stops = {"/speed": {"type": "std_msgs/Float64", "stop": {"data": 0.0}}}
-    for line in ({"agent": "car", "stops": stops}, *told):
+    first = {"agent": "car", "stops": stops, "queue": str(queue) if queue is not None else None}
+    for line in (first, *told):
         os.write(written, json.dumps(line).encode() + b"\n")
     os.close(written)
     monkeypatch.setattr(guard_process, "shared", lambda _name: node)
@@ -110,13 +113,15 @@ def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_w
 
 
 def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     node, looks = Node(), iter([True, True, False, True, True, True])
     monkeypatch.setattr(node, "lives", lambda _name: next(looks))
     monkeypatch.setattr(guard_process, "_LOOK_S", 0.01)
-    guarded(node, monkeypatch, ["/speed", None, True])
+    queue = tmp_path / "queue.db"
+    guarded(node, monkeypatch, ["/speed", None, True], queue=queue)
     assert next(looks, None) is None
+    assert KeptStop(queue).stopped, "the agent had no time to keep it"
 
 
 def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Mapping
 
 import pytest
 
-from iort_agent.errors import IdentityError, RefusedError
+from iort_agent.errors import BusyError, IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
+from iort_agent.verbs import provision as provision_module
 from iort_agent.verbs.provision import provision
 from iort_agent.verbs.registration import Seams, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
@@ -242,3 +244,19 @@ def test_a_lost_answer_is_not_a_refusal(claim: Path, aws: Exchange) -> None:
     aws.register = register
     assert taken_up(claim, aws) == "certificate 0"
     assert aws.waited == [1.0, 4.0]
+
+
+def test_a_renewal_waits_for_an_agent_that_is_too_busy_to_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def ask(_path: Path) -> object:
+        asked.append(1)
+        if len(asked) == 1:
+            raise BusyError("busy")
+        return SimpleNamespace(connection=SimpleNamespace(connected=True, certificate_id="new"))
+
+    monkeypatch.setattr(provision_module, "ask", ask)
+    monkeypatch.setattr(provision_module, "_LOOK_S", 0)
+    # Without a configuration it cannot connect alone, which would take the agent's connection.
+    provision_module._wait_connected(None, "new", Path("agent.sock"))  # type: ignore[arg-type]  # none
+    assert len(asked) == 2

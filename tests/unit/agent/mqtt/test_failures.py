@@ -10,11 +10,13 @@ from awscrt import mqtt5
 
 from iort_agent.identity.certificate import Validity
 from iort_agent.mqtt.failures import why_not_connected
+from iort_agent.mqtt.reconnect import Cause, Causes, Hangups
 
 NOW_S = 1_700_000_000
 GOOD = Validity(not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)
 REFUSED = mqtt5.ConnectReasonCode.NOT_AUTHORIZED
 HUNG_UP, CLOSED = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP", "AWS_IO_SOCKET_CLOSED"
+TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
 DNS = "AWS_IO_DNS_INVALID_NAME"
 
 
@@ -52,9 +54,26 @@ def test_each_failure_has_its_cause(
         client_id="car7",
         validity=lambda: validity,
         now_us=NOW_S * 1_000_000,
-        hung_up=lambda before_tls: again,
+        hung_up=lambda before_tls: Hangups(again, again and not before_tls),
     )
     assert words in cause.text
     kind, slow = expected
     assert cause.slow is slow
     assert not kind or cause[0] == kind
+
+
+def test_resets_before_tls_and_while_it_begins_are_one_cause_that_is_told_twice() -> None:
+    """A proxy without a broker resets connections; when, only its machine's load decides."""
+    causes = Causes()
+
+    def found(name: str) -> Cause:
+        return why_not_connected(
+            failed(name),
+            client_id="car7",
+            validity=lambda: GOOD,
+            now_us=NOW_S * 1_000_000,
+            hung_up=causes.hung_up,
+        )
+
+    told = [(causes.is_news(cause), cause.slow) for cause in map(found, (CLOSED, TLS_FAILED) * 3)]
+    assert told == [(True, False), (False, False), (True, False), *[(False, False)] * 3]

@@ -53,14 +53,12 @@ def test_a_cause_is_news_once() -> None:
 def test_only_disconnects_in_a_row_become_a_refusal(before_tls: bool) -> None:
     causes = Causes()
     told = [causes.hung_up(before_tls=before_tls) for _ in range(HANGUPS)]
-    assert told == [False] * (HANGUPS - 1) + [True]
+    assert told == [(False, False)] * (HANGUPS - 1) + [(True, not before_tls)]
     causes.connected()
-    assert not causes.hung_up(before_tls=before_tls)
+    assert causes.hung_up(before_tls=before_tls) == (False, False)
 
 
 def test_a_reset_that_looks_like_a_tls_failure_is_not_a_refusal() -> None:
     causes = Causes()
-    for _ in range(HANGUPS):
-        causes.hung_up(before_tls=True)
-    assert not causes.hung_up(before_tls=False)
-    assert not causes.hung_up(before_tls=True)
+    told = [causes.hung_up(before_tls=bool(i % 2)) for i in range(2 * HANGUPS)]
+    assert told == [(i + 1 >= HANGUPS, False) for i in range(2 * HANGUPS)]

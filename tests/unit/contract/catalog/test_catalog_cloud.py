@@ -12,8 +12,26 @@ from iort_contract.catalog.metrics import METRICS, ROBOT_CHARTS
 from iort_contract.catalog.rules import RULES
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import encode_ping
+from iort_contract.messages.viewing import LEASE
 from iort_contract.tables import ENVELOPE, EXPIRES_S, MESSAGE_BASE64, PING_FIELDS, RECEIVED_MS, ROBOT, TOPIC
-from iort_contract.topics import FILE, LANES, PING_PATHS, build_topic
+from iort_contract.topics import (
+    ANSWER,
+    ASK,
+    BROKER,
+    CMD,
+    FILE,
+    FLEET,
+    LAMBDA,
+    LANES,
+    LIVE,
+    PING,
+    PONG,
+    RECORD,
+    RULE,
+    SHADOW,
+    VIEW,
+    build_topic,
+)
 
 
 def matches(pattern, topic):
@@ -22,27 +40,44 @@ def matches(pattern, topic):
     return len(levels) == len(wanted) and all(map(lambda w, level: w in ("+", level), wanted, levels))
 
 
-RULE_TOPICS = {
-    "record": ("dt", "vesc"),
-    "live": ("live", "vesc"),
-    "pong": ("ping", "rule"),
-    "echo": ("ping", "lambda"),
-    "upload": ("ping", "file"),
+# By lane and name of a robot's topic: the rules that select it.
+SELECTED_BY = {
+    (RECORD, "vesc"): {"record"},
+    (LIVE, "vesc"): {"live", "fault", "battery"},
+    (PING, RULE): {"pong"},
+    (PING, LAMBDA): {"echo"},
+    (PING, FILE): {"upload"},
+    (PING, BROKER): set(),
+    **{(PONG, path): set() for path in (RULE, LAMBDA, FILE)},
+    (ASK, "calibration"): {"ask"},
+    (ANSWER, "calibration"): set(),
+    (FLEET, "pose"): set(),
+    (CMD, "stop"): set(),
+    (VIEW, LEASE): set(),
 }
 
 
-@pytest.mark.parametrize("rule", RULE_TOPICS)
 @pytest.mark.parametrize("namespace", ["iort", "stage2"])
-def test_a_rule_selects_exactly_its_own_topics(rule, namespace):
-    sql = RULES[rule].statement(namespace)
-    [pattern] = re.findall(r"FROM '([^']*)'", sql)
-    assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
-    every = [(lane, name) for lane in LANES for name in ("vesc", FILE, *PING_PATHS)]
-    heard = {pair for pair in every if matches(pattern, build_topic(pair[0], "car", pair[1], namespace))}
-    lane, name = RULE_TOPICS[rule]
-    expected = {(lane, name)} if lane == "ping" else {pair for pair in every if pair[0] == lane}
-    assert heard == expected
-    assert not matches(pattern, build_topic(lane, "car", name, "other"))
+def test_a_topic_is_selected_by_exactly_its_rules(namespace):
+    patterns = {
+        name: re.findall(r"FROM '([^']*)'", rule.statement(namespace))[0] for name, rule in RULES.items()
+    }
+    expected = {
+        **{build_topic(lane, "car", name, namespace): rules for (lane, name), rules in SELECTED_BY.items()},
+        **{build_topic(lane, "car", name, "other"): set() for lane, name in SELECTED_BY},
+        "$aws/events/presence/connected/car": {"presence"},
+        "$aws/events/presence/disconnected/car": {"presence"},
+        f"$aws/things/car/shadow/name/{SHADOW}/update/accepted": {"version"},
+        f"$aws/things/car/shadow/name/{SHADOW}/update/documents": set(),
+        "$aws/things/car/shadow/update/accepted": set(),
+    }
+    assert {lane for lane, _ in SELECTED_BY} == set(LANES)
+    for topic, rules in expected.items():
+        assert {rule for rule, pattern in patterns.items() if matches(pattern, topic)} == rules, topic
+
+
+def test_a_pong_goes_to_the_topic_on_which_the_robot_hears_it():
+    assert RULES["pong"].action.topic("iort").replace("${topic(3)}", "car") == build_topic(PONG, "car", RULE)
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -168,7 +168,25 @@ def test_old_samples_and_a_long_round_trip_are_refused() -> None:
 
 
 def test_a_terminals_arrows_and_letters_are_keys() -> None:
-    assert keys_of("wW\x1b[A\x1bOD \x1b[C\x1b") == ["w", "w", "up", "left", " ", "right", "\x1b"]
+    assert keys_of("wW\x1b[A\x1bOD \x1b[C\x1b") == (["w", "w", "up", "left", " ", "right"], "\x1b")
+
+
+def test_no_other_key_is_taken_for_the_letters_of_its_sequence() -> None:
+    # F4, Shift and left, delete, and an arrow whose end has not come yet.
+    assert keys_of("\x1bOS\x1b[1;2D\x1b[3~\x1b[") == (["\x1b"] * 3, "\x1b[")
+
+
+def test_keys_that_waited_for_the_network_move_nothing_until_they_fail_to_come() -> None:
+    keys, wait_us = Keys(), NEXT_US - 1
+    burst, _ = keys_of("w" * 40)
+    for came in (burst, burst[:3], ["w"]):
+        wait_us += NEXT_US - 1
+        keys.arrived(came, wait_us)
+        assert all(keys.press(key, wait_us) for key in came)
+        assert keys.late(wait_us)
+        assert not keys.held(wait_us)
+    keys.press("w", wait_us + NEXT_US)
+    assert keys.held(wait_us + NEXT_US)
 
 
 def test_a_key_holds_the_stick_until_its_repetitions_fail_to_come() -> None:

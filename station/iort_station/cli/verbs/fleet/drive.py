@@ -98,7 +98,7 @@ class _Seat:
 
     def __init__(self, cloud: Cloud, robot: str, driver: Driver) -> None:
         self._cloud, self._robot, self._driver = cloud, robot, driver
-        self._keys = Keys()
+        self._keys, self._begun = Keys(), ""
         self._heard: queue.SimpleQueue[tuple[str, bytes, int]] = queue.SimpleQueue()
         self._topic = build_topic(CMD, robot, driver.limits.command, cloud.namespace)
         self._lease = encode_lease(Lease(secrets.token_hex(8), LIVE_MAX_RATE_HZ, VIEW_LEASE_MS, broker=True))
@@ -139,7 +139,9 @@ class _Seat:
         text = os.read(sys.stdin.fileno(), 1024).decode(errors="replace") if readable else ""
         if readable and not text:
             return False  # the terminal has closed
-        for key in keys_of(text):
+        keys, self._begun = keys_of(self._begun + text)
+        self._keys.arrived(keys, _now_us())
+        for key in keys:
             if key == "q":
                 return False
             self._press(key, _now_us())
@@ -197,7 +199,8 @@ class _Seat:
         stick = driver.stick if driver.phase is Phase.DRIVING else None
         speed = f"{stick.speed * driver.top_mps:+.2f}" if stick else "0"
         steering = f"{stick.steering * driver.limits.max_steering_rad:+.2f}" if stick else "0"
-        rows.add_row(self._robot, _state(driver))
+        late = self._keys.late(now_us)
+        rows.add_row(self._robot, Text("let go: the keys came late", style="red") if late else _state(driver))
         rows.add_row(
             "speed",
             f"{speed} m/s of {driver.top_mps:.2f}; the car's limit is {driver.limits.max_speed_mps:g}",
