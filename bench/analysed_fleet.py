@@ -11,7 +11,6 @@ processes, with their imports. Exit status 1 if a drive was not analysed.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from rich.console import Console
 
 from bench.command import made, parser, progress, steps, write
 from bench.errors import BenchError
+from bench.meters import usage
 from bench.proof.cars import drive_of
 from bench.proof.speed import HOUR_S
 from bench.proof.stored import stored
@@ -145,21 +145,17 @@ def _without_lambda_2(cloud: Cloud) -> None:
 def _cpu_s(embedded: EmbeddedCloud) -> dict[str, float]:
     """The processor time of the functions' processes so far."""
     spent = dict.fromkeys(_FUNCTIONS, 0.0)
-    for name, process in _workers(embedded):
-        # A process may end meanwhile.
-        with suppress(OSError):
-            fields = (process / "stat").read_text().rpartition(")")[2].split()
-            spent[name] += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    for name, pid in _workers(embedded):
+        spent[name] += usage.of(pid).cpu_s
     return spent
 
 
-def _workers(embedded: EmbeddedCloud) -> Iterator[tuple[str, Path]]:
-    for process in Path("/proc").glob("[0-9]*"):
+def _workers(embedded: EmbeddedCloud) -> Iterator[tuple[str, int]]:
+    for pid in usage.descendants(embedded.emulator.pid):
+        # A process may end meanwhile.
         with suppress(OSError):
-            command = (process / "cmdline").read_bytes().decode(errors="replace")
-            for name in _FUNCTIONS:
-                if str(embedded.folder) in command and f"-analysis-{name}" in command:
-                    yield name, process
+            command = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
+            yield from ((name, pid) for name in _FUNCTIONS if f"-analysis-{name}" in command)
 
 
 if __name__ == "__main__":

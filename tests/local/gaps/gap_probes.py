@@ -20,6 +20,8 @@ from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
 from ministack.services import cloudwatch_logs, dynamodb, iot, iot_data, lambda_svc, sqs
 
+from tests.waiting import GUARD_S
+
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",
     "POST",
@@ -237,7 +239,7 @@ def log_levels() -> bool:
             capture_output=True,
             text=True,
             check=True,
-            timeout=60,
+            timeout=GUARD_S,
         )
     return "[WARNING]" not in done.stderr
 

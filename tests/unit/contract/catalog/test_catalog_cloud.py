@@ -76,10 +76,6 @@ def test_a_topic_is_selected_by_exactly_its_rules(namespace):
         assert {rule for rule, pattern in patterns.items() if matches(pattern, topic)} == rules, topic
 
 
-def test_a_pong_goes_to_the_topic_on_which_the_robot_hears_it():
-    assert RULES["pong"].action.topic("iort").replace("${topic(3)}", "car") == build_topic(PONG, "car", RULE)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_a_message_cannot_overwrite_a_key_that_the_cloud_adds(rule):
     sql = RULES[rule].statement()
