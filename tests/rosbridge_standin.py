@@ -81,21 +81,23 @@ class RosbridgeStandin:
             return [op for op in self.operations if wanted.items() <= op.items()]
 
         with self._changed:
-            assert self._changed.wait_for(lambda: len(matching()) >= count, 60), self.operations
+            assert self._changed.wait_for(lambda: len(matching()) >= count, 120), self.operations
             return matching()[count - 1]
 
-    def publish(self, topic: str, message: Any, *, latch: str | None = None) -> None:
-        """Publish in the graph; ``latch`` names a publisher that keeps it for later subscribers."""
+    def publish(self, topic: str, message: Any, *, latch: str | None = None) -> bool:
+        """Publish in the graph; ``latch`` names a publisher that keeps it for later subscribers. Return
+        whether a client was connected that subscribes to it.
+        """
         text = json.dumps({"op": "publish", "topic": topic, "msg": message})
         if latch is not None:
             self._latched.setdefault(topic, {})[latch] = text
-        self._do(self._deliver(topic, text))
+        return bool(self._do(self._deliver(topic, text)))
 
     def send(self, text: str) -> None:
         """Send to every client."""
 
         async def to_all() -> None:
-            for client in self._clients:
+            for client in list(self._clients):
                 await client.send_str(text)
 
         self._do(to_all())
@@ -113,8 +115,8 @@ class RosbridgeStandin:
 
         self._do(abort())
 
-    def _do(self, what: Any) -> None:
-        asyncio.run_coroutine_threadsafe(what, self._loop).result(60)
+    def _do(self, what: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(what, self._loop).result(60)
 
     def _run(self, ready: threading.Event) -> None:
         asyncio.run(self._serve(ready))
@@ -187,12 +189,19 @@ class RosbridgeStandin:
         if not any(topic in topics for topics in self._clients.values()):
             self._subscribers.pop(topic, None)
 
-    async def _deliver(self, topic: str, text: str) -> None:
+    async def _deliver(self, topic: str, text: str) -> bool:
         if self._subscribers.get(topic) != self._master:
-            return
-        for client, topics in self._clients.items():
-            if topic in topics and topics[topic].lets_through():
-                await client.send_str(text)
+            return False
+        heard = False
+        # Clients come and go while one of them is sent to.
+        for client, topics in list(self._clients.items()):
+            if topic not in topics:
+                continue
+            with contextlib.suppress(ConnectionResetError):
+                if topics[topic].lets_through():
+                    await client.send_str(text)
+                heard = True
+        return heard
 
     def _call(self, operation: dict[str, Any]) -> dict[str, Any]:
         service = operation["service"]

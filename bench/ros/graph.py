@@ -20,7 +20,7 @@ SYSTEM_PYTHON = "/usr/bin/python3"
 # The packages of the checkout that a node imports; the Python with rospy has none of them installed.
 PYTHONPATH = os.pathsep.join(str(ROOT / folder) for folder in ("", "contract", "device"))
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
-_START_S = 20.0
+_START_S = 120.0
 
 
 class RosError(BenchError):

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from bench.report.result import NOT_MEASURED, Section
 from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import MIXED, topics
 from bench.target import Say, Target
+from iort_agent.errors import AgentError
+from iort_agent.status.server import SOCKET, fetch
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import LIVE, RECORD, parse_topic
 
@@ -124,6 +127,7 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
             result.published.update(json.loads(publisher.finish()))
         ended = time.monotonic()
         say("waiting for what is under way")
+        _await_received(car.parent / SOCKET, result.published)
         _finish(processes[RECORDER], signal.SIGINT)
         _finish(processes[AGENT], signal.SIGTERM)
         # The agent's last messages are on their way from the broker to the watcher.
@@ -144,6 +148,17 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
 def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, usage.Usage]:
     # `rosbag` is a script that has started the recorder.
     return {who: usage.of(one.pid) + usage.below(one.pid) for who, one in processes.items()}
+
+
+def _await_received(socket: Path, published: Mapping[str, int]) -> None:
+    """Wait until the agent has received all messages, or for so long that some must be lost."""
+    until, streams = time.monotonic() + _CATCH_UP_S, {one.name: one.stream for one in topics().values()}
+    while time.monotonic() < until:
+        with suppress(AgentError):  # it is too busy to answer
+            received = fetch(socket)["streams"]
+            if all(received[streams[name]]["samples"] >= count for name, count in published.items()):
+                return
+        time.sleep(0.2)  # the agent gives no notice
 
 
 def _finish(process: subprocess.Popen[str], number: signal.Signals) -> None:

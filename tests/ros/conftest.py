@@ -114,12 +114,16 @@ class Process:
         return self.lines
 
     def wait(self) -> None:
-        """Wait until it ends by itself."""
-        assert self._process.wait(WAIT_S) == 0, "\n".join(self.errors[-25:])
+        """Wait until it ends by itself, without error."""
+        assert self.ended() == 0, "\n".join(self.errors[-25:])
 
     def terminate(self) -> int:
         """End it as a supervisor does; return its status."""
         self._process.terminate()
+        return self.ended()
+
+    def ended(self) -> int:
+        """Wait until it ends by itself; return its status."""
         status = self._process.wait(WAIT_S)
         for reader in self._readers:
             reader.join(WAIT_S)

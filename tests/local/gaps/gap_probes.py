@@ -20,6 +20,8 @@ from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
 from ministack.services import cloudwatch_logs, dynamodb, iot, iot_data, lambda_svc, sqs
 
+from tests.waiting import GUARD_S
+
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",
     "POST",
@@ -67,6 +69,13 @@ SHADOW_ARN_REQUEST: tuple[Any, ...] = (
 def shadow_arn() -> bool:
     """Ask for a request's resource."""
     return not iam_actions.extract_resource_arn(*SHADOW_ARN_REQUEST).endswith(":thing/car/one")
+
+
+def policy_target() -> bool:
+    """Ask for a request's resource."""
+    body = b'{"target": "arn:aws:iot:r:0:cert/1"}'
+    request = ("iot", "PUT", "/target-policies/robot", {}, body, {}, "r", "0")
+    return iam_actions.extract_resource_arn(*request) == "*"
 
 
 def connect_timeout() -> bool:
@@ -230,7 +239,7 @@ def log_levels() -> bool:
             capture_output=True,
             text=True,
             check=True,
-            timeout=60,
+            timeout=GUARD_S,
         )
     return "[WARNING]" not in done.stderr
 

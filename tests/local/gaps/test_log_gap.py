@@ -13,6 +13,7 @@ from ministack.core import lambda_runtime
 from ministack.services import lambda_svc
 
 from local.gaps.functions import log_end, log_retention
+from tests.waiting import GUARD_S
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def test_the_worker_marks_the_end_of_each_invocations_log(installed, tmp_path):
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=GUARD_S,
     )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert [answer.get("result") for answer in answers] == [None, "one", "", "two"]
@@ -55,7 +56,7 @@ def test_each_log_record_has_a_level(installed, tmp_path):
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=GUARD_S,
     )
     lines = [line.split("\t") for line in done.stderr.splitlines()]
     assert [(line[0], line[-1]) for line in lines[:2]] == [("[INFO]", "fine"), ("[WARNING]", "not so good")]

@@ -8,6 +8,8 @@ import urllib.request
 
 import pytest
 
+from tests.waiting import GUARD_S
+
 
 @pytest.mark.parametrize(
     "asked",
@@ -24,4 +26,4 @@ def test_nobody_erases_or_reads_a_cloud_without_a_signature(embedded, asked):
     request = urllib.request.Request(f"{embedded.cloud.endpoint_url}{path}", method=method)
     context = ssl.create_default_context(cafile=embedded.cloud.ca_bundle)
     with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(request, context=context, timeout=10)
+        urllib.request.urlopen(request, context=context, timeout=GUARD_S)

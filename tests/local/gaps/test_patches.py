@@ -15,6 +15,7 @@ from local.deployment import ROOT
 from local.emulator import patched
 from local.errors import LocalError
 from tests.local.gaps import gap_probes
+from tests.waiting import GUARD_S
 
 PATCHES = [patch.stem for patch in patched.PATCHES]
 HEAD = re.compile(
@@ -25,6 +26,7 @@ HEAD = re.compile(
 ASK = """
 import json, sys
 from tests.local.gaps import gap_probes
+from tests.waiting import GUARD_S
 print(json.dumps({name: bool(getattr(gap_probes, name)()) for name in sys.argv[1:]}))
 """
 
@@ -34,7 +36,7 @@ def lacking(*folders):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
     command = [sys.executable, "-c", ASK, *PATCHES]
     done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=120
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=GUARD_S
     )
     assert done.returncode == 0, done.stderr
     return {name for name, lacks in json.loads(done.stdout.splitlines()[-1]).items() if lacks}

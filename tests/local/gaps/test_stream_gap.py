@@ -18,6 +18,7 @@ from local.keeping import queues
 from local.keeping.ledger import LedgerError
 from tests.local.gaps import series_table
 from tests.local.keeping.in_process import ACCOUNT, REGION, kept
+from tests.waiting import GUARD_S
 
 QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
 
@@ -86,7 +87,7 @@ class Cloud:
             assert dynamodb._put_item({"TableName": "gap", "Item": item})[0] == 200
 
     def poll_until(self, condition):
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + GUARD_S
         while not condition():
             assert time.monotonic() < deadline, self.seen
             if not self.mappings.poll():

@@ -26,6 +26,7 @@ from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
 from local.up import service
 from local.up.down import stop
+from tests.waiting import GUARD_S
 
 
 @pytest.fixture
@@ -269,7 +270,7 @@ def test_a_full_disk_shortens_a_log_all_the_same(tmp_path):
 
 def test_a_page_at_an_ipv6_address_needs_a_name_that_a_browsers_policy_can_have(tmp_path):
     up = [sys.executable, "-m", "local.up.run", "--state", str(tmp_path / "cloud"), "--page", "::1"]
-    done = subprocess.run(up, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(up, cwd=ROOT, capture_output=True, text=True, timeout=GUARD_S, check=False)
     assert (done.returncode, done.stderr) == (
         1,
         "up: PAGE must have a name after an IPv6 address, such as PAGE=::1,iort.lab\n",

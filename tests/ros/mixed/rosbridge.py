@@ -49,10 +49,7 @@ class GraphServer(RosbridgeStandin):
             for line in lines:
                 name, content = line.split(" ")
                 topic, data = TOPICS[name], base64.b64decode(content)
-                heard = name in self._subscribers
-                try:
-                    self.publish(name, as_json(topic.message, data), latch="/base" if topic.latched else None)
-                except ConnectionResetError:
-                    heard = False  # its client has just left
+                latch = "/base" if topic.latched else None
+                heard = self.publish(name, as_json(topic.message, data), latch=latch)
                 if not heard and not topic.latched:
                     self.unheard[name].append(data)

@@ -8,6 +8,8 @@ import time
 import roslib.message
 import rospy
 
+from iort_agent.ros1 import connecting
+
 
 def say(line: str) -> None:
     """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
@@ -22,6 +24,7 @@ def plain(value):
 
 
 name, topic, kind = sys.argv[1:4]
+connecting.mend(f"/{name}")
 rospy.init_node(name, disable_signals=True)
 subscriber = rospy.Subscriber(
     topic,

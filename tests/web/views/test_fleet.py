@@ -75,7 +75,7 @@ def test_cars_that_are_not_heard_are_listed_until_they_send(
 def test_an_offline_car_is_told_from_an_unknown_one(open_page: Callable[..., Page], served: str) -> None:
     page = open_page(f"{served}#/car/car-2", timezone_id="UTC")
     until(lambda: page.inner_text("#empty-title") == "car-2 is offline", "the car's state")
-    assert "since Tue 14 Nov 22:13:20 UTC" in page.inner_text("#empty")
+    assert "Offline since Tue 14 Nov 22:13:20 UTC. It appears" in page.inner_text("#empty")
     assert page.get_by_role("link", name="What it did before").is_visible()
     page.goto(f"{served}#/car/car-22")
     until(lambda: page.inner_text("#empty-title") == "There is no car car-22", "the refusal")

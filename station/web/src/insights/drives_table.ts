@@ -32,8 +32,8 @@ function row(drive: DriveEntry, named: boolean, chosen: boolean): HTMLElement {
     ...(named ? [el("th", { scope: "row" }, el("a", { href: route({ view: "insights", robot }) }, robot))] : []),
     el("td", {}, at),
     el("td", {}, age(to - from)),
-    el("td", {}, number(samples)),
-    el("td", {}, repaired.join(", ") || "none"),
+    el("td", { "data-head": "samples" }, number(samples)),
+    el("td", { "data-head": "repaired" }, repaired.join(", ") || "none"),
     el("td", failed === "" ? {} : { class: "words" }, result),
   );
 }

@@ -56,7 +56,7 @@ async function answered(address: string, request: RequestInit): Promise<Response
     answer = await fetch(address, request);
   } catch (error) {
     if (request.signal?.aborted) throw error;
-    throw new AnswerError("The page's server does not answer. Is `iort dashboard` still running?");
+    throw new AnswerError("The page's server does not answer. Is it still running?");
   }
   if (answer.ok) return answer;
   const body = (await answer.json().catch(() => ({}))) as { error?: unknown };

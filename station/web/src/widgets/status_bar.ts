@@ -73,7 +73,7 @@ export class StatusBar {
     let words = "";
     let detail = "";
     if (link.kind === "lost") {
-      words = `Connection lost: ${link.reason}.`;
+      words = `Connection lost: ${link.reason}${/[.?]$/.test(link.reason) ? "" : "."}`;
       const wait = link.retryAt - at;
       detail = `${age(at - link.since)} ago. ${wait > 0.5 ? `Trying again in ${Math.ceil(wait)} s` : "Trying again now"}.`;
     } else if (this.reconnected && at - this.reconnected.at < ANNOUNCE_S) {

@@ -2,6 +2,7 @@
 
 import type { Config } from "../base/contract";
 import { byId, byName } from "../base/dom";
+import { capital } from "../base/format";
 import { route } from "../base/route";
 import type { Registry } from "../live/registry";
 import { presence } from "./offline_cars";
@@ -22,7 +23,7 @@ export class Waiting {
     const off = known && !known.online ? known : undefined;
     const comes = "It appears here with its first live message.";
     write("empty-title", unknown ? `There is no car ${robot}` : off ? `${robot} is offline` : `Waiting for ${robot ?? "a car"}`);
-    write("empty-text", unknown ? registered(Object.keys(robots)) : known ? `It is ${presence(known)}. ${comes}` : comes);
+    write("empty-text", unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes);
     byId("empty-listening").hidden = unknown || off !== undefined;
     const past = byId("empty-past");
     past.hidden = robot === undefined || unknown || !this.config.answers;
