@@ -29,7 +29,7 @@ class Hours(NamedTuple):
 def copy(source: Cloud, target: Cloud, topic: str) -> Hours:
     """Copy the hours that the target lacks; the manifest's row comes last.
 
-    An hour that both have is made by each from its own table; `compare` tells if one lacks something.
+    An hour that both have stays as it is: `iort_station.moving.recorded.merge` copies what the target lacks.
     """
     there = {row.hour for row in Archive(target, topic).rows()}
     copied = left = 0

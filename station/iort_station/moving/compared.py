@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from iort_contract.archive import content_hash, item_hash
+from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
@@ -77,7 +77,7 @@ def compare(
 
 
 def _batches(cloud: Cloud, robot: str, stream: str, progress: BatchProgress) -> Iterator[_Batch]:
-    attributes = tuple({*ENVELOPE, *HEADER})
+    attributes = tuple({*ENVELOPE, *HEADER, HASH})
     for items in Recorded(cloud, robot, stream).items(starting_between(None, None), attributes):
         progress(len(items))
         for item in items:

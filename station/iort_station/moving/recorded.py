@@ -9,10 +9,12 @@ from iort_analysis.samples.batches import Item
 from iort_contract.dynamodb import WRITE_ITEMS, Keys
 from iort_contract.tables import BATCH, EXPIRES_S
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import key_of
+from iort_station.data.stored.archive import Archive, HourFile, is_expiring, key_of
 from iort_station.data.stored.batches import ahead, telemetry_table
 from iort_station.recordings.adopt import UNITS_PER_S, write
 
+# The target's archive finds a batch within a day, by a sweep.
+_MERGED_S = 30 * 86_400
 # Receives the number of batches read.
 BatchProgress = Callable[[int], None]
 
@@ -36,6 +38,34 @@ def copy(
             write(table, new[start : start + WRITE_ITEMS], units_per_s)
         batches += len(new)
         progress(len(items))
+    return batches
+
+
+def merge(
+    source: Cloud,
+    target: Cloud,
+    topic: str,
+    *,
+    units_per_s: int = UNITS_PER_S,
+    progress: BatchProgress = lambda _batches: None,
+) -> int:
+    """Copy what only the source's archive still has of hours that both have archived, into the target's
+    table, from where its own archive takes it up; returns the number of batches."""
+    ours, theirs = Archive(source, topic), Archive(target, topic)
+    there = {row.hour: row for row in theirs.rows()}
+    table, batches = telemetry_table(target), 0
+    for row in ours.rows():
+        their = there.get(row.hour)
+        if their is None or their.content == row.content or not is_expiring(row):
+            continue
+        known = set(theirs.read(their, HourFile.ids))
+        old = [item for item in ours.read(row, HourFile.items) if key_of(item) not in known]
+        expires = {EXPIRES_S: {"N": str(int(time.time()) + _MERGED_S)}}
+        new = [{**item, **expires} for item in _lacking(target, topic, old)]
+        for start in range(0, len(new), WRITE_ITEMS):
+            write(table, new[start : start + WRITE_ITEMS], units_per_s)
+        batches += len(new)
+        progress(row.batches)
     return batches
 
 

@@ -39,6 +39,7 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data.analysis import notes
+from iort_station.data.stored.archive import Archive
 from iort_station.data.stored.batches import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry, robots, tags
@@ -194,6 +195,31 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     telemetry_table(target).put([{**late, "samples": items[0]["samples"]}])
     exit_code, told = moved("--dry-run")
     assert (exit_code, told["problem"]) == (1, "1 batches have another content in the target")
+
+
+def test_an_hour_that_both_have_archived_is_merged(
+    embedded: EmbeddedCloud, other: EmbeddedCloud, movers: tuple[Side, Side], tmp_path: Path
+) -> None:
+    robot = "parted"
+    robots.add(embedded.cloud, robot, out=tmp_path)
+    for cloud, first in ((embedded.cloud, 0), (other.cloud, 1)):
+        # In the archive alone, as after the retention.
+        items, topic = stored(cloud, robot)[first : first + 2], topic_of(cloud, robot, STREAM)
+        telemetry_table(cloud).put(items)
+        archive.run(cloud, topic)
+        archive.wait(cloud, lambda _left: None)
+        for item in items:
+            key = {name: item[name] for name in (TOPIC, BATCH)}
+            table = cloud.output("storage", "TelemetryTable")
+            cloud.client("dynamodb").delete_item(TableName=table, Key=key)
+    for copied in (1, 0):
+        done = iort(movers[0], "move", robot, "--to", str(movers[1].folder), "--json", "--same-robots")
+        (told,) = [one for one in json.loads(done.stdout)["streams"] if one["stream"] == STREAM]
+        assert (done.exit_code, told["problem"], told["copied_batches"], told["more"]) == (0, "", copied, 1)
+    # By its hash the batch is the archived one, though it may be compressed in another way.
+    archive.run(other.cloud, topic)
+    archive.wait(other.cloud, lambda _left: None)
+    assert [row.batches for row in Archive(other.cloud, topic).rows()] == [3]
 
 
 def test_a_robot_moves_with_everything_that_is_known_of_it(

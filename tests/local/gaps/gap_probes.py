@@ -71,6 +71,13 @@ def shadow_arn() -> bool:
     return not iam_actions.extract_resource_arn(*SHADOW_ARN_REQUEST).endswith(":thing/car/one")
 
 
+def policy_target() -> bool:
+    """Ask for a request's resource."""
+    body = b'{"target": "arn:aws:iot:r:0:cert/1"}'
+    request = ("iot", "PUT", "/target-policies/robot", {}, body, {}, "r", "0")
+    return iam_actions.extract_resource_arn(*request) == "*"
+
+
 def connect_timeout() -> bool:
     """Read the source for a time limit: no finite wait shows that a connection would stay for ever."""
     source = inspect.getsource(iot._mtls_serve_conn) + inspect.getsource(iot._MtlsAcceptor)

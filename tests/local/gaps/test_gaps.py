@@ -103,6 +103,12 @@ def test_a_named_shadow_request_names_its_shadow():
         assert iam_actions.extract_resource_arn(*request) == f"arn:aws:iot:r:0:{found}"
 
 
+def test_a_request_to_attach_a_policy_names_its_target():
+    for body, found in ((b'{"target": "arn:aws:iot:r:0:cert/1"}', "arn:aws:iot:r:0:cert/1"), (b"{}", "*")):
+        request = ("iot", "PUT", "/target-policies/robot", {}, body, {}, "r", "0")
+        assert iam_actions.extract_resource_arn(*request) == found
+
+
 def test_floor_rounds_down_in_a_rule():
     evaluate = iot._eval_select_function
     assert evaluate("floor", ["3.7"], "", b"", {}) == 3

@@ -84,11 +84,6 @@ class CloudClock:
         """Take the cloud's time at which the car took a command that left here."""
         self._most.append(taken_us - left_us)
 
-    def forget(self) -> None:
-        """Forget all: it was wrong."""
-        self._least.clear()
-        self._most.clear()
-
     def offset_us(self) -> int | None:
         """The cloud's time minus this clock's; None before the first message."""
         if not self._least:

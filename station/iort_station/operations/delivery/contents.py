@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from iort_contract.archive import content_hash, item_hash
+from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
@@ -19,7 +19,7 @@ def hashes(
 ) -> dict[str, str]:
     """For each run, the hash over its batches that start between two times, wherever they are stored."""
     found: dict[str, list[tuple[str, str]]] = {}
-    for items in Recorded(cloud, robot, stream).items(starting_between(first_us, last_us), ENVELOPE):
+    for items in Recorded(cloud, robot, stream).items(starting_between(first_us, last_us), (*ENVELOPE, HASH)):
         for item in items:
             key = key_of(item)
             with suppress(ContractError):

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,8 +23,9 @@ from iort_contract.messages.analysis.findings import Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
+from iort_station.data.stored.archive import HourFile
 from iort_station.errors import StationError
-from iort_station.moving import archived, plan, written
+from iort_station.moving import archived, plan, recorded, written
 from tests.unit.analysis.archive.test_archive import batch_at, item_of
 from tests.unit.analysis.archive.test_archive import written as written_hour
 from tests.unit.contract.messages.test_findings import FINDING
@@ -132,6 +135,48 @@ def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
     other.content[hour.key] = b"being written"
     assert archived.copy(source, other, TOPIC) == (0, 1)
     assert other.content[hour.key] == b"being written"
+
+
+def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: pytest.MonkeyPatch) -> None:
+    hour = parse_hour("2026-11-22T07")
+    items = [item_of(batch_at(hour, minute, {"speed": [float(minute)] * 3})) for minute in range(3)]
+    row = ArchivedHour(TOPIC, str(hour), DAY, 2, 6, 0, "source", "", 1, 0, 0)
+    rows = {"source": [row], "target": [replace(row, content="target")]}
+    has = {"source": items[:2], "target": items[1:]}
+    table = []
+
+    class Hours:
+        def __init__(self, side: str, _topic: str) -> None:
+            self._side = side
+
+        def rows(self) -> list[ArchivedHour]:
+            return rows[self._side]
+
+        def read(self, _row: ArchivedHour, use: Any) -> list[Any]:
+            return (
+                has[self._side] if use is HourFile.items else [one["batch"]["S"] for one in has[self._side]]
+            )
+
+    class Table:
+        def pages(self, *_keys: Any, attributes: Any) -> list[Any]:
+            return [SimpleNamespace(items=table)]
+
+        def put(self, new: list[Any]) -> None:
+            table.extend(new)
+
+    monkeypatch.setattr(recorded, "Archive", Hours)
+    monkeypatch.setattr(recorded, "telemetry_table", lambda _side: Table())
+    sides: Any = "source", "target"
+    assert [recorded.merge(*sides, TOPIC) for _ in range(2)] == [1, 0]
+    (copied,) = table
+    expires_s = int(copied.pop("expires_s")["N"])
+    assert copied == {name: value for name, value in items[0].items() if name != "expires_s"}
+    assert expires_s > time.time() + 29 * 86_400
+    table.clear()
+    # The source's table has all of it, which is copied from there; or the hours are the same.
+    for same in ({"first_expires_s": int(time.time()) + 10 * 86_400}, {"content": "target"}):
+        rows["source"] = [replace(row, **same)]
+        assert recorded.merge(*sides, TOPIC) == 0
 
 
 def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:

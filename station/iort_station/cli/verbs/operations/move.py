@@ -157,7 +157,8 @@ class _Moving:
             if self._units is not None:
                 # Before the batches, which the target's archive adds to these hours.
                 hours = archived.copy(source, target, topic)
-                batches = recorded.copy(source, target, topic, units_per_s=self._units, progress=read.tell)
+                for copy in (recorded.copy, recorded.merge):
+                    batches += copy(source, target, topic, units_per_s=self._units, progress=read.tell)
             found = compared.compare(source, target, robot, stream, read.tell)
         if not found.batches and not hours.left:
             return
