@@ -13,7 +13,7 @@ from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.browser import drawn, show, until
 from tests.web.cars import SUBSCRIBE_KEY, Car
-from tests.web.lab import Lab
+from tests.web.lab import NOW_S, Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -209,12 +209,12 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         # Only what the fleet's stop has stopped.
         page.get_by_role("button", name="Really release car-9: it may move").click()
         until(lambda: words.inner_text().startswith(stands), "the release of car-9")
-        assert lab.asked[-1] == {"stopped": "false"}
+        assert lab.asked[-1] == {"stopped": "false", "seen_ms": str(round(NOW_S * 1000))}
         page.goto(f"{server.url}#/car/car-1")
         page.get_by_role("button", name="Release car-1").click()
         page.get_by_role("button", name="Really release car-1").click()
         until(lambda: not words.is_visible(), "the release")
-    assert lab.asked[-1] == {"stopped": "false", "robot": "car-1"}
+    assert lab.asked[-1] == {"stopped": "false", "robot": "car-1", "seen_ms": str(round(NOW_S * 1000))}
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     page.get_by_text("The page's server does not answer: nobody can be stopped here").wait_for()
 

@@ -57,6 +57,11 @@ class StopNotes(NamedTuple):
     fleet: Pressed | None = None
     released: Pressed | None = None
 
+    @property
+    def newest(self) -> Pressed | None:
+        """The newest of the stops."""
+        return max(filter(None, (self.robot, self.fleet)), key=lambda one: one.t_ms, default=None)
+
 
 @dataclass(frozen=True)
 class Desired:

@@ -52,29 +52,32 @@ def stop(cloud: Cloud, robots: Iterable[str], *, by: str, fleet: bool = False) -
     """Stop robots without waiting for them; `motion` tells what they have confirmed.
 
     Robots that are not connected stop before they take a command. Every robot is tried. Returns why, for
-    each one for which it failed. ``by`` is who stops them; ``fleet`` is a stop that `release_fleet` ends.
-    Raises `StationError` for a robot that is not registered, before any is tried.
+    each one for which it failed. ``by`` is who stops them; ``fleet`` is a stop that the release of the fleet
+    ends. Raises `StationError` for a robot that is not registered, before any is tried.
     """
     change = encode_stop(_pressed(by), fleet=fleet)
     return _changed(cloud, robots, lambda robot: _change(cloud, robot, change))
 
 
-def release(cloud: Cloud, robots: Iterable[str], *, by: str) -> dict[str, str]:
-    """Release robots, however they were stopped; as `stop`."""
-    change = encode_release(_pressed(by))
-    return _changed(cloud, robots, lambda robot: _change(cloud, robot, change))
+def release(
+    cloud: Cloud, robots: Iterable[str], *, by: str, fleet: bool = False, seen_ms: int | None = None
+) -> dict[str, str]:
+    """Release robots, however they were stopped; with ``fleet`` those that a stop of the fleet has stopped
+    and nobody has stopped alone; as `stop`.
 
-
-def release_fleet(cloud: Cloud, robots: Iterable[str], *, by: str) -> dict[str, str]:
-    """Release the robots that a stop of the fleet has stopped, and leave those that were stopped alone; as
-    `stop`."""
+    ``seen_ms`` is the time of the newest stop that who releases knows of: one that was stopped again since
+    then stays. None releases it in any case.
+    """
     released = encode_release(_pressed(by))
 
     def change(robot: str) -> None:
         state = read(cloud.client("iot-data"), robot)
-        if state.desired.stops.fleet is not None:
+        stop = state.desired.stops.newest
+        if seen_ms is not None and stop is not None and stop.t_ms > seen_ms:
+            raise StationError(f"{stop.by} has stopped it again since")
+        if not fleet or state.desired.stops.fleet is not None:
             # With the version, so that a stop which somebody asks for at this moment is not lost.
-            alone = state.desired.stopped_alone
+            alone = fleet and state.desired.stopped_alone
             _change(cloud, robot, encode_fleet_released() if alone else released, version=state.version)
 
     return _changed(cloud, robots, change)
@@ -111,7 +114,7 @@ def _changed(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None])
     def tried(robot: str) -> str:
         try:
             change(robot)
-        except (BotoCoreError, ClientError) as error:
+        except (BotoCoreError, ClientError, StationError) as error:
             return str(error)
         return ""
 
@@ -131,7 +134,7 @@ def _motion(cloud: Cloud, robot: str) -> Motion:
         reason=rejected.reason if rejected is not None else "",
         drive=state.reported.drive,
         alone=asked and state.desired.stopped_alone,
-        by=(notes.robot or notes.fleet) if asked else notes.released,
+        by=notes.newest if asked else notes.released,
     )
 
 

@@ -15,7 +15,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
-from iort_station.page.answers.parameters import text
+from iort_station.page.answers.parameters import text, whole
 
 # Every open page asks for the fleet, and each robot costs a read of its shadow.
 _KEPT_S = 3.0
@@ -65,7 +65,8 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     fleet = _fleet(cloud)
 
     def stop(asked: Mapping[str, str]) -> MotionAnswer:
-        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped."""
+        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
+        ``seen_ms`` is the newest stop that the page shows: a release ends no stop after it."""
         wanted = {"true": True, "false": False}.get(text(asked, "stopped"))
         if wanted is None:
             raise StationError("stopped must be true or false")
@@ -73,10 +74,9 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         robots = one or list(registry.presence(cloud))
         if wanted:
             failed = stopping.stop(cloud, robots, by=user(), fleet=one is None)
-        elif one is not None:
-            failed = stopping.release(cloud, one, by=user())
         else:
-            failed = stopping.release_fleet(cloud, robots, by=user())
+            seen_ms = whole(asked, "seen_ms", 0, 10**15)
+            failed = stopping.release(cloud, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
         fleet.forget()
         return _told(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
 

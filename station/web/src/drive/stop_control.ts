@@ -17,6 +17,8 @@ export class StopControl {
   private readonly strip: HTMLElement;
   private robot: string | undefined;
   private sure = false;
+  // The newest stop when the viewer was asked whether to release it.
+  private seen_ms = 0;
 
   /** `changed` is called when the cars' stops or limits may be others. */
   constructor(config: Config, header: HTMLElement, changed: () => void) {
@@ -30,7 +32,7 @@ export class StopControl {
     if (this.stops.able) header.querySelector("#link")!.before(this.press);
     this.press.addEventListener("click", () => void this.stops.set(this.robot, true));
     onPress(this.release, () => {
-      if (this.sure) void this.stops.set(this.robot, false);
+      if (this.sure) void this.stops.set(this.robot, false, this.seen_ms);
       this.ask(!this.sure);
     });
     this.release.addEventListener("blur", () => this.ask(false));
@@ -48,6 +50,7 @@ export class StopControl {
 
   private ask(sure: boolean): void {
     this.sure = sure;
+    this.seen_ms = this.stops.newest_ms(this.robot);
     const whom = this.robot === undefined ? this.stops.held.fleet : [this.robot];
     this.release.textContent = sure ? `Really release ${listed(whom)}: ${whom.length === 1 ? "it" : "they"} may move` : `Release ${this.robot ?? "all"}`;
     setAttribute(this.release, "data-sure", String(sure));

@@ -50,11 +50,18 @@ export class Stops {
     return { fleet: asked.filter((name) => !this.robots[name]!.alone), alone: asked.filter((name) => this.robots[name]!.alone) };
   }
 
-  /** Stop a car, or every one; or release it. */
-  async set(robot: string | undefined, stopped: boolean): Promise<void> {
+  /** When the newest stop of a car, or of any, was asked for. */
+  newest_ms(robot: string | undefined): number {
+    const robots = robot === undefined ? Object.values(this.robots).filter(({ asked }) => asked) : [this.of(robot)];
+    return Math.max(0, ...robots.map((one) => one?.at_ms ?? 0));
+  }
+
+  /** Stop a car, or every one; or release it from the stops that the viewer knows of. */
+  async set(robot: string | undefined, stopped: boolean, seen_ms = 0): Promise<void> {
     this.error = "";
+    const whom = robot === undefined ? {} : { robot };
     try {
-      const answer = await act<MotionAnswer>("stop", { stopped: String(stopped), ...(robot === undefined ? {} : { robot }) });
+      const answer = await act<MotionAnswer>("stop", { stopped: String(stopped), ...whom, ...(stopped ? {} : { seen_ms: String(seen_ms) }) });
       this.take(answer);
       const failed = Object.entries(answer.failed).map(([name, reason]) => `${name}: ${reason}`);
       if (failed.length > 0) this.error = `Not ${stopped ? "stopped" : "released"}: ${failed.join("; ")}`;

@@ -17,6 +17,8 @@ from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
 from iort_station.page.answers import control, motion
 
+# A page that shows every stop.
+NOW = {"seen_ms": str(10**15)}
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 
 
@@ -70,7 +72,7 @@ def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
     told = motion.answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (True, True)
     assert told["drive"] == vars(LIMITS)
-    told = motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "false"})["robots"]["car7"]
+    told = motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "false", **NOW})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (False, True)
 
 
@@ -101,13 +103,13 @@ def test_the_release_of_the_fleet_leaves_a_robot_that_was_stopped_alone(cloud):
     assert {robot: one["alone"] for robot, one in told.items()} == {"car7": True, "car8": False}
     assert told["car8"]["by"] == user()
     assert abs(told["car8"]["at_ms"] / 1000 - time.time()) < 60
-    told = act({"stopped": "false"})["robots"]
+    told = act({"stopped": "false", **NOW})["robots"]
     assert {robot: one["asked"] for robot, one in told.items()} == {"car7": True, "car8": False}
     assert told["car8"]["by"] == user(), "who released it"
-    assert not act({"robot": "car7", "stopped": "false"})["robots"]["car7"]["asked"]
+    assert not act({"robot": "car7", "stopped": "false", **NOW})["robots"]["car7"]["asked"]
     # Stopped by an older station, or by `iort config`: nobody knows with what.
     cloud.states["car8"] = {"desired": {"motion": {"stopped": True}}}
-    assert act({"stopped": "false"})["robots"]["car8"]["asked"]
+    assert act({"stopped": "false", **NOW})["robots"]["car8"]["asked"]
 
 
 def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
@@ -118,8 +120,21 @@ def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
         cloud.version += 1
 
     cloud.read = somebody_stops
-    assert set(act({"stopped": "false"})["failed"]) >= {"car7"}
+    assert set(act({"stopped": "false", **NOW})["failed"]) >= {"car7"}
     assert cloud.states["car7"]["desired"]["motion"]["stopped"]
+
+
+@pytest.mark.parametrize("whom", [{}, {"robot": "car7"}])
+def test_a_release_ends_no_stop_that_the_page_does_not_show(cloud, whom):
+    act = motion.actions(cloud)["stop"]
+    seen = act({"stopped": "true", **whom})["robots"]["car7"]["at_ms"]
+    newer = stopping.encode_stop(stopping.Pressed("anna", seen + 1), fleet=not whom)
+    cloud.states["car7"] = _merged(cloud.states["car7"], {"desired": newer})
+    told = act({"stopped": "false", "seen_ms": str(seen), **whom})
+    assert told["failed"] == {"car7": "anna has stopped it again since"}
+    assert cloud.states["car7"]["desired"]["motion"]["stopped"]
+    told = act({"stopped": "false", "seen_ms": str(seen + 1), **whom})
+    assert not told["robots"]["car7"]["asked"]
 
 
 def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):

@@ -77,7 +77,7 @@ def _ask(cloud: Cloud, names: list[str], *, everyone: bool, release: bool) -> di
     by = alarms.user()
     if not release:
         return stopping.stop(cloud, names, by=by, fleet=everyone)
-    return (stopping.release_fleet if everyone else stopping.release)(cloud, names, by=by)
+    return stopping.release(cloud, names, by=by, fleet=everyone)
 
 
 def _wait(cloud: Cloud, names: list[str], seconds: float, *, stopped: bool) -> dict[str, Motion]:
