@@ -6,8 +6,10 @@ import json
 import multiprocessing
 import os
 import re
+import tempfile
 import threading
 from contextlib import ExitStack, closing
+from pathlib import Path
 
 import pytest
 from argon2 import PasswordHasher
@@ -45,10 +47,14 @@ def start(folder):
         return state.settings().ports, authority.pem, rows
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch):
     # So often the ledger looks whether it is closed.
     monkeypatch.setattr(ledger, "_LOOK_S", 0.01)
+
+
+@pytest.fixture
+def folder(tmp_path):
     start(tmp_path / "cloud")
     return tmp_path / "cloud"
 
@@ -169,13 +175,14 @@ def test_a_remembered_address_that_this_machine_has_not_is_told_with_its_file(fo
     ],
     ids=["folder", "file", "read-only file", "read-only folder", "unreachable"],
 )
-def test_files_that_are_not_the_users_own_are_told(folder, tmp_path_factory, damage, why):
-    for path in (folder, *folder.iterdir(), folder.parent / "cloud.lock"):
-        os.chown(path, NOBODY, NOBODY)
+def test_files_that_are_not_the_users_own_are_told(damage, why):
     # pytest's folders are for their user alone.
-    for above in (folder.parent, tmp_path_factory.getbasetemp(), tmp_path_factory.getbasetemp().parent):
-        above.chmod(0o755)
-    os.chown(folder.parent, 0, NOBODY)
-    folder.parent.chmod(0o775)
-    damage(folder)
-    assert re.search(why, as_nobody(folder))
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent) / "cloud"
+        start(folder)
+        for path in (folder, *folder.iterdir(), folder.parent / "cloud.lock"):
+            os.chown(path, NOBODY, NOBODY)
+        os.chown(parent, 0, NOBODY)
+        folder.parent.chmod(0o775)
+        damage(folder)
+        assert re.search(why, as_nobody(folder))
