@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
@@ -76,6 +77,8 @@ def pytest_configure() -> None:
     """Let tests import the ministack of the embedded cloud: the installed one with local/patches/."""
     # The CDK's own validation only warns, and is most of a synthesis. `make check` has it.
     os.environ["CDK_VALIDATION"] = "false"
+    # Threads of PubNub's SDK outlive their client, and would log into later tests.
+    logging.getLogger("pubnub").propagate = False
     if find_spec("ministack"):
         patched.use()
 
