@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,8 @@ def test_the_page_wakes_a_car_over_its_own_connection_and_lets_it_sleep(
         until(lambda: page.get_attribute("#car", "data-state") == "live", "the car to be live")
         assert "live over AWS IoT" in page.inner_text(".foot")
         assert page.locator("[data-value=leg_toLambda]").count() == 0
-        assert float(plain(page.inner_text("[data-value=leg_toPage]"))) > 0
+        # Below zero while the car knows its clock's offset only roughly.
+        assert math.isfinite(float(plain(page.inner_text("[data-value=leg_toPage]"))))
         page.goto(f"{server.url}#/alarms")
         until(lambda: page.evaluate(f"iort.robots['{car.robot}'].state") == "idle", "the car to sleep again")
 
