@@ -155,8 +155,8 @@ def _await_received(socket: Path, published: Mapping[str, int]) -> None:
     until, streams = time.monotonic() + _CATCH_UP_S, {one.name: one.stream for one in topics().values()}
     while time.monotonic() < until:
         with suppress(AgentError):  # it is too busy to answer
-            received = fetch(socket)["streams"]
-            if all(received[streams[name]]["samples"] >= count for name, count in published.items()):
+            received = {stream: one["samples"] for stream, one in fetch(socket)["streams"].items()}
+            if all(received.get(streams[name], 0) >= count for name, count in published.items()):
                 return
         time.sleep(0.2)  # the agent gives no notice
 

@@ -229,7 +229,7 @@ def _show(one: Audit) -> None:
 
 def _said(one: Audit) -> tuple[tuple[str, str], str]:
     """The verdict with its style, and what the agent counted."""
-    told = "" if one.taken is None else f" ({one.taken:,} samples taken by the agent)"
+    told = "" if one.taken is None else f" ({one.taken:,} samples taken by the agent, at its last report)"
     if one.complete:
         return ("complete", "green"), told
     what = f"{one.missing:,} batches missing" if one.missing else "not complete"
