@@ -201,13 +201,20 @@ class DriveLimitsEntry(TypedDict):
 
 class MotionEntry(TypedDict):
     """Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere,
-    ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it.
-    ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else
-    released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it."""
+    unless the robot rejected it; ``stopped`` as the robot has confirmed it, null before it does. ``reason``
+    says why it rejected a stop or a release. ``stands``: by the robot's own word it takes no motion by
+    command until it is released. ``stoppable``: whether a stop ends its motion; false if nothing that moves
+    it can be stopped from here, null before it has said so. ``why_not`` is for a human, empty if it is
+    stoppable. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop,
+    or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot
+    drive it."""
 
     asked: bool
     stopped: bool | None
     reason: str
+    stands: bool
+    stoppable: bool | None
+    why_not: str
     alone: bool
     by: str
     at_ms: int

@@ -10,6 +10,7 @@ from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import RuntimeSettings
 from iort_contract.checks import check_field
+from iort_contract.messages.control.driving import NO_MOTION
 from iort_contract.messages.control.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS
 from iort_contract.messages.control.shadow import Rejection
 from iort_contract.topics import check_stream
@@ -47,9 +48,7 @@ def overlay(
             elif name in SETTINGS:
                 values[attribute] = allowed(SETTINGS[name])(value, _PLACE.child(name))
                 if name == MOTION_STOPPED and value and not moves:
-                    raise _PLACE.child(name).problem(
-                        "nothing to stop: downlink.cmd has no command with motion"
-                    )
+                    raise _PLACE.child(name).problem(NO_MOTION)
                 if name == MOTION_STOPPED and not value and base.motion_stopped:
                     raise _PLACE.child(name).problem(
                         "car.yaml has motion: {stopped: true}; change it on the robot, and restart the agent"

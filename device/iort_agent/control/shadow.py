@@ -40,8 +40,8 @@ _NOT_FOUND = 404
 class Shadow:
     """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
     the cloud's last report of batches that it put off. ``in_force`` are the
-    settings until the shadow is known, if not the file's. ``drive`` is reported; ``moves`` tells whether the
-    robot has a motion that can be stopped."""
+    settings until the shadow is known, if not the file's. ``drive`` and ``moves`` are reported: what a stick
+    drives, and whether the robot has a motion that can be stopped."""
 
     def __init__(
         self,
@@ -200,7 +200,7 @@ class Shadow:
         rejected = {name: one._replace(value=_quoted(one.value)) for name, one in self._rejected.items()}
         settings = self.settings.by_name()
         return encode_reported(
-            Reported(settings, rejected, dict(self._answers), self._agent_version, self._drive)
+            Reported(settings, rejected, dict(self._answers), self._agent_version, self._drive, self._moves)
         )
 
     def _publish(self, topic: str, payload: bytes) -> None:

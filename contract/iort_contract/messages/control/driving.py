@@ -40,6 +40,8 @@ DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SETTINGS_UNKNOWN, NO_GUARD = (
     "settings_unknown",
     "guard_not_ready",
 )
+# Why a robot rejects a stop, and what its operators are told before they need one.
+NO_MOTION = "nothing to stop: downlink.cmd has no command with motion"
 # Not of a command: the lease ended, or an emergency stop began, and the robot was stopped.
 STOPPED = "stopped"
 REFUSALS: Mapping[str, str] = {

@@ -13,7 +13,7 @@ from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETT
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
 from iort_contract.topics import COMMANDS
 
-REJECTED, DRIVE, STOPS = "rejected", "drive", "stops"
+REJECTED, DRIVE, MOVES, STOPS = "rejected", "drive", "moves", "stops"
 # Larger than any count, and than any time of a calendar.
 _MOST = 10**15
 _SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
@@ -82,13 +82,15 @@ class Desired:
 @dataclass(frozen=True)
 class Reported:
     """The settings in force and the rejected ones, by name; the newest outcome of each command; what a stick
-    drives, if the robot can be driven by hand."""
+    drives, if the robot can be driven by hand. ``moves`` tells whether it has a motion that a stop ends; None
+    of an agent that does not say so."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     rejected: Mapping[str, Rejection] = field(default_factory=dict)
     commands: Mapping[str, Outcome] = field(default_factory=dict)
     agent_version: str = ""
     drive: DriveLimits | None = None
+    moves: bool | None = None
 
 
 def decode_desired(document: Any) -> Desired:
@@ -130,6 +132,7 @@ def decode_reported(document: Any) -> Reported:
     commands = _mapping(found.pop(COMMANDS, None))
     version = found.pop(AGENT_VERSION, "")
     drive = decode_limits(found.pop(DRIVE, None))
+    moves = found.pop(MOVES, None)
     return Reported(
         dict(sorted(_flat(found))),
         {
@@ -144,6 +147,7 @@ def decode_reported(document: Any) -> Reported:
         },
         version if isinstance(version, str) else "",
         drive,
+        moves if isinstance(moves, bool) else None,
     )
 
 
@@ -156,6 +160,7 @@ def encode_reported(reported: Reported) -> dict[str, Any]:
         COMMANDS: {name: one._asdict() for name, one in reported.commands.items()},
         AGENT_VERSION: reported.agent_version,
         DRIVE: encode_limits(reported.drive),
+        MOVES: reported.moves,
     }
 
 

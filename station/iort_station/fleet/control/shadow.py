@@ -52,6 +52,11 @@ class State(NamedTuple):
             if name in desired and _same(one.value, desired[name])
         }
 
+    @property
+    def stop_rejected(self) -> bool:
+        """Whether the robot has rejected the stop that is asked for, which holds nothing then."""
+        return self.desired.settings.get(MOTION_STOPPED) is True and MOTION_STOPPED in self.rejected()
+
     def pending(self) -> dict[str, Any]:
         """The desired settings, by name, that the robot has neither applied nor rejected."""
         in_force, rejected = self.reported.settings, self.rejected()

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.messages.control.driving import DriveLimits
+from iort_contract.messages.control.driving import NO_MOTION, DriveLimits
 from iort_contract.messages.control.settings import MOTION_STOPPED
 from iort_contract.messages.control.shadow import (
     Pressed,
@@ -32,15 +32,30 @@ _AT_ONCE = 32
 
 class Motion(NamedTuple):
     """Whether a robot may move: the stop as it is asked for, as the robot has confirmed it (None before it
-    does), and why the robot rejected it. ``drive`` is None if a stick cannot drive it. ``alone`` is a stop
-    that the release of the fleet does not end. ``by`` is who stopped it, or else released it last."""
+    does), and why the robot rejected a stop or a release. A rejected stop is not asked for: it holds nothing.
+    ``drive`` is None if a stick cannot drive it. ``stoppable`` tells whether a stop ends its motion; None
+    before the robot has said so. ``alone`` is a stop that the release of the fleet does not end. ``by`` is
+    who stopped it, or else released it last."""
 
     asked: bool
     stopped: bool | None
     reason: str
     drive: DriveLimits | None
+    stoppable: bool | None = None
     alone: bool = False
     by: Pressed | None = None
+
+    @property
+    def stands(self) -> bool:
+        """Whether a stop holds, by the robot's own word."""
+        return self.stopped is True and self.stoppable is not False
+
+    @property
+    def why_not(self) -> str:
+        """Why a stop may not stop it, for a human; empty if it does."""
+        if self.stoppable is None:
+            return "it has not said whether a stop ends its motion: it has not run yet, or has an older agent"
+        return "" if self.stoppable else f"a stop does nothing there: {NO_MOTION}"
 
 
 def motion(cloud: Cloud, robots: Iterable[str]) -> dict[str, Motion]:
@@ -75,9 +90,9 @@ def release(
         stop = state.desired.stops.newest
         if seen_ms is not None and stop is not None and stop.t_ms > seen_ms:
             raise StationError(f"{stop.by} has stopped it again since")
-        if not fleet or state.desired.stops.fleet is not None:
+        if not fleet or state.desired.stops.fleet is not None or state.stop_rejected:
             # With the version, so that a stop which somebody asks for at this moment is not lost.
-            alone = fleet and state.desired.stopped_alone
+            alone = fleet and state.desired.stopped_alone and not state.stop_rejected
             _change(cloud, robot, encode_fleet_released() if alone else released, version=state.version)
 
     return _changed(cloud, robots, change)
@@ -126,13 +141,14 @@ def _motion(cloud: Cloud, robot: str) -> Motion:
     rejected = state.rejected().get(MOTION_STOPPED)
     stopped = state.reported.settings.get(MOTION_STOPPED)
     # A robot may also stand by its car.yaml, or since the shadow that asked for it was deleted.
-    asked = state.desired.settings.get(MOTION_STOPPED, stopped) is True
+    asked = state.desired.settings.get(MOTION_STOPPED, stopped) is True and not state.stop_rejected
     notes = state.desired.stops
     return Motion(
         asked=asked,
         stopped=stopped,
         reason=rejected.reason if rejected is not None else "",
         drive=state.reported.drive,
+        stoppable=state.reported.moves,
         alone=asked and state.desired.stopped_alone,
         by=notes.newest if asked else notes.released,
     )

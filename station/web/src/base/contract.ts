@@ -660,11 +660,14 @@ export interface DriveLimitsEntry {
   readonly lease_ms: number;
 }
 
-/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, ``stopped`` as the robot has confirmed it; null before it does. ``reason`` says why it rejected it. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it. */
+/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, unless the robot rejected it; ``stopped`` as the robot has confirmed it, null before it does. ``reason`` says why it rejected a stop or a release. ``stands``: by the robot's own word it takes no motion by command until it is released. ``stoppable``: whether a stop ends its motion; false if nothing that moves it can be stopped from here, null before it has said so. ``why_not`` is for a human, empty if it is stoppable. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it. */
 export interface MotionEntry {
   readonly asked: boolean;
   readonly stopped: boolean | null;
   readonly reason: string;
+  readonly stands: boolean;
+  readonly stoppable: boolean | null;
+  readonly why_not: string;
   readonly alone: boolean;
   readonly by: string;
   readonly at_ms: number;

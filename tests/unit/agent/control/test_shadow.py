@@ -23,7 +23,7 @@ BASE = RuntimeSettings(
     record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"
 )
 PREFIX = "$aws/things/car1/shadow/name/agent"
-DOCUMENT = encode_reported(Reported(BASE.by_name(), agent_version="1.2.3"))
+DOCUMENT = encode_reported(Reported(BASE.by_name(), agent_version="1.2.3", moves=True))
 
 
 class Rig:

@@ -11,7 +11,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from iort_agent.control.shadow import _merged
-from iort_contract.messages.control.driving import DriveLimits, encode_limits
+from iort_contract.messages.control.driving import NO_MOTION, DriveLimits, encode_limits
 from iort_station.errors import StationError
 from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
@@ -88,6 +88,46 @@ def test_a_robot_with_impossible_limits_keeps_no_other_from_its_stop(cloud):
     told = motion.actions(cloud)["stop"]({"stopped": "true"})["robots"]
     assert told["car8"]["asked"]
     assert told["car7"]["drive"] is None
+
+
+def rejects(cloud: Shadows, robot: str) -> None:
+    """A robot without a motion command answers a stop."""
+    rejection = {"value": True, "reason": NO_MOTION}
+    said = {"moves": False, "motion": {"stopped": False}, "rejected": {"motion.stopped": rejection}}
+    cloud.states[robot] = _merged(cloud.states.get(robot, {}), {"reported": said})
+
+
+def test_a_robot_that_cannot_be_stopped_says_so_before_and_after_a_stop(cloud):
+    cloud.states = {"car7": {"reported": {"moves": True}}, "car8": {"reported": {"moves": False}}}
+    ask, act = motion.answers(cloud)["motion"], motion.actions(cloud)["stop"]
+    before = ask({})["robots"]
+    assert {robot: one["stoppable"] for robot, one in before.items()} == {"car7": True, "car8": False}
+    assert NO_MOTION in before["car8"]["why_not"]
+    act({"stopped": "true"})
+    cloud.confirm("car7", stopped=True)
+    rejects(cloud, "car8")
+    after = {robot: ask({"robot": robot})["robots"][robot] for robot in ("car7", "car8")}
+    assert {robot: (one["stands"], one["asked"]) for robot, one in after.items()} == {
+        "car7": (True, True),
+        "car8": (False, False),
+    }
+    assert after["car8"]["reason"] == NO_MOTION
+
+
+def test_a_robot_that_has_not_said_whether_it_can_be_stopped_is_no_stopped_one(cloud):
+    told = motion.answers(cloud)["motion"]({"robot": "car8"})["robots"]["car8"]
+    assert (told["stoppable"], told["stands"]) == (None, False)
+    assert "has not said" in told["why_not"]
+
+
+def test_a_rejected_stop_is_over_with_the_release_of_the_fleet(cloud):
+    act = motion.actions(cloud)["stop"]
+    act({"robot": "car8", "stopped": "true"})
+    rejects(cloud, "car8")
+    act({"stopped": "true"})
+    told = act({"stopped": "false", **NOW})["robots"]["car8"]
+    assert (told["asked"], told["alone"]) == (False, False)
+    assert cloud.states["car8"]["desired"]["motion"]["stopped"] is False
 
 
 def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release(cloud):
