@@ -12,15 +12,16 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Callable, NoReturn, Sequence
 
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
 from iort_agent.common.log_lines import neutral
-from iort_agent.common.logs import set_up
+from iort_agent.common.logs import Troubles, set_up
+from iort_agent.common.schema import did_you_mean
 from iort_agent.common.state import document
 from iort_agent.common.version import agent_version
-from iort_agent.config import Config, load_config
+from iort_agent.config import Config, load_config, without_sources
 from iort_agent.errors import AgentError, ConfigError
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
@@ -36,6 +37,7 @@ _SAME_SIGNAL_S = 1.0
 # ROS' NAME:=VALUE, which roslaunch adds to every command. A name with one underscore is a parameter.
 _REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
 _PARAMETER = re.compile(r"_[^_]")
+_NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,9 +69,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.umask(before)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Names the nearest choice for a wrong one."""
+
+    def error(self, message: str) -> NoReturn:
+        wrong = _NO_CHOICE.search(message)
+        hint = did_you_mean(wrong.group(1), re.findall(r"[\w-]+", wrong.group(2))) if wrong else ""
+        super().error(message + hint)
+
+
 def command_line() -> argparse.ArgumentParser:
     """The commands and their options."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="iort-agent",
         description="Sends a robot's data to AWS IoT: every sample recorded, the newest one live. "
         "Without COMMAND it runs: `iort-agent --config FILE`.",
@@ -91,11 +102,13 @@ def command_line() -> argparse.ArgumentParser:
     running.add_argument(
         "--drain-s",
         type=_seconds,
-        default=10.0,
         metavar="S",
-        help="how long to wait at the end until everything is delivered (default 10)",
+        help="how long to wait at the end until everything is delivered "
+        "(default: as long as it takes, or 10 after a signal)",
     )
     running.add_argument("--log-level", choices=LOG_LEVELS, help="instead of the file's log_level")
+    flushing = command("flush", flush, "deliver what the queue still holds, and record nothing")
+    flushing.add_argument("--drain-s", type=_seconds, metavar="S", help="give up after this time")
     checking = command("check", check, "check everything that the file names, and say what to do")
     checking.add_argument("--json", action="store_true", help="as JSON")
     uploading = command("upload", upload, "upload files, and print their keys")
@@ -123,7 +136,10 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         # The ROS node reads them from sys.argv, as every ROS node does.
         remappings = [argument for argument in arguments if _REMAPPING.fullmatch(argument)]
         arguments = [argument for argument in arguments if argument not in remappings]
-    options = parser.parse_args(arguments)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        names = [f"--{name}".replace("_", "-") for name in vars(options) if name != "command"]
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(unknown[0], names)}")
     options.ignored = [argument for argument in remappings if _PARAMETER.match(argument)]
     return options
 
@@ -147,6 +163,25 @@ def run(options: argparse.Namespace) -> int:
     for argument in options.ignored:
         _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
                      options.config)  # fmt: skip
+    status, agent = _run(config, options, troubles)
+    report = make_report(agent)
+    if options.report is not None:
+        options.report.write_text(json.dumps(document(report), indent=2) + "\n", encoding="utf-8")
+    samples = sum(counts.samples for counts in report.streams.values())
+    _log.info("ended: %d samples, %d live messages", samples, report.live_published)
+    return status
+
+
+def flush(options: argparse.Namespace) -> int:
+    """`iort-agent flush`: status 1 if something is left."""
+    config = load_config(options.config)
+    if config.queue.path is None:
+        raise ConfigError(f"{options.config}: queue.path is not set: a queue in memory ends with its run")
+    status, _ = _run(without_sources(config), options, set_up(config.log_level))
+    return status
+
+
+def _run(config: Config, options: argparse.Namespace, troubles: Troubles) -> tuple[int, Agent]:
     # Reading a configuration must not need the network's library.
     from iort_agent.verbs.uplink import make_uplink  # noqa: PLC0415 - it loads the library
 
@@ -165,12 +200,7 @@ def run(options: argparse.Namespace) -> int:
             server.stop()
     finally:
         spool.close()
-    report = make_report(agent)
-    if options.report is not None:
-        options.report.write_text(json.dumps(document(report), indent=2) + "\n", encoding="utf-8")
-    samples = sum(counts.samples for counts in report.streams.values())
-    _log.info("ended: %d samples, %d live messages", samples, report.live_published)
-    return status
+    return status, agent
 
 
 def check(options: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@ sections."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from iort_agent.common.schema import (
@@ -88,6 +88,18 @@ def load_config(file: Path) -> Config:
     if "://" in config.endpoint or "/" in config.endpoint:
         raise place.child("endpoint").error(config.endpoint, "a host name, without scheme or path")
     return config
+
+
+def without_sources(config: Config) -> Config:
+    """The configuration of a run that only delivers what the runs before it have left."""
+    return replace(
+        config,
+        sources=(),
+        share=(),
+        downlink=DownlinkConfig(),
+        ping=PingConfig(),
+        metrics=MetricsConfig(enabled=False),
+    )
 
 
 def _check_streams(config: Config, place: Place) -> None:

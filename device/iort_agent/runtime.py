@@ -21,13 +21,19 @@ _TYPES_S = 3600.0
 _CLOSE_S = 5.0
 # A warm Lambda function answers well within this time.
 _LAST_PONGS_S = 2.0
+_LOOK_S = 0.5
 
 
 class Runtime:
-    """Runs an agent. `run` is called once."""
+    """Runs an agent. `run` is called once.
 
-    def __init__(self, agent: Agent) -> None:
+    ``stopped_s`` is the time for delivering the rest after a stop from outside, because a service manager
+    kills what takes long; while the rest takes longer, its progress is logged every ``progress_s``.
+    """
+
+    def __init__(self, agent: Agent, *, stopped_s: float = 10.0, progress_s: float = 5.0) -> None:
         self.agent = agent
+        self._stopped_s, self._progress_s = stopped_s, progress_s
         self._stop = threading.Event()
         self._asked = False
 
@@ -36,12 +42,13 @@ class Runtime:
         self._asked = True
         self._stop.set()
 
-    def run(self, *, drain_s: float) -> int:
-        """Run until every source has ended or `stop` is called, then deliver the rest.
+    def run(self, *, drain_s: float | None) -> int:
+        """Run until every source has ended or `stop` is called, then deliver the rest within ``drain_s``.
 
-        Returns the exit status: 1 if a source failed or ended without a stored sample, or if a batch was
-        dropped or could not be delivered within ``drain_s``; else 0. Raises `UplinkError` if the uplink
-        cannot start.
+        None means: however long it takes if the sources ended by themselves, and ``stopped_s`` once `stop` is
+        called. Returns the exit status: 1 if a source failed or ended without a stored sample, if a batch
+        was dropped, or if not all was delivered; else 0. A run that was stopped may leave batches to the
+        next one, in a queue on disk. Raises `UplinkError` if the uplink cannot start.
         """
         agent = self.agent
         problem = too_many(agent.config.sources, agent.config.record)
@@ -59,20 +66,21 @@ class Runtime:
         uploads = agent.uploads
         uploader = None if uploads is None else _start("uploads", lambda: uploads.run(uploads_stop))
         self._stop.wait()
+        stopped = self._asked
         if agent.downlink is not None:
             # An agent that ends by itself must not end an emergency stop.
             agent.downlink.halt(keep_stop=not self._asked)
         agent.pings.wake()
         for thread in (*sources, watcher, ticker, pinger):
             thread.join()
-        agent.pings.close(min(_LAST_PONGS_S, drain_s))
+        agent.pings.close(_LAST_PONGS_S if drain_s is None else min(_LAST_PONGS_S, drain_s))
         agent.streams.flush()
         self._check_sources()
         self._send_log()
-        delivered = self._drain(drain_s)
+        delivered = self._drain(drain_s, stopped=stopped)
         if agent.downlink is not None:
             agent.downlink.close(keep_stop=not self._asked)
-        self._end_uploads(uploader, uploads_stop, drain_s)
+        delivered = self._end_uploads(uploader, uploads_stop, drain_s, stopped=stopped) and delivered
         record_stop.set()
         agent.record.wake()
         record.join()
@@ -138,8 +146,8 @@ class Runtime:
             counts = [found[name] for name in source.streams if name in found]
             source.check_stored([(one.samples, one.refused) for one in counts])
 
-    def _drain(self, drain_s: float) -> bool:
-        """Deliver the rest; whether all was delivered, or is kept for the next run."""
+    def _drain(self, drain_s: float | None, *, stopped: bool) -> bool:
+        """Deliver the rest; whether all was delivered, or is kept for the run after a stopped one."""
         streams, spool = self.agent.streams, self.agent.spool
         streams.flush()
         # After the flush, so that the accounts count every batch. Their own batch is the last one.
@@ -148,34 +156,67 @@ class Runtime:
         left = spool.backlog()
         if left.batches:
             _log.info("delivering the last %d batches", left.batches)
-        if self.agent.record.wait_empty(drain_s):
+        if self._wait(self.agent.record.wait_empty, drain_s, self._tell_left):
             dropped = spool.dropped()
             if dropped.batches:
                 _log.error("%d samples were dropped: the queue was full or damaged", dropped.samples)
             return dropped.batches == 0
         left = spool.backlog()
-        if spool.durable:
-            _log.warning(
-                "%d samples in %d batches were not delivered within %g s; the next run sends them",
-                left.samples, left.batches, drain_s,
-            )  # fmt: skip
-            return True
-        _log.error(
-            "%d samples in %d batches could not be delivered within %g s and are lost",
-            left.samples, left.batches, drain_s,
-        )  # fmt: skip
-        return False
+        kept = f"{left.samples} samples in {left.batches} batches were not delivered"
+        if not spool.durable:
+            _log.error("%s and are lost: the queue is in memory, see queue.path", kept)
+        elif stopped:
+            _log.warning("%s; the next run sends them, or `iort-agent flush`", kept)
+        else:
+            # The next run would play a recording again.
+            _log.error("%s; they are in the queue: `iort-agent flush` sends them", kept)
+        return spool.durable and stopped
 
-    def _end_uploads(self, thread: threading.Thread | None, stop: threading.Event, drain_s: float) -> None:
-        """Upload the attachments, which belong to samples. The next run uploads the other files."""
+    def _wait(self, empty: Callable[[float], bool], drain_s: float | None, tell: Callable[[], None]) -> bool:
+        """Wait until ``empty``, as `run` says of ``drain_s``; whether it is. ``tell`` logs the progress."""
+        waited = told = 0.0
+        while True:
+            if drain_s is None and self._asked:
+                drain_s = waited + self._stopped_s
+            look_s = _LOOK_S if drain_s is None else max(0.0, min(_LOOK_S, drain_s - waited))
+            if empty(look_s):
+                return True
+            waited += look_s
+            if drain_s is not None and waited >= drain_s:
+                return False
+            if waited - told >= self._progress_s:
+                told = waited
+                tell()
+
+    def _tell_left(self) -> None:
+        left, connection = self.agent.spool.backlog(), self.agent.uplink.status()
+        why = "" if connection.connected else f"; not connected: {connection.last_error or 'no answer'}"
+        _log.info("%d samples in %d batches are still to be delivered%s", left.samples, left.batches, why)
+
+    def _end_uploads(
+        self,
+        thread: threading.Thread | None,
+        stop: threading.Event,
+        drain_s: float | None,
+        *,
+        stopped: bool,
+    ) -> bool:
+        """Upload the attachments, which belong to samples, and return whether they are, or are kept for the
+        run after a stopped one. The next run uploads the other files."""
         attachments, uploads = self.agent.attachments, self.agent.uploads
-        if attachments is not None and not attachments.wait_empty(drain_s):
-            _log.warning("attachments were not uploaded within %g s; the next run uploads them", drain_s)
+        uploaded = attachments is None or self._wait(attachments.wait_empty, drain_s, _tell_uploading)
+        if not uploaded:
+            _log.warning("attachments were not uploaded; the next run uploads them, or `iort-agent flush`")
         stop.set()
         if uploads is not None:
             uploads.wake()
         if thread is not None:
             thread.join()
+        return uploaded or stopped
+
+
+def _tell_uploading() -> None:
+    _log.info("attachments are still to be uploaded")
 
 
 def _start(name: str, target: Callable[[], object]) -> threading.Thread:

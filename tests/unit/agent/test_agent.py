@@ -6,7 +6,7 @@ import json
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Callable
 from unittest.mock import Mock
 
 import pytest
@@ -15,8 +15,8 @@ from iort_agent.agent import Agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.schema import Place, load
-from iort_agent.common.state import Status, document, read
-from iort_agent.config import Config
+from iort_agent.common.state import Connection, Status, document, read
+from iort_agent.config import Config, without_sources
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
@@ -29,8 +29,9 @@ from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_agent.sources.sim.source import SimConfig
 from iort_agent.spool.config import QueueConfig
-from iort_agent.spool.interface import REJECT_NEW
+from iort_agent.spool.interface import REJECT_NEW, Spool
 from iort_agent.spool.memory import MemorySpool
+from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
@@ -71,16 +72,42 @@ def drive(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0 + i * 20_000, {"speed": i})
 
 
+class Watched(Loopback):
+    """A broker in memory that acts when somebody looks at its connection for the third time."""
+
+    def __init__(self, clock: Clock, act: Callable[[], object]) -> None:
+        super().__init__(clock, Dispatcher(), connected=False)
+        self._act, self._looks = act, 0
+
+    def status(self) -> Connection:
+        self._looks += 1
+        if self._looks == 3:
+            self._act()
+        return super().status()
+
+
 class Rig:
-    def __init__(self, *sources: Any, connected: bool = True, **settings: Any) -> None:
-        config = Config("car1", "host", Path(), Path(), tuple(Script(run) for run in sources))
+    def __init__(
+        self,
+        *sources: Any,
+        connected: bool = True,
+        at_end: tuple[Path, Callable[[Rig], object]] | None = None,
+        **settings: Any,
+    ) -> None:
+        config = Config("car1", "host", Path(), Path(), tuple(Script(run) for run in sources))  # type: ignore[misc]  # a part of a source
         self.clock = SystemClock()
         self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
-        self.spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
+        self.spool: Spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
+        if at_end is not None:
+            # A queue on disk, no connection, and what is done when the run waits at its end.
+            queue, act = at_end
+            self.uplink = Watched(self.clock, lambda: act(self))
+            self.spool = make_spool(QueueConfig(queue), self.clock)
+            config = config if sources else without_sources(config)
         self.agent = Agent(
             replace(config, **settings), uplink=self.uplink, spool=self.spool, clock=self.clock
         )
-        self.runtime = Runtime(self.agent)
+        self.runtime = Runtime(self.agent, stopped_s=0.0, progress_s=0.0)
 
     def report(self) -> dict[str, Any]:
         """The document that `--report` writes."""
@@ -99,7 +126,11 @@ class Rig:
 
 def test_an_emergency_stop_outlives_the_agent_also_without_a_connection(tmp_path: Path) -> None:
     downlink = load(DownlinkConfig, DOWNLINK, Place(tmp_path))
-    settings = {"sources": (SimConfig(),), "downlink": downlink, "queue": QueueConfig(tmp_path / "queue.db")}
+    settings: dict[str, Any] = {
+        "sources": (SimConfig(),),
+        "downlink": downlink,
+        "queue": QueueConfig(tmp_path / "queue.db"),
+    }
 
     def run() -> Agent:
         return Rig(connected=False, **settings).agent
@@ -172,8 +203,46 @@ def test_undelivered_samples_are_reported(caplog: pytest.LogCaptureFixture) -> N
     rig = Rig(drive, connected=False)
     assert rig.runtime.run(drain_s=0.05) == 1
     # Two of them are the agent's accounts, of its start and its end.
-    assert "502 samples in 12 batches could not be delivered within 0.05 s" in caplog.text
+    assert "502 samples in 12 batches were not delivered and are lost" in caplog.text
     assert rig.report()["spool"]["left_samples"] == 502
+
+
+def test_a_recording_is_done_when_it_is_delivered_however_long_that_takes(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    rig = Rig(drive, at_end=(tmp_path / "queue.db", lambda rig: rig.uplink.connect()))
+    assert rig.runtime.run(drain_s=None) == 0
+    assert rig.recorded() == list(range(500))
+    assert "502 samples in 12 batches are still to be delivered; not connected: no answer" in caplog.text
+
+
+def test_what_a_recording_leaves_is_flushed_and_not_played_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    queue = tmp_path / "queue.db"
+    played = Rig(drive, at_end=(queue, lambda rig: rig.runtime.stop()))
+    assert played.runtime.run(drain_s=None) == 1
+    assert "502 samples in 12 batches were not delivered; they are in the queue: `iort-agent flush`" in (
+        caplog.text
+    )
+    played.spool.close()
+    flushed = Rig(at_end=(queue, lambda rig: rig.uplink.connect()))
+    assert flushed.runtime.run(drain_s=None) == 0
+    assert flushed.recorded() == list(range(500))
+    assert flushed.spool.backlog().batches == 0
+    flushed.spool.close()
+
+
+def test_a_stopped_run_leaves_the_rest_to_the_next_one(tmp_path: Path) -> None:
+    def stopped(emit: Emit, stop: threading.Event) -> None:
+        drive(emit, stop)
+        rig.runtime.stop()
+
+    rig = Rig(stopped, at_end=(tmp_path / "queue.db", lambda _: None))
+    assert rig.runtime.run(drain_s=None) == 0
+    assert rig.spool.backlog().samples == 502
+    rig.spool.close()
 
 
 def test_a_backlog_is_delivered_after_a_late_connect() -> None:
@@ -421,7 +490,9 @@ def test_a_wrong_configuration_prints_a_message_and_exits_with_2(
     [
         (["--help"], 0, "Without COMMAND it runs"),
         ([], 2, "replace the robot's key and certificate"),
-        (["rum"], 2, "'rum' (choose from"),
+        (["rum"], 2, "(did you mean run?)"),
+        (["run", "--config", "x", "--drain", "1", "--log-level", "inf"], 2, "(did you mean info?)"),
+        (["run", "--config", "x", "--drian-s", "1"], 2, "--drian-s 1 (did you mean --drain-s?)"),
         (["--config", "x", "--drain-s", "-1"], 2, "must be 0 to 86400"),
         (["--config", "x", "--no"], 2, "unrecognized arguments: --no"),
     ],
