@@ -26,6 +26,7 @@ from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT
 from iort_contract.topics import PING_PATHS
+from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
@@ -118,6 +119,7 @@ class _Demo:
                     open_actions=actions(embedded.cloud),
                     actions=control.actions(embedded.cloud),
                     port=self._options.port,
+                    invitations=kept.pages(),
                 )
             )
             embedded.show_page(page.url)

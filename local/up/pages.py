@@ -11,6 +11,7 @@ from typing import Any
 from typing_extensions import Self
 
 from iort_contract.cloud import IOT
+from iort_station import kept
 from iort_station.cloud import Cloud
 from iort_station.fleet import registry
 from iort_station.page.answers import control
@@ -38,7 +39,7 @@ class Pages:
         embedded, listen = self._embedded, self._listen
         with ExitStack() as stack:
             port = embedded.state.port("page", embedded.host)
-            self.here = PageServer(port=port, **shown(embedded.cloud))
+            self.here = PageServer(port=port, invitations=kept.pages(), **shown(embedded.cloud))
             embedded.state.serve(stack, "page", self.here)
             if listen is not None:
                 port = embedded.state.port("network page", listen.address)

@@ -21,10 +21,19 @@ START_BYTES, FLOOR_BYTES = 500 * 1024 * 1024, 200 * 1024 * 1024
 
 def folder(environment: Mapping[str, str] = os.environ) -> Path:
     """Where `make up` keeps its cloud, unless told otherwise by ``STATE=``."""
+    return _data(environment) / "cloud"
+
+
+def pages(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where the pages that this user serves give invitations: see `iort_station.page.invitations`."""
+    return _data(environment) / "pages"
+
+
+def _data(environment: Mapping[str, str]) -> Path:
     home = (
         environment.get("XDG_DATA_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".local/share"
     )
-    return Path(home) / "iort" / "cloud"
+    return Path(home) / "iort"
 
 
 def lock_of(folder: Path) -> Path:

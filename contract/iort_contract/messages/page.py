@@ -49,8 +49,9 @@ class Config(TypedDict):
     says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access
     token, or empty. ``answers`` says whether the server answers questions about the past; a static site does
     not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is
-    a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters.
-    ``track`` is the track that the cars drive on, if it is known."""
+    a new one at every start: see `Admitted`. ``invite`` is the command, for who serves the page, whose link
+    gives one more browser the key; empty if there is none. ``vehicles`` maps a robot to its `Vehicle`'s
+    parameters. ``track`` is the track that the cars drive on, if it is known."""
 
     namespace: str
     live: Literal["pubnub", "iot"]
@@ -63,6 +64,7 @@ class Config(TypedDict):
     answers: bool
     actions: list[str]
     keyed: list[str]
+    invite: str
     vehicles: dict[str, dict[str, float]]
     track: TrackMap | None
 

@@ -7,6 +7,9 @@ import logging
 import socket
 import ssl
 import threading
+from collections.abc import AsyncIterator
+from concurrent.futures import Future
+from contextlib import asynccontextmanager, suppress
 from types import TracebackType
 from typing import Any
 
@@ -14,9 +17,12 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from typing_extensions import Self
 
+from iort_station.supervision import keep, keep_task
+
 
 class BackgroundServer:
-    """Calls `handle` for every request, from `start` to `stop` or within a ``with`` block.
+    """Calls `handle` for every request, from `start` to `stop` or within a ``with`` block. After an
+    unexpected error it says so and listens again.
 
     ``port=0`` takes a free port. With ``tls`` it speaks HTTPS. A connection without a request is closed
     after ``idle_s``, or up to twice that before its first one. ``options`` are those of `aiohttp.web.Server`.
@@ -37,6 +43,7 @@ class BackgroundServer:
             self._options["keepalive_timeout"] = idle_s
         self._scheme = "http" if tls is None else "https"
         self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
         self._loop: asyncio.AbstractEventLoop
         self._stopping: asyncio.Event
 
@@ -44,26 +51,61 @@ class BackgroundServer:
         """Answer a request."""
         raise NotImplementedError
 
+    @asynccontextmanager
+    async def beside(self) -> AsyncIterator[None]:
+        """What runs in the server's loop as long as it serves; nothing by default."""
+        yield
+
     def start(self) -> Self:
         """Listen, and return once connections are accepted. Raises `OSError` if the port is not free."""
         if self._thread is not None:
             raise RuntimeError("the server is running already")
+        listening = self._listen()
+        self._ended.clear()
+        started: Future[None] = Future()
+        self._thread = threading.Thread(
+            target=self._run, args=(listening, started), name=type(self).__name__, daemon=True
+        )
+        self._thread.start()
+        try:
+            started.result()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def _listen(self) -> socket.socket:
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         both = self.host == "::" and socket.has_dualstack_ipv6()
         listening = socket.create_server((self.host, self.port), family=family, dualstack_ipv6=both)
         self.port = listening.getsockname()[1]
-        started = threading.Event()
-        self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._serve(listening, started)), name=type(self).__name__, daemon=True
-        )
-        self._thread.start()
-        started.wait()
-        return self
+        return listening
+
+    def _run(self, listening: socket.socket, started: Future[None]) -> None:
+        first: list[socket.socket] = [listening]
+
+        def serve() -> None:
+            with first.pop() if first else self._listen() as door:
+                asyncio.run(self._serve(door, started))
+
+        def begin() -> None:
+            try:
+                serve()
+            except Exception as error:
+                if started.done():
+                    raise
+                # Whoever starts it gets this one.
+                started.set_exception(error)
+
+        keep(type(self).__name__, begin, self._ended)
 
     def stop(self) -> None:
         """Drop every connection and end the thread. A second call has no effect."""
         if self._thread is not None:
-            self._loop.call_soon_threadsafe(self._stopping.set)
+            self._ended.set()
+            # Between two starts there is no loop.
+            with suppress(AttributeError, RuntimeError):
+                self._loop.call_soon_threadsafe(self._stopping.set)
             self._thread.join()
             self._thread = None
 
@@ -75,8 +117,10 @@ class BackgroundServer:
     ) -> None:
         self.stop()
 
-    async def _serve(self, listening: socket.socket, started: threading.Event) -> None:
+    async def _serve(self, listening: socket.socket, started: Future[None]) -> None:
         self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
+        if self._ended.is_set():
+            return
         logger = logging.getLogger(f"aiohttp.server.{type(self).__name__}")
         logger.addFilter(_is_our_fault)
         asked: set[Any] = set()
@@ -92,35 +136,47 @@ class BackgroundServer:
         runner = web.ServerRunner(server, shutdown_timeout=1)
         await runner.setup()
         await web.SockSite(runner, listening, ssl_context=self._tls).start()
-        started.set()
         closing = None
         if self._idle_s is not None:
-            closing = asyncio.create_task(_close_silent(server, asked, self._idle_s))
-        await self._stopping.wait()
-        if closing is not None:
-            closing.cancel()
-        # Stop accepting before dropping connections: asyncio loses one that comes while it closes.
-        self._loop.remove_reader(listening)
-        await _drop_connections(server)
-        await runner.cleanup()
+            closing = asyncio.create_task(self._close_silent(server, asked, self._idle_s))
+        try:
+            async with self.beside():
+                if not started.done():
+                    started.set_result(None)
+                await self._stopping.wait()
+        finally:
+            if closing is not None:
+                closing.cancel()
+            # Stop accepting before dropping connections: asyncio loses one that comes while it closes.
+            self._loop.remove_reader(listening)
+            await _drop_connections(server)
+            await runner.cleanup()
+
+    async def _close_silent(self, server: web.Server, asked: set[Any], idle_s: float) -> None:
+        """Close connections without a first request, for which aiohttp waits for ever."""
+        before: set[Any] = set()
+
+        async def look() -> None:
+            nonlocal before
+            while True:
+                await self.pause(idle_s)
+                now = set(server.connections)
+                asked.intersection_update(now)
+                for connection in (before & now) - asked:
+                    if connection.transport is not None:
+                        connection.transport.abort()
+                before = now
+
+        await keep_task(f"{type(self).__name__}'s closing of silent connections", look)
+
+    async def pause(self, seconds: float) -> None:
+        """The time between two looks for silent connections."""
+        await asyncio.sleep(seconds)
 
 
 def _is_our_fault(record: logging.LogRecord) -> bool:
     """Whether a fault is ours: aiohttp logs a traceback for malformed requests too, after its answer 400."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
-
-
-async def _close_silent(server: web.Server, asked: set[Any], idle_s: float) -> None:
-    """Close connections without a first request, for which aiohttp waits for ever."""
-    before: set[Any] = set()
-    while True:
-        await asyncio.sleep(idle_s)
-        now = set(server.connections)
-        asked &= now
-        for connection in (before & now) - asked:
-            if connection.transport is not None:
-                connection.transport.abort()
-        before = now
 
 
 async def _drop_connections(server: web.Server) -> None:

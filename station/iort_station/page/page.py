@@ -66,6 +66,7 @@ def config(
     answers: bool = False,
     actions: Iterable[str] = (),
     keyed: Iterable[str] = (),
+    invite: str = "",
     track: Track | None = None,
 ) -> Config:
     """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
@@ -107,6 +108,7 @@ def config(
         "answers": answers,
         "actions": sorted(actions),
         "keyed": sorted(keyed),
+        "invite": invite,
         "track": None if track is None else _track_map(track),
     }
 

@@ -12,13 +12,15 @@ import asyncio
 import errno
 import ipaddress
 import json
+import logging
 import re
 import secrets
 import ssl
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,6 +46,7 @@ from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.bodies import Body, as_json, packed, takes_gzip
+from iort_station.page.invitations import COMMAND, answer, listening
 from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
@@ -51,6 +54,7 @@ Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 Download = Callable[[Mapping[str, str], Path], Path]
 Vehicles = Mapping[str, Mapping[str, float]]
 _T = TypeVar("_T")
+_log = logging.getLogger("iort")
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
@@ -59,6 +63,8 @@ ADMISSION = "/key.json"
 _CHUNK_BYTES = 256 * 1024
 # The most answers that are worked on at a time; further requests wait.
 MOST_ANSWERS = 16
+# Invitations that nobody has used yet; a further one ends the oldest.
+_MOST_TOKENS = 64
 # A file of a long range takes a gigabyte of memory while it is written.
 MOST_DOWNLOADS = 2
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
@@ -73,8 +79,9 @@ class PageServer(BackgroundServer):
     gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``vehicles`` may be
     a function, for a server during which robots come. ``downloads`` maps a name to the function that writes
     the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server
-    accepts a Host that is localhost, an address or one of ``names``, and no other. With a ``context`` it
-    speaks HTTPS. Raises `StationError` if the page is not built, if the port is in use, and for a
+    accepts a Host that is localhost, an address or one of ``names``, and no other. In the
+    folder ``invitations`` it gives its own user an `invitation` when asked. With a ``context`` it speaks
+    HTTPS. Raises `StationError` if the page is not built, if the port is in use, and for a
     configuration that it must not serve.
     """
 
@@ -100,6 +107,7 @@ class PageServer(BackgroundServer):
         port: int = 0,
         names: Iterable[str] = (),
         built: Path = BUILT,
+        invitations: Path | None = None,
         context: ssl.SSLContext | None = None,
     ) -> None:
         super().__init__(host, port, tls=context, idle_s=IDLE_S)
@@ -110,7 +118,8 @@ class PageServer(BackgroundServer):
         self._downloads = {f"/{name}": download for name, download in (downloads or {}).items()}
         # No file has the key, because every user of this machine can read the files.
         self._key = secrets.token_urlsafe(32)
-        self._tokens: set[str] = set()
+        self._tokens: deque[str] = deque(maxlen=_MOST_TOKENS)
+        self._invitations = invitations if keyed else None
         self._admitted = admitted or (lambda _: None)
         self._free = asyncio.Semaphore(MOST_ANSWERS)
         self._free_to_write = asyncio.Semaphore(MOST_DOWNLOADS)
@@ -127,6 +136,7 @@ class PageServer(BackgroundServer):
             answers=bool(answers),
             actions=[*free, *keyed],
             keyed=keyed,
+            invite=COMMAND if keyed and invitations else "",
             track=track,
         )
         pubnub = [pubnub_address(origin, tls=tls)] if live == PUBNUB else []
@@ -162,7 +172,7 @@ class PageServer(BackgroundServer):
         if not self._keyed:
             return self.url + view
         token = secrets.token_urlsafe(32)
-        self._tokens.add(token)
+        self._tokens.append(token)
         # What follows the # stays in the browser; it is in no log.
         return f"{self.url}{view}?{INVITATION}={token}"
 
@@ -177,6 +187,25 @@ class PageServer(BackgroundServer):
             if error.errno == errno.EADDRINUSE:
                 raise StationError(f"{where}: the port is in use; choose another, or 0 for any") from error
             raise StationError(f"{where}: {error}") from error
+
+    @asynccontextmanager
+    async def beside(self) -> AsyncIterator[None]:
+        """Give invitations to who serves the page."""
+        if self._invitations is None:
+            yield
+            return
+        with ExitStack() as stack:
+            try:
+                door = stack.enter_context(listening(self._invitations, self.port))
+            except (OSError, StationError) as error:
+                _log.warning("`%s` does not know this page: %s", COMMAND, error)
+                yield
+                return
+            server = await asyncio.start_unix_server(
+                lambda reader, writer: answer(reader, writer, self.url, self.invitation), sock=door
+            )
+            async with server:
+                yield
 
     async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer with a file, or with the result of one of ``answers``."""
@@ -258,11 +287,15 @@ class PageServer(BackgroundServer):
             return {"key": self._key}
         try:
             self._tokens.remove(token)
-        except KeyError as error:
+        except ValueError as error:
             known = "this address was used before, or is of an earlier start of the server"
-            raise StationError(f"{known}: open the one in the server's terminal") from error
+            raise StationError(f"{known}: {self._another()}") from error
         self._admitted(self.invitation())
         return {"key": self._key}
+
+    def _another(self) -> str:
+        """What gives a browser the key."""
+        return f"open a link of `{COMMAND}`" if self._invitations else "open the one in the server's terminal"
 
     def _is_key(self, told: str) -> bool:
         return secrets.compare_digest(told.encode(errors="surrogateescape"), self._key.encode())
@@ -277,7 +310,7 @@ class PageServer(BackgroundServer):
             refused = "an action needs this page's own origin"
             return self._response(request, as_json({"error": refused}), 403)
         if keyed and not self._is_key(request.headers.get(KEY_HEADER, "")):
-            refused = "this browser may only look: open the address in the server's terminal"
+            refused = f"this browser may only look: {self._another()}"
             return self._response(request, as_json({"error": refused}), 403)
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:

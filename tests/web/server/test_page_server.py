@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import gzip
 import http.client
 import json
 import socket
+import stat
 import threading
-from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from collections.abc import AsyncIterator, Mapping
+from contextlib import ExitStack, asynccontextmanager, closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,8 @@ import pytest
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
+from iort_station.page import invitations
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer, on_loopback
@@ -315,6 +318,56 @@ def test_the_key_comes_once_for_each_invitation_and_is_in_no_file(built: Path) -
         assert page.invitation() == f"{page.url}#/"
 
 
+@pytest.mark.parametrize("place", ["pages", "a" * 120])
+def test_a_command_gives_another_browser_the_key(built: Path, tmp_path: Path, place: str) -> None:
+    folder = tmp_path / place
+    keyed: dict[str, Any] = {"actions": {"act": lambda _: {}}, "built": built, "invitations": folder}
+    with PageServer(**TOLD, **keyed) as page:
+        assert json.loads(ask(page, "/config.json")[1])["invite"] == "iort invite"
+        # Nobody else may enter, and no file has a key.
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        assert [stat.S_ISSOCK(one.stat().st_mode) for one in folder.iterdir()] == [True]
+        tokens = []
+        for _ in range(2):
+            found, address = invitations.invite(folder)
+            assert (found.url, address.startswith(f"{page.url}#/?key=")) == (page.url, True)
+            tokens.append(json.dumps({"token": address.rpartition("=")[2]}))
+        for token in tokens:
+            assert post(page, "key", token)[0] == 200
+            status, refused = post(page, "key", token)
+            assert (status, "`iort invite`" in refused["error"]) == (400, True)
+        assert "`iort invite`" in post(page, "act", "{}")[1]["error"]
+        with PageServer(**TOLD, **keyed) as other:
+            assert [one.url for one in invitations.served(folder)] == sorted([page.url, other.url])
+            with pytest.raises(UsageError, match=r"several pages are served: .*--port"):
+                invitations.invite(folder)
+            assert invitations.invite(folder, other.port)[1].startswith(other.url)
+        with pytest.raises(UsageError, match=f"got 1; there is {page.url}"):
+            invitations.invite(folder, 1)
+    with pytest.raises(StationError, match="you serve no page"):
+        invitations.invite(folder)
+
+
+def test_the_socket_of_a_killed_server_is_no_page(built: Path, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as killed:
+        port = free_port()
+        killed.bind(str(tmp_path / f"{port}.sock"))
+    assert not invitations.served(tmp_path)
+    keyed: Any = {"act": lambda _: {}}
+    with PageServer(**TOLD, actions=keyed, built=built, invitations=tmp_path, port=port) as page:
+        assert [one.url for one in invitations.served(tmp_path)] == [page.url]
+
+
+def test_a_page_without_a_folder_for_invitations_is_served(
+    built: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    keyed: Any = {"act": lambda _: {}}
+    with PageServer(**TOLD, actions=keyed, built=built, invitations=tmp_path / "file" / "pages") as page:
+        assert ask(page, "/page.js")[0].status == 200
+    assert "`iort invite` does not know this page" in caplog.text
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
 def test_a_server_on_loopback_may_move_a_robot(host: str) -> None:
     assert on_loopback(host)
@@ -339,7 +392,7 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
-    nothing: dict[str, Any] = {"actions": [], "keyed": [], "track": None}
+    nothing: dict[str, Any] = {"actions": [], "keyed": [], "invite": "", "track": None}
     nothing |= {"live": "pubnub", "drivers": False, "identity": None}
     assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False, **nothing}
 
@@ -468,6 +521,78 @@ def test_the_pubnub_sdk_is_served_unmodified_with_its_licence() -> None:
     published = (modules / "dist" / "web" / "pubnub.min.js").read_bytes()
     assert (BUILT / "pubnub.min.js").read_bytes() == published
     assert (modules / "LICENSE").read_text().strip() in (BUILT / "licences.txt").read_text()
+
+
+class Failing(BackgroundServer):
+    """Its loop and its look for silent connections fail once each, at the second time."""
+
+    def __init__(self) -> None:
+        super().__init__("127.0.0.1", 0, idle_s=30.0)
+        self.starts, self.looks = 0, 0
+        self.fail, self.again, self.looked = asyncio.Event(), threading.Event(), threading.Event()
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        self.fail.set()
+        return web.Response()
+
+    @asynccontextmanager
+    async def beside(self) -> AsyncIterator[None]:
+        self.starts += 1
+        if self.starts > 1:
+            self.again.set()
+            yield
+            return
+        failing = asyncio.create_task(self.fail.wait())
+        serving = asyncio.current_task()
+        assert serving is not None
+        failing.add_done_callback(lambda _: serving.cancel())
+        try:
+            yield
+        except asyncio.CancelledError as cancelled:
+            raise RuntimeError("a fault of the loop") from cancelled
+
+    async def pause(self, seconds: float) -> None:
+        self.looks += 1
+        if self.looks == 1:
+            raise RuntimeError("a fault of the look")
+        self.looked.set()
+        await super().pause(seconds)
+
+
+def test_each_task_of_a_server_goes_on_after_an_unexpected_exception(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def ask_it(server: Failing) -> int:
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+        with closing(connection):
+            connection.request("GET", "/")
+            return connection.getresponse().status
+
+    with Failing() as server:
+        port = server.port
+        assert server.looked.wait(60)
+        assert "Failing's closing of silent connections has failed" in caplog.text
+        with suppress(OSError, http.client.HTTPException):
+            ask_it(server)
+        assert server.again.wait(60)
+        assert "a fault of the loop" in caplog.text
+        assert (server.port, ask_it(server)) == (port, 200)
+    # It ends, also while it waits for its next start.
+    with Failing() as server:
+        with suppress(OSError, http.client.HTTPException):
+            ask_it(server)
+        server.stop()
+
+
+def test_a_server_that_cannot_start_says_so() -> None:
+    class Broken(Failing):
+        @asynccontextmanager
+        async def beside(self) -> AsyncIterator[None]:
+            raise RuntimeError("a fault at the start")
+            yield
+
+    with pytest.raises(RuntimeError, match="a fault at the start"):
+        Broken().start()
 
 
 def test_a_server_forgets_connections_that_have_ended() -> None:

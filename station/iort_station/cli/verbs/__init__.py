@@ -10,6 +10,7 @@ VERBS = {
     "fleet.files": "Bags, images and other files that robots have uploaded.",
     "page.pubnub": "Store PubNub's keys, encrypted, where Lambda 1 reads them.",
     "page.dashboard": "Serve the live page until Ctrl-C.",
+    "page.invite": "Print a link for one more browser that may stop and drive.",
     "operations.cost": "Print the cost of a fleet, at list prices.",
     "operations.archive": "Telemetry that is kept for good: show, run, verify.",
     "operations.audit": "Prove that every sample of a robot arrived.",

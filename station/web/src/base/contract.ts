@@ -532,7 +532,7 @@ export interface Identity {
   readonly robots: readonly string[];
 }
 
-/** ``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers`` says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
+/** ``config.json``: where to listen. ``live`` is ``pubnub``, by ``subscribe_key`` at ``origin``; or ``iot``, by addresses of the server's answer ``socket``, or of a static site's ``identity``. ``drivers`` says whether the action ``drive`` gives addresses that may send commands. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``actions`` names what the server changes when it is asked; those in ``keyed`` need its key, which is a new one at every start: see `Admitted`. ``invite`` is the command, for who serves the page, whose link gives one more browser the key; empty if there is none. ``vehicles`` maps a robot to its `Vehicle`'s parameters. ``track`` is the track that the cars drive on, if it is known. */
 export interface Config {
   readonly namespace: string;
   readonly live: "pubnub" | "iot";
@@ -545,6 +545,7 @@ export interface Config {
   readonly answers: boolean;
   readonly actions: readonly string[];
   readonly keyed: readonly string[];
+  readonly invite: string;
   readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
   readonly track: TrackMap | null;
 }

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from iort_station import kept
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, LiveWay, Token, TrackFile
 from iort_station.cli.words import examples, say
@@ -59,6 +60,7 @@ def dashboard(
         track=None if track is None else load_track(track),
         host=host,
         port=port,
+        invitations=kept.pages(),
         names=name or (),
         **reaching(cloud, live or transport(cloud)),
     ) as page:
