@@ -215,6 +215,16 @@ def test_get_downloads_the_newest_file_or_all(iort, store, tmp_path):
     assert "no matching files" in str(iort("get", "car", "--name", "*.zip", status=1).exception)
 
 
+def test_get_fetches_the_rest_of_the_files_if_one_is_damaged(iort, store, tmp_path):
+    bad = store(b"first", name="a.bag", sha256="0" * 64)
+    store(b"second", name="b.bag", second=NOON + 60)
+    done = iort("get", "car", "--out", str(tmp_path), status=1)
+    assert (tmp_path / "b.bag").read_bytes() == b"second"
+    assert not (tmp_path / "a.bag").exists()
+    assert f"{bad}: SHA-256 must be" in done.stderr
+    assert "1 of 2 files could not be fetched" in str(done.exception)
+
+
 def test_empty_asks_for_confirmation(iort, store, s3):
     store()
     assert "Nobody can answer here" in str(iort("empty", status=2).exception)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from botocore.exceptions import ClientError
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_station.cli import completion, console
@@ -70,7 +71,8 @@ def get(
 ) -> None:
     """Download files, and check the SHA-256 that the robot gave.
 
-    Files of the same name get a folder for each time. An interrupted download continues.
+    Files of the same name get a folder for each time. An interrupted download continues. A file that is
+    damaged or cannot be fetched is named, and the others are fetched; the exit status is then 1.
     """
     within = when.range()
     cloud = context.obj.cloud()
@@ -80,12 +82,21 @@ def get(
     if not found:
         raise StationError(f"{robot} has no matching files")
     apart = len({one.name for one in found}) < len(found)
+    failed = 0
     for one in found:
         folder = out / time.strftime("%Y%m%d-%H%M%S", time.gmtime(one.second)) if apart else out
-        with bar(one.name, one.size, DownloadColumn(), TransferSpeedColumn()) as progress:
-            path = files.download(cloud, one, folder, progress, force=force)
+        try:
+            with bar(one.name, one.size, DownloadColumn(), TransferSpeedColumn()) as progress:
+                path = files.download(cloud, one, folder, progress, force=force)
+        except (StationError, ClientError) as error:
+            failed += 1
+            named = str(error) if one.key in str(error) else f"{one.key}: {error}"
+            console.errors.print(named, style="red", soft_wrap=True)
+            continue
         text = json.dumps({**_as_json(one), "path": str(path)}) if as_json else str(path)
         console.out.print(text, soft_wrap=True)
+    if failed:
+        raise StationError(f"{failed} of {len(found)} files could not be fetched; they are named above")
 
 
 @commands.command("empty", epilog=examples("files empty --yes"))
