@@ -50,7 +50,7 @@ class Decoder:
     """Decodes the messages of one definition.
 
     ``select`` names the wanted paths, or their beginnings; None selects all. An element that is named
-    (``ranges.540``) is taken from an array of any length. With ``large``, a ``uint8[]`` stays bytes.
+    (``ranges.540``) is taken from an array of any length. With ``large``, a ``uint8[]`` stays `Large` bytes.
 
     ``stamped`` is true if messages begin with a header. ``unknown`` are selected paths that the message does
     not have. ``left_out`` counts the omitted values by path. ``walked`` counts the elements of variable size
@@ -149,7 +149,7 @@ class Decoder:
             raise struct.error
         shown: Sequence[int] = ()
         if path is not None and blob and self._large:
-            out[path] = bytes(data[at : at + n])  # type: ignore[assignment]  # for the attachments
+            out[path] = Large(data[at : at + n], at - _LENGTH.size)  # type: ignore[assignment]  # for the attachments
         elif path is not None and n <= MAX_ELEMENTS and not blob:
             shown = range(n)
         elif path is not None:
@@ -200,6 +200,17 @@ class Decoder:
                 return False
             rest = rest[1:]
         return not rest or self._has(rest, self._types.get(field.kind, ()))
+
+
+class Large(bytes):
+    """The bytes of an array, with the place of their length in the message: ``at``."""
+
+    at: int
+
+    def __new__(cls, content: bytes, at: int) -> Large:  # noqa: PYI034 - Python 3.8 has no Self
+        large = super().__new__(cls, content)
+        large.at = at
+        return large
 
 
 _Sample = Dict[str, Value]

@@ -7,7 +7,7 @@ import struct
 from typing import Iterator, Mapping, NamedTuple, Sequence
 
 from iort_contract.limits import MessageError, Value
-from iort_contract.ros1.decode import Decoder
+from iort_contract.ros1.decode import Decoder, Large
 from iort_contract.ros1.definition import layout, parse
 
 # The size limit of a layout in a batch; ROS definitions have some thousand characters.
@@ -58,7 +58,7 @@ class RosMessage(Mapping[str, Value]):
         raw: bytes,
         kind: RosType,
         *,
-        large: Mapping[str, bytes] | None = None,
+        large: Mapping[str, Large] | None = None,
         beside: Mapping[str, Value] | None = None,
     ) -> None:
         self.raw = raw
@@ -87,9 +87,12 @@ class RosMessage(Mapping[str, Value]):
         return self._values
 
 
-def cut(raw: bytes, content: bytes) -> tuple[bytes, int]:
-    """The message with an empty array in place of ``content``, and its position; `filled` undoes it."""
-    at = raw.index(_LENGTH.pack(len(content)) + content)
+def cut(raw: bytes, content: Large, removed: int = 0) -> tuple[bytes, int]:
+    """The message with an empty array in place of ``content``, and its position; `filled` undoes it.
+
+    ``removed`` are the bytes that were cut out before, in front of it.
+    """
+    at = content.at - removed
     return raw[:at] + _LENGTH.pack(0) + raw[at + 4 + len(content) :], at
 
 

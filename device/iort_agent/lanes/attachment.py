@@ -69,7 +69,7 @@ class Attachments:
             if isinstance(values, RosMessage):
                 if values.large:
                     values = self.attach_to_message(stream, t_us, values)
-            elif any(type(value) is bytes for value in values.values()):
+            elif any(isinstance(value, bytes) for value in values.values()):
                 values = self.attach_to_fields(stream, t_us, values)
             emit(stream, t_us, values)
 
@@ -82,7 +82,7 @@ class Attachments:
         raw = message.raw
         beside: dict[str, Value] = {}
         for field, content in message.large.items():
-            raw, at = cut(raw, content)
+            raw, at = cut(raw, content, len(message.raw) - len(raw))
             beside.update(self._attachment(stream, t_us, field, content, keep=keep))
             beside[f"{field}.{ATTACHMENT_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)
@@ -92,7 +92,7 @@ class Attachments:
         keep = self._is_due(stream, t_us)
         sample: dict[str, Value] = {}
         for field, value in values.items():
-            if type(value) is bytes:
+            if isinstance(value, bytes):
                 sample.update(self._attachment(stream, t_us, field, value, keep=keep))
             else:
                 sample[field] = value

@@ -20,7 +20,7 @@ from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
-from iort_contract.ros1.decode import Decoder, stamp_ns
+from iort_contract.ros1.decode import Decoder, Large, stamp_ns
 from iort_contract.ros1.definition import Definition, parse
 from iort_contract.ros1.message import RosMessage, RosType
 from iort_contract.topics import check_stream
@@ -172,7 +172,7 @@ class Intake:
                     return None
                 self.warn("undecodable", f"kept as it is: {error}")
         if kind.whole is not None and (kind.decoder is None or not self._config.fields):
-            contents = {name: value for name, value in values.items() if isinstance(value, bytes) and value}
+            contents = {name: value for name, value in values.items() if isinstance(value, Large) and value}
             return RosMessage(data, kind.whole, large=contents)
         if not values:
             self.warn("empty", "its messages have no field to send")

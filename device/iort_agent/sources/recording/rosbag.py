@@ -14,7 +14,7 @@ from iort_agent.sources.recording.unreadable import check_kind, wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
-from iort_contract.ros1.decode import Decoder, stamp_ns
+from iort_contract.ros1.decode import Decoder, Large, stamp_ns
 from iort_contract.ros1.definition import md5sum, parse
 from iort_contract.ros1.message import RosMessage, RosType
 
@@ -124,7 +124,7 @@ class Recording:
             if kind.large is not None:
                 with suppress(MessageError):
                     values: dict[str, Any] = dict(kind.large.decode(raw))
-                    contents = {name: v for name, v in values.items() if isinstance(v, bytes) and v}
+                    contents = {name: v for name, v in values.items() if isinstance(v, Large) and v}
             yield Message(stream, at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
 
     def _kind(self, stream: str, connection: Any) -> _Kind:

@@ -24,12 +24,12 @@ from iort_contract.limits import MAX_PUBNUB_BYTES, MessageError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, file_key
-from iort_contract.ros1.decode import Decoder
+from iort_contract.ros1.decode import Decoder, Large
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import Messages, RosMessage, RosType, filled
 from tests.agent_fakes import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
-from tests.unit.contract.ros1.ros1_messages import text, u32
+from tests.unit.contract.ros1.ros1_messages import HEADER, text, u32
 
 T_US = 1_700_000_000_123_456
 PICTURE = jpeg()
@@ -46,7 +46,7 @@ IMAGE = RosType("/camera", "sensor_msgs/CompressedImage", "1", "string format\nu
 def image(content=PICTURE):
     """A message with a content between other fields."""
     raw = text("jpeg") + u32(len(content)) + content + b"\7"
-    return RosMessage(raw, IMAGE, large={"data": content})
+    return RosMessage(raw, IMAGE, large={"data": Large(content, len(text("jpeg")))})
 
 
 def test_the_attachment_names_the_key_of_the_upload(tmp_path):
@@ -81,12 +81,15 @@ def test_other_content_is_kept_unchanged(tmp_path):
 @pytest.mark.parametrize("every_s", [0, 10**6], ids=["kept", "left out"])
 def test_a_message_is_restored_with_its_contents(tmp_path, every_s):
     """Even if a content equals another one or another part of the message."""
-    kind = RosType("/t", "a_msgs/A", "1", "uint8[] a\nstring s\nuint8[] b\nuint8[] c\nuint8[] d")
+    definition = "uint8[] a\nstring s\nuint8[] b\nuint8[] c\nuint8[] d"
+    kind = RosType("/t", "a_msgs/A", "1", definition)
     contents = {"a": b"xy", "b": b"xy", "c": b"jpeg", "d": PICTURE}
     a, b, c, d = (u32(len(content)) + content for content in contents.values())
-    message = RosMessage(a + text("jpeg") + b + c + d, kind, large=contents)
+    raw = a + text("jpeg") + b + c + d
+    values = Decoder(parse("a_msgs/A", definition), large=True).decode(raw)
+    message = RosMessage(raw, kind, large={name: values[name] for name in contents})
     attachments = attachments_in(tmp_path, every_s=every_s)
-    attachments.attach_to_message("s", T_US, RosMessage(u32(1) + b"z", kind, large={"a": b"z"}))
+    attachments.attach_to_message("s", T_US, RosMessage(u32(1) + b"z", kind, large={"a": Large(b"z", 0)}))
     sample = attachments.attach_to_message("s", T_US + 1, message)
     assert len(sample.raw) == len(message.raw) - sum(map(len, contents.values()))
     raw = sample.raw
@@ -200,6 +203,15 @@ def test_a_thumbnail_is_a_small_picture_of_the_same_shape():
 )
 def test_content_that_is_no_picture_has_no_thumbnail(content, content_type):
     assert thumbnail(content, content_type) is None
+
+
+def test_a_content_whose_bytes_are_in_the_stamp_too_is_cut_out_of_its_array(tmp_path):
+    kind = RosType("/t", "a_msgs/A", "1", "Header header\nuint8[] data\nuint8 last" + HEADER)
+    raw = u32(1, 1, 0x99) + text("car") + u32(1) + b"\x99" + b"\7"
+    large = {"data": Large(b"\x99", len(raw) - 6)}
+    sample = attachments_in(tmp_path).attach_to_message("s", T_US, RosMessage(raw, kind, large=large))
+    assert (sample["last"], sample["data.at"]) == (7, len(raw) - 6)
+    assert sample.raw == u32(1, 1, 0x99) + text("car") + u32(0) + b"\7"
 
 
 # --- sources ----------------------------------------------------------------------------------------

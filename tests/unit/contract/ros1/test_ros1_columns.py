@@ -27,6 +27,7 @@ from iort_contract.messages.batch import Batch, decode_batch, encode_batch, mess
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
 from iort_contract.ros1.decode import HEADER as HEAD
+from iort_contract.ros1.decode import Large
 from iort_contract.ros1.definition import layout, parse
 from iort_contract.ros1.message import MAX_LAYOUT, Messages, RosMessage, RosType, cut, filled, type_id
 from iort_contract.ros1.serialized import pack, unpack
@@ -567,7 +568,7 @@ def test_a_message_decodes_its_fields_on_access() -> None:
 @given(st.binary(max_size=30), st.binary(min_size=1, max_size=9), st.binary(max_size=30))
 def test_a_content_that_was_cut_out_is_restored(before: bytes, content: bytes, after: bytes) -> None:
     raw = before + u32(len(content)) + content + after
-    less, at = cut(raw, content)
+    less, at = cut(raw, Large(content, len(before)))
     assert len(less) == len(raw) - len(content)
     assert filled(less, content, at) == raw
 
