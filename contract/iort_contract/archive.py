@@ -220,6 +220,7 @@ class Pending(NamedTuple):
 
 
 def parse_pending(item: Item) -> Pending:
-    """Decode the key of a pending row."""
-    period, _, topic = str(item[HOUR]["S"]).partition("#")
+    """Decode the key of a pending row; raises `ContractError`."""
+    period, _, topic = text(plain(item), HOUR).partition("#")
+    parse_hour(period if "T" in period else f"{period}T00")
     return Pending(topic, period)

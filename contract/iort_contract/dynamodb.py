@@ -12,8 +12,8 @@ from decimal import Decimal
 from itertools import islice
 from typing import Any, Callable, Dict, Iterable, Iterator, Mapping, NamedTuple, Sequence, TypeVar
 
-from iort_contract.checks import COMPACT
-from iort_contract.limits import MAX_BATCH_SPAN_US
+from iort_contract.checks import COMPACT, shown
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH, SECOND, TOPIC
 
@@ -219,17 +219,26 @@ def plain(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def deserialize(attribute: Mapping[str, Any]) -> Any:
-    """The value of an attribute such as ``{"N": "1.5"}``."""
-    ((kind, content),) = attribute.items()
-    return _VALUES[kind](content)
+    """The value of an attribute such as ``{"N": "1.5"}``; raises `ContractError` for anything else."""
+    try:
+        ((kind, content),) = attribute.items()
+        return _VALUES[kind](content)
+    except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ContractError(f"attribute must be one of DynamoDB, got {shown(attribute)}") from error
 
 
 def _same(content: Any) -> Any:
     return content
 
 
+def _text(content: Any) -> str:
+    if not isinstance(content, str):
+        raise TypeError
+    return content
+
+
 _VALUES: dict[str, Callable[[Any], Any]] = {
-    "S": _same,
+    "S": _text,
     "N": Decimal,
     "B": _same,
     "BOOL": _same,

@@ -108,7 +108,7 @@ def start_us(item: Item) -> int:
     """The time at which a stored batch starts; 0 if its key is invalid."""
     try:
         return batch_id(item[BATCH]["S"]).t_us
-    except (ContractError, KeyError):
+    except (ContractError, KeyError, TypeError):
         return 0
 
 

@@ -41,13 +41,13 @@ def written(envelope: Envelope) -> Written | None:
     text = envelope.text
     if envelope.codec != CODEC or b"\\" in text or not text.endswith(b"]}}"):
         return None
-    start, dt, times, fields, opened, *columns = text.split(b'"')
-    names = tuple(columns[::2])
-    if (start, dt, fields, opened) != (b"{", b"dt", b"fields", b":{") or 2 * len(names) != len(columns):
+    parts = text.split(b'"')
+    names = tuple(parts[5::2])
+    if parts[:2] + parts[3:5] != [b"{", b"dt", b"fields", b":{"] or len(parts) != 5 + 2 * len(names):
         return None
     if len(names) > MAX_FIELDS or envelope.n * len(names) > MAX_BATCH_VALUES:
         return None
-    return Written(envelope, names, b"".join((times, *columns[1::2]))[:-2] + b",")
+    return Written(envelope, names, b"".join((parts[2], *parts[6::2]))[:-2] + b",")
 
 
 def decoded(run: Sequence[Written], wanted: Callable[[str], bool]) -> Block | None:

@@ -83,7 +83,7 @@ def account(sample: Mapping[str, Value]) -> Account:
         try:
             counts = json.loads(str(sample["counts"]))
             return SourceAccount(str(sample["source"]), {str(name): int(n) for name, n in counts.items()})
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
             raise ContractError(f"a source's account cannot be decoded: {error}") from error
     try:
         names = StreamAccount._fields[1:-1]
@@ -91,7 +91,7 @@ def account(sample: Mapping[str, Value]) -> Account:
         return StreamAccount(
             str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, bool(sample["ended"])
         )
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ContractError(f"a stream's account cannot be decoded: {error}") from error
 
 

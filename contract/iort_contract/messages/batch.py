@@ -104,11 +104,14 @@ def _not_an_id(text: Any) -> ContractError:
 
 
 def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:
-    """The lowest and highest key of batches that start between these times, both inclusive; None is open."""
+    """The lowest and highest key of batches that start between these times, both inclusive; None is open.
+
+    Of a range before 1970, where no batch is, the highest is below the lowest.
+    """
     first = min(max(0, first_us or 0), _MAX_BATCH_ID_US - 1)
     last = _MAX_BATCH_ID_US - 1 if last_us is None else min(max(-1, last_us), _MAX_BATCH_ID_US - 1)
     # Sorts after all ids of this time: "~" is greater than any character of an id.
-    return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
+    return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "")
 
 
 def run_ends(text: Any) -> tuple[RunEnd, ...]:

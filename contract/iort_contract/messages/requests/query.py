@@ -109,5 +109,5 @@ def unpacked_samples(packed: bytes) -> tuple[list[int], Mapping[str, list[Value]
     try:
         body = json.loads(zlib.decompress(packed))
         return list(accumulate(body["dt"])), body["fields"]
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
+    except (KeyError, RecursionError, TypeError, ValueError, zlib.error) as error:
         raise ContractError(f"samples must be what the query function packs: {error}") from error

@@ -1,0 +1,335 @@
+"""Every decoder of what is stored or received raises the contract's error only, whatever the damage."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from random import Random
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iort_analysis.drives.recorded import recorded
+from iort_analysis.samples.batches import RefusedItems, blocks, part
+from iort_analysis.samples.seconds import batches_of
+from iort_contract.archive import ArchivedHour, Pending, archived_hour, parse_hour, parse_pending
+from iort_contract.codec.columns import DICTIONARY, packed, unpacked
+from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.account import SourceAccount, StreamAccount, account
+from iort_contract.messages.analysis.findings import (
+    DriveKey,
+    Estimate,
+    Finding,
+    decode_finding,
+    encode_finding,
+)
+from iort_contract.messages.analysis.notes import Note, decode_note, encode_note
+from iort_contract.messages.analysis.run import (
+    AnalysedDrive,
+    AnalysisRequest,
+    PlannedDrive,
+    decode_analysed,
+    decode_planned,
+    decode_request,
+    encode_analysed,
+    encode_planned,
+    encode_request,
+)
+from iort_contract.messages.batch import (
+    Batch,
+    batch_id,
+    decode_batch,
+    decode_item,
+    encode_batch,
+    messages_of,
+    run_ends,
+)
+from iort_contract.messages.control.commands import (
+    Command,
+    FleetMessage,
+    decode_command,
+    decode_fleet,
+    encode_command,
+    encode_fleet,
+)
+from iort_contract.messages.control.driving import DriveLimits, decode_limits, encode_limits
+from iort_contract.messages.control.shadow import decode_desired, decode_reported
+from iort_contract.messages.event import event_message, rule_event
+from iort_contract.messages.live import (
+    LiveSample,
+    decode_live,
+    decode_live_update,
+    decode_pong,
+    encode_live,
+    encode_ping,
+    live_update,
+)
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.messages.requests.ask import (
+    Answer,
+    Ask,
+    decode_answer,
+    decode_ask,
+    encode_answer,
+    encode_ask,
+)
+from iort_contract.messages.requests.files import (
+    Address,
+    File,
+    FileAnswer,
+    FileRequest,
+    decode_file_answer,
+    decode_file_request,
+    encode_file_answer,
+    encode_file_request,
+    file_key,
+    parse_file_key,
+)
+from iort_contract.messages.requests.query import (
+    QueryAnswer,
+    QueryRequest,
+    decode_query_answer,
+    decode_query_request,
+    encode_query_answer,
+    encode_query_request,
+    packed_samples,
+    unpacked_samples,
+)
+from iort_contract.messages.viewing import Lease, decode_lease, encode_lease
+from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
+from iort_contract.ros1.definition import parse
+from iort_contract.ros1.message import Messages, RosType
+from iort_contract.ros1.serialized import pack, unpack
+from iort_contract.topics import parse_topic
+from iort_contract.track import parse_track, track_of
+from tests.examples import examples
+from tests.fakes import item_of
+from tests.mutation import mutated_bytes, mutated_item, mutated_json, mutated_value
+from tests.unit.contract.ros1.ros1_messages import HEADER, header, text
+
+T_US, RUN = 1_700_000_000_000_000, "0badcafe"
+FLAT = RosType("/flat", "a_msgs/S", "2", "Header header\nfloat64 x\nuint8 n" + HEADER)
+NAMES = RosType("/names", "a_msgs/N", "3", "string[] names\nuint8[] data\nfloat64[] x")
+LAYOUTS = {FLAT.id: FLAT.layout, NAMES.id: NAMES.layout}
+RAWS = [header() + struct.pack("<dB", i / 2, i) for i in range(3)]
+TEXTS = [struct.pack("<I", 2) + text("a") + text("b") + struct.pack("<I", 0) * 2 for _ in range(3)]
+TIMES = [T_US, T_US + 1000, T_US + 2000]
+BATCHES = [
+    Batch(RUN, 3, TIMES, {"speed": [1.5, 2.25, 3], "mode": ["a", None, True], "n": [1, 2, 3]}, 1),
+    Batch(RUN, 0, TIMES, {"speed": [1.5, 2.25, 3], "volts": [7, 8, 9]}, 0, None, ()),
+    Batch(RUN, 4, TIMES, {}, 0, Messages(FLAT.id, FLAT.layout, RAWS)),
+    Batch(RUN, 5, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES.id, NAMES.layout, TEXTS)),
+]
+ITEMS = [item_of(batch) for batch in BATCHES]
+COLUMNS, ABOUT = as_columns(BATCHES[2].messages, TIMES)
+DRIVE, ESTIMATE = DriveKey("car7", T_US, RUN), Estimate(0.03, 0.02, 0.04, "ohm")
+FINDING = Finding(
+    DRIVE, "battery_worn", "warning", "a", 1, 2, "vesc", ("volts",), "worn", ESTIMATE, ESTIMATE, 0.1
+)
+FILE = File("a/b.bag", "recording", "application/x-rosbag", 5, "0" * 64, T_US)
+SHADOW = {
+    "live": {"rate_hz": 5},
+    "rejected": {"live.rate_hz": {"value": 50, "reason": "must be 0.1 to 10"}},
+    "commands": {"go": {"session": RUN, "seq": 1, "outcome": "done"}},
+    "stops": {"robot": {"by": "me", "t_ms": 1}},
+    "over_share": {"since_ms": 1, "last_ms": 2, "batches": 3},
+    "drive": encode_limits(DriveLimits("go", "speed", "angle", 1.0, 0.4, 300)),
+}
+ROW = ArchivedHour("dt/iort/car/vesc", "2023-11-14T22", "a.parquet", 1, 2, 0, "c", "d", 5, 6, 7).item()
+TRACK = "# x_m, y_m, w_right_m, w_left_m\n0, 0, 1, 1\n4, 0, 1, 1\n4, 4, 1, 1\n0, 4, 1, 1\n"
+
+
+def json_of(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def columns(items: Any) -> None:
+    """The columns' decoder passes over what is not a batch, and counts it."""
+    refused = RefusedItems()
+    found = part(items, refused).block
+    assert len(found.times_us) or refused.count
+    list(blocks([items], RefusedItems(), {"speed"}.__contains__))
+
+
+class Decoder(NamedTuple):
+    """How something valid is damaged, and what reads it."""
+
+    mutate: Callable[[Random, Any], Any]
+    decode: Callable[[Any], Any]
+    valid: tuple[Any, ...]
+    # Whether everything is decoded to something.
+    total: bool = False
+
+
+def of_texts(decode: Callable[[Any], Any], *valid: str) -> Decoder:
+    def damaged(random: Random, value: str) -> Any:
+        return mutated_bytes(random, value.encode()).decode("latin-1")
+
+    return Decoder(damaged, decode, valid)
+
+
+of_bytes = partial(Decoder, mutated_bytes)
+of_json = partial(Decoder, mutated_json)
+of_values = partial(Decoder, mutated_value)
+of_items = partial(Decoder, mutated_item)
+MESSAGES = tuple(encode_batch(batch) for batch in BATCHES)
+LIVE = LiveSample(RUN, 4, T_US, T_US + 5, {"speed": 1.5, "mode": "a"}, 0, 7, 100)
+DECODERS: Mapping[str, Decoder] = {
+    # The record lane.
+    "batch": of_json(decode_batch, MESSAGES),
+    "batch of an item": of_items(lambda item: decode_batch(plain(item)), ITEMS),
+    "item": of_items(lambda item: decode_item(plain(item)), ITEMS),
+    "messages of an item": of_items(lambda item: messages_of(plain(item), LAYOUTS), ITEMS),
+    "columns of items": of_items(lambda item: columns([ITEMS[0], item, ITEMS[1]]), ITEMS),
+    "columns of an item": of_items(lambda item: columns([item]), ITEMS),
+    "batches of items": of_items(lambda item: batches_of([ITEMS[0], item]), ITEMS, total=True),
+    "drive": of_items(lambda item: recorded(DRIVE, T_US + 9999, "vesc", [ITEMS[0], item]), ITEMS, total=True),
+    "batch id": of_texts(batch_id, f"{T_US}-{RUN}-3"),
+    "run ends": of_texts(run_ends, f"{RUN}-3 1{RUN}-0", ""),
+    "column": of_values(
+        lambda value: unpacked("a", value, 3), (packed([1, 2, 4]), packed([0.5, 1, 2]), [None, "a", 1, True])
+    ),
+    "topic": of_texts(parse_topic, "dt/iort/car/vesc"),
+    # ROS messages.
+    "ROS messages": of_bytes(
+        lambda body: view(unpack(body, 3)), tuple(pack(one.messages) for one in BATCHES[2:])
+    ),
+    "ROS columns": of_values(
+        lambda about: from_columns(COLUMNS, json.dumps(about), TIMES, LAYOUTS), (json.loads(ABOUT),)
+    ),
+    "ROS message": of_bytes(decoder_of(NAMES.layout).decode, (TEXTS[0],)),
+    "ROS message of numbers": of_bytes(decoder_of(FLAT.layout).decode, (RAWS[0],)),
+    "ROS definition": of_texts(
+        lambda text: parse("a_msgs/S", text), "Header header\nfloat64[3] x\nuint8 N=5\n" + HEADER
+    ),
+    "ROS layout": of_texts(lambda text: decoder_of(text).decode(RAWS[0]), FLAT.layout),
+    "message type": of_values(message_type, (MessageType("s", "/s", "a/A", "1", "float64 x").sample(),)),
+    # The live lane and the pings.
+    "live": of_json(decode_live, (encode_live(LIVE),)),
+    "live update": of_values(
+        decode_live_update, (live_update("car", "vesc", LIVE, 1, 2), live_update("car", "vesc", LIVE))
+    ),
+    "pong": of_json(decode_pong, (encode_ping(7, T_US),)),
+    "event": of_values(event_message, (rule_event(b"x", "live/iort/car/vesc", 5),)),
+    # To and from robots.
+    "command": of_json(
+        decode_command, (encode_command(Command(RUN, 1, 2, 3, 400, {"a": 1}, 100, True, "me")),)
+    ),
+    "fleet message": of_json(decode_fleet, (encode_fleet(FleetMessage(RUN, 1, T_US, {"a": 1}, 5)),)),
+    "lease": of_json(decode_lease, (encode_lease(Lease(RUN, 5.0, 1000)),)),
+    "limits": of_values(decode_limits, (SHADOW["drive"],), total=True),
+    "desired": of_values(decode_desired, (SHADOW,), total=True),
+    "reported": of_values(decode_reported, (SHADOW,), total=True),
+    "account": of_values(
+        account,
+        (
+            StreamAccount("vesc", 5, 5, 0, 0, 0, 2, ended=True).sample(),
+            SourceAccount("ros", {"/a.empty": 2}).sample(),
+        ),
+    ),
+    # Requests and their answers.
+    "query request": of_values(
+        decode_query_request,
+        (json.loads(encode_query_request(QueryRequest("car", "vesc", 5, 9, ("a",), "a > 1"))),),
+    ),
+    "query answer": of_json(
+        decode_query_answer,
+        (
+            json.dumps(
+                encode_query_answer(QueryAnswer(2, ("a",), 3, 1, 1, "codec", {"a": 2}, None, b"x"))
+            ).encode(),
+        ),
+    ),
+    "query samples": of_bytes(unpacked_samples, (packed_samples(TIMES, {"a": [1, None, "x"]}),)),
+    "query samples' text": of_json(
+        lambda text: unpacked_samples(zlib.compress(text)),
+        (zlib.decompress(packed_samples(TIMES, {"a": [1, None, "x"], "b": [1, 2, 3]})),),
+    ),
+    "file request": of_json(
+        decode_file_request, (encode_file_request(FileRequest(RUN, FILE, {1: "0" * 64})),)
+    ),
+    "file answer": of_json(
+        decode_file_answer,
+        (encode_file_answer(FileAnswer(RUN, "k", have=((1, 2),), addresses=(Address(3, "u", {"a": "b"}),))),),
+    ),
+    "file key": of_texts(parse_file_key, file_key("car", FILE)),
+    "question": of_json(decode_ask, (encode_ask(Ask(RUN, T_US, 500, {"a": 1}, 5)),)),
+    "answer": of_json(decode_answer, (encode_answer(Answer(RUN, {"a": 1})),)),
+    "track": of_texts(parse_track, TRACK),
+    "track of lists": of_values(track_of, (json_of(vars(parse_track(TRACK))),)),
+    # The analysis.
+    "finding": of_values(decode_finding, (json_of(encode_finding(FINDING)),)),
+    "note": of_values(decode_note, (encode_note(Note("car7", T_US, "a", "me", "0badcafe")),)),
+    "analysis request": of_values(
+        lambda content: decode_request(content, T_US),
+        (encode_request(AnalysisRequest(("car",), 1, 9)), {"last_s": 60}),
+    ),
+    "planned drive": of_values(
+        decode_planned, (encode_planned(PlannedDrive(DRIVE, T_US + 5, ("vesc",), "vesc")),)
+    ),
+    "analysed drive": of_values(
+        decode_analysed,
+        (
+            json_of(
+                encode_analysed(AnalysedDrive(DRIVE, 5, "job", 9, {"a": ESTIMATE}, {"b": "no"}, {"c": 1}))
+            ),
+        ),
+    ),
+    # The archive and the summary.
+    "manifest row": of_items(archived_hour, (ROW,)),
+    "hour": of_texts(parse_hour, "2023-11-14T22"),
+    "pending": of_items(parse_pending, (Pending("dt/iort/car/vesc", "2023-11-14T22").key,)),
+    "second": of_values(flat_second, ({"n": 5, "speed": [1, 2, 3, 4], "volts": [7]},), total=True),
+}
+
+
+def decode_or_refuse(decoder: Decoder, value: Any) -> None:
+    try:
+        decoder.decode(value)
+    except ContractError as error:
+        assert not decoder.total
+        str(error).encode()  # the error can be logged, whatever the message held
+
+
+@pytest.mark.parametrize("name", DECODERS)
+def test_what_is_valid_is_decoded(name: str) -> None:
+    for valid in DECODERS[name].valid:
+        DECODERS[name].decode(valid)
+
+
+@pytest.mark.parametrize("name", DECODERS)
+@examples(100)
+@given(st.randoms(use_true_random=False))
+def test_what_is_damaged_is_decoded_or_refused(name: str, random: Random) -> None:
+    decoder = DECODERS[name]
+    decode_or_refuse(decoder, decoder.mutate(random, random.choice(decoder.valid)))
+
+
+def of_raw_bytes() -> list[str]:
+    return [name for name, one in DECODERS.items() if one.mutate in (mutated_bytes, mutated_json)]
+
+
+@pytest.mark.parametrize("name", of_raw_bytes())
+@given(st.binary(max_size=300))
+def test_any_bytes_are_decoded_or_refused(name: str, content: bytes) -> None:
+    decode_or_refuse(DECODERS[name], content)
+
+
+@pytest.mark.parametrize(
+    "body", [b"1]}}", b"]}}", b'"]}}', b'{"dt"]}}', b'{"dt":[0],"fields":{"a]}}', b'{"dt":[0]}}']
+)
+def test_a_body_of_few_quotes_is_refused(body: bytes) -> None:
+    """Such a body once ended every reader of its robot."""
+    deflater = zlib.compressobj(6, zdict=DICTIONARY)
+    packed_body = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+    refused = RefusedItems()
+    found = part([{**ITEMS[0], "samples": {"S": packed_body}}, ITEMS[1]], refused)
+    assert (refused.count, len(found.block.times_us)) == (1, 3)
