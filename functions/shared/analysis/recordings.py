@@ -19,7 +19,7 @@ from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import Item, TelemetryTable, plain, quick, with_samples_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.batch import batch_id, decode_batch
 from iort_contract.tables import BATCH, ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 
 # A stream with more fields is a scan or an image, from which nothing is mined.
 MAX_FIELDS = 100
-# A stream's fields are looked at so often in a range: a field may come later. So many broken batches in a row
-# tell none.
+# A stream's fields are looked at so often in a range, nearer to each other where its recordings end sooner: a
+# field may come later. So many broken batches in a row tell none.
 _LOOKS, _TRIES = 4, 5
+_LEAST_APART_US = 60_000_000
 
 
 class Registered(NamedTuple):
@@ -86,11 +87,18 @@ class Recordings:
         """The fields that a stream has at the beginning of a range or at some times later; None if it has no
         samples there that could be mined."""
         names: dict[str, None] | None = None
-        for look in range(_LOOKS):
-            at_us = start_us + (end_us - start_us) * look // _LOOKS
+        # A range may begin years before the recordings, and end years after them.
+        at_us, apart_us, looks = start_us, (end_us - start_us) // _LOOKS, 0
+        seen_us = start_us
+        while looks < _LOOKS and at_us < end_us:
             found = list(islice(self.items(robot, stream, at_us, end_us, page_items=_TRIES), _TRIES))
-            if not found:
+            if found:
+                looks, seen_us = looks + 1, max(at_us, _start_us(found[0]))
+            elif not looks or apart_us < _LEAST_APART_US:
                 break
+            else:
+                apart_us //= _LOOKS
+            at_us = seen_us + max(apart_us, 1)
             for item in found:
                 with suppress(ContractError):
                     names = (names or {}) | dict.fromkeys(decode_batch(plain(item)).columns)
@@ -108,6 +116,14 @@ def robots_of(client: DynamoDBClient, table: str) -> list[str]:
 
 def _key(item: Item) -> str:
     return str(item[BATCH]["S"])
+
+
+def _start_us(item: Item) -> int:
+    """The time of a stored batch, by its id; 0 for what is not a batch."""
+    try:
+        return batch_id(_key(item)).t_us
+    except ContractError:
+        return 0
 
 
 def _is_number(value: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from iort_contract.messages.analysis.findings import Estimate
 from iort_contract.messages.analysis.run import AnalysedDrive
 
 GAIN = "speed_to_erpm_gain"
+_NUMBER = re.compile(r"\d[\d.,]*")
 
 
 class Calibrated(NamedTuple):
@@ -22,7 +24,7 @@ class Calibrated(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """The parameters that drives gave, and the newest drive's reasons for the others."""
+    """The parameters that drives gave, and why the drives did not give the others."""
 
     found: Mapping[str, Calibrated]
     missing: Mapping[str, str]
@@ -39,9 +41,23 @@ def calibration(drives: Sequence[AnalysedDrive]) -> Calibration:
         if known:
             used = known[:1] if parameter.state else known
             found[name] = Calibrated(combined(used), len(used))
-        elif reason := next((drive.missing[name] for drive in drives if name in drive.missing), None):
-            missing[name] = reason
+        elif reasons := [drive.missing[name] for drive in drives if name in drive.missing]:
+            missing[name] = _reasons(reasons)
     return Calibration(found, missing)
+
+
+def _reasons(reasons: Sequence[str]) -> str:
+    """The drives' reasons, the most frequent first, each with the number of drives that give it.
+
+    Reasons that differ in their numbers alone are one, with the newest drive's numbers.
+    """
+    alike: dict[str, list[str]] = {}
+    for reason in reasons:
+        alike.setdefault(_NUMBER.sub("#", reason), []).append(reason)
+    if len(alike) == 1:
+        return reasons[0]
+    ranked = sorted(alike.values(), key=len, reverse=True)
+    return "; ".join(f"{same[0]} ({len(same)} of {len(reasons)} drives)" for same in ranked)
 
 
 def vesc_yaml(calibrated: Calibration, vehicle: Vehicle | None) -> str:

@@ -18,7 +18,7 @@ from iort_contract.messages.analysis.insights import (
     FindingEntry,
     InsightsAnswer,
 )
-from iort_contract.messages.analysis.run import MAX_RANGE_US, AnalysedDrive, AnalysisRequest
+from iort_contract.messages.analysis.run import AnalysedDrive, AnalysisRequest
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data.analysis import findings as stored
@@ -30,6 +30,8 @@ from iort_station.page.answers.parameters import text, whole
 _DRIVES, _FINDINGS = 60, 60
 _FLEET_DRIVES, _FLEET_FINDINGS = 3, 10
 _READERS = 8
+# The page asks for days; a year is more than it offers.
+_LONGEST_S = 366 * 86_400
 
 
 def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
@@ -59,7 +61,7 @@ def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
 
 def analyse(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisStarted:
     """Start an analysis of the drives of the last ``last_s``: of ``robot``, or of all robots without one."""
-    last_us = whole(asked, "last_s", 1, MAX_RANGE_US // 1_000_000) * 1_000_000
+    last_us = whole(asked, "last_s", 1, _LONGEST_S) * 1_000_000
     robots = (check_robot(asked["robot"]),) if asked.get("robot") else ()
     now_us = time.time_ns() // 1000
     run = analysis.start(cloud, AnalysisRequest(robots, now_us - last_us, now_us, again=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import pytest
 from typer.testing import CliRunner
@@ -12,6 +13,7 @@ from iort_contract.messages.analysis.findings import DriveKey, Finding
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.cli.verbs.operations import analyse
+from iort_station.data import inventory
 from iort_station.data.analysis import findings
 from iort_station.fleet import registry
 from iort_station.operations import analysis
@@ -56,3 +58,23 @@ def test_a_failed_drive_counts_that_began_before_the_range_and_goes_on_in_it(mon
 
     assert (done.exit_code, json.loads(done.stdout)["failed"]) == (1, 1)
     assert done.stderr == "iort: car7: no memory is left\n"
+
+
+def test_all_drives_are_all_and_without_one_it_is_told_what_is_recorded(monkeypatch):
+    requests = []
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: None)
+    monkeypatch.setattr(registry, "get", lambda *_given: {})
+    monkeypatch.setattr(analysis, "start", lambda _cloud, request: requests.append(request) or "arn:run")
+    monkeypatch.setattr(analysis, "watch", lambda *_given: iter([Progress(SUCCEEDED)]))
+    monkeypatch.setattr(findings, "findings", lambda *_given: [])
+    monkeypatch.setattr(inventory, "streams_of", lambda _cloud, robot: ["vesc"] * (robot == "car7"))
+    monkeypatch.setattr(inventory, "extent", lambda *_given: ("2019-05-01T10:00:00Z", "2019-05-01T11:00:00Z"))
+
+    done = CliRunner().invoke(app, ["analyse", "car7", "car8", "--last", "all", "--wait"])
+
+    (request,) = requests
+    # A clock that is ahead may be stored, too.
+    assert (request.start_us, request.end_us > (time.time() + 300 * 86_400) * S) == (0, True)
+    assert "car7: no drives from 1970-01-01T00:00:00Z to " in done.stderr
+    assert "it recorded from 2019-05-01T10:00:00Z to 2019-05-01T11:00:00Z" in done.stderr
+    assert "car8: no drives: it has recorded nothing" in done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
@@ -61,6 +62,17 @@ def test_a_state_is_that_of_the_newest_drive(iort):
 
     assert found["value"] == 11.2
     assert found["drives"] == 1
+
+
+def test_the_reasons_of_all_drives_are_told_the_most_frequent_first(iort):
+    short = [replace(drive(9 - i), missing={"effective_mass_kg": f"lasts {i} s"}) for i in range(2)]
+    steady = [replace(drive(7 - i), missing={"effective_mass_kg": "hardly accelerates"}) for i in range(5)]
+
+    said, _ = iort([*short, *steady])
+
+    assert "no effective_mass_kg: hardly accelerates (5 of 7 drives); lasts 0 s (2 of 7 drives)" in said
+    # One reason needs no count, though its numbers differ.
+    assert "no effective_mass_kg: lasts 0 s\n" in iort(short)[0]
 
 
 def test_a_robot_without_analysed_drives_is_told(iort):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from typing import Annotated
 
@@ -10,13 +11,9 @@ import typer
 
 from iort_analysis.drives.finding import LONGEST_US
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
-from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.run import (
-    MAX_RANGE_US,
-    AnalysisRequest,
-    decode_request,
-    encode_request,
-)
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.limits import MAX_AHEAD_US, ContractError
+from iort_contract.messages.analysis.run import AnalysisRequest, decode_request, encode_request
 from iort_station.cli import completion
 from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged
@@ -26,6 +23,7 @@ from iort_station.data.analysis import findings
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
+from iort_station.times import iso_s
 
 commands = typer.Typer()
 # The range without an option.
@@ -77,7 +75,8 @@ def analyse(
     facts = {"run": name, "drives": done.drives or 0, "failed": len(failed), "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
     if not done.drives:
-        text += "; a drive begins when the car moves: `iort runs` lists what was recorded"
+        for line in _recorded(cloud, robots or sorted(findings.named(cloud, None)), request):
+            say(line)
     for one in failed:
         say(f"{one.drive.robot}: {one.text}")
     tell(facts, f"{text}, drives failed: {len(failed)}" if failed else text, as_json=as_json)
@@ -86,13 +85,31 @@ def analyse(
 
 def _request(robots: list[str], when: When, *, again: bool) -> AnalysisRequest:
     within, now_us = when.range(_USUAL), time.time_ns() // 1000
-    end_us = within.end_us or now_us
-    start_us = max(0, end_us - MAX_RANGE_US) if within.start_us is None else within.start_us
-    request = AnalysisRequest(tuple(robots), start_us, end_us, again=again)
+    # Without a range all drives are meant, also those of a clock that is ahead.
+    end_us = now_us + MAX_AHEAD_US if within.end_us is None else within.end_us
+    request = AnalysisRequest(tuple(robots), within.start_us or 0, end_us, again=again)
     try:
         return decode_request(encode_request(request), now_us)
     except ContractError as error:
         raise UsageError(str(error)) from error
+
+
+def _recorded(cloud: Cloud, robots: Iterable[str], request: AnalysisRequest) -> Iterator[str]:
+    """Why a range may have no drives: what each robot recorded, and when."""
+    # numpy takes longer to load than most commands to run.
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
+
+    for robot in robots:
+        streams = [name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS]
+        extents = [times for name in streams if (times := inventory.extent(cloud, robot, name))]
+        if not extents:
+            yield f"{robot}: no drives: it has recorded nothing"
+            continue
+        first, last = min(times[0] for times in extents), max(times[1] for times in extents)
+        yield (
+            f"{robot}: no drives from {iso_s(request.start_us)} to {iso_s(request.end_us)}: "
+            f"it recorded from {first} to {last}"
+        )
 
 
 def _watched(cloud: Cloud, run: str) -> analysis.Progress:
