@@ -21,8 +21,8 @@ from functions.shared.analysis.failures import failed_plans
 from functions.shared.analysis.kept import Kept
 from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
-from iort_analysis.drives.finding import STAND_US, Heard, find
-from iort_analysis.drives.motion import motion_field, motion_stream, moving
+from iort_analysis.drives.finding import STAND_US, Found, Heard, find
+from iort_analysis.drives.motion import Motion, motion_among
 from iort_analysis.samples.batches import RefusedItems, blocks
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import plan_key
@@ -60,27 +60,35 @@ def planned(robot: str, request: AnalysisRequest, recordings: Recordings) -> lis
     }
     if not fields:
         return []
-    motion = motion_stream(fields)
+    motion = motion_among(fields)
     # Without a speed every stream is as good, and only pauses and runs cut.
-    stream = motion or min(fields)
-    heard = _Heard(recordings, robot, stream, motion_field(fields[stream]))
+    heard = _Heard(recordings, robot, min(fields) if motion is None else motion.stream, motion)
+    drives = heard.drives(request)
+    if not drives and motion is not None:
+        # Recorded, and never moved: its longest stand is looked at, which says so.
+        stands = _Heard(recordings, robot, motion.stream, None).drives(request)
+        drives = sorted(stands, key=lambda one: one.last_us - one.start_us)[-1:]
     return [
         PlannedDrive(
             DriveKey(robot, found.start_us, found.run),
             found.last_us + MAX_BATCH_SPAN_US - 1,
             tuple(sorted(fields)),
-            motion or "",
+            "" if motion is None else motion.stream,
         )
-        for found in find(heard.between(heard.beginning_us(request.start_us), _END_US), request.end_us)
-        if found.last_us >= request.start_us
+        for found in drives
     ]
 
 
 class _Heard:
-    """The batches of the stream that tells of motion, by ``field``; without one only pauses and runs cut."""
+    """The batches of the stream that tells of ``motion``; without it only pauses and runs cut."""
 
-    def __init__(self, recordings: Recordings, robot: str, stream: str, field: str | None) -> None:
-        self._recordings, self._robot, self._stream, self._field = recordings, robot, stream, field
+    def __init__(self, recordings: Recordings, robot: str, stream: str, motion: Motion | None) -> None:
+        self._recordings, self._robot, self._stream, self._motion = recordings, robot, stream, motion
+
+    def drives(self, request: AnalysisRequest) -> list[Found]:
+        """The drives that have samples in the range."""
+        batches = self.between(self.beginning_us(request.start_us), _END_US)
+        return [one for one in find(batches, request.end_us) if one.last_us >= request.start_us]
 
     def beginning_us(self, start_us: int) -> int:
         """The time from which on to look: that of the range, or where a drive began that goes on there."""
@@ -104,11 +112,11 @@ class _Heard:
 
     def _moves(self, item: Item) -> bool:
         """Whether the car moves in a batch, or nobody knows."""
-        if self._field is None:
+        if self._motion is None:
             return True
-        for block in blocks([[item]], RefusedItems(), self._field.__eq__):
-            moves = moving(block.columns)
-            return moves is None or bool(moves.any() or np.isnan(block.columns[self._field]).all())
+        for block in blocks([[item]], RefusedItems(), self._motion.field.__eq__):
+            moves = self._motion.moves(block.columns)
+            return moves is None or bool(moves.any() or np.isnan(block.columns[self._motion.field]).all())
         return False
 
 

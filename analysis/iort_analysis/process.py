@@ -108,7 +108,7 @@ def _finite_event(event: Event) -> Event:
 def _wild(drive: Drive) -> str:
     """The motor controller's fields with wild values that the cleaning left, since they were too many."""
     block = drive.streams.get(drive.vesc or "")
-    moves = None if block is None else moving(block.columns)
+    moves = None if block is None else moving(drive.vesc or "", block.columns)
     if block is None or moves is None:
         return ""
     shares = {name: wild_share(column, moves) for name, column in block.columns.items()}

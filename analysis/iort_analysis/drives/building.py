@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from iort_analysis.drives.cleaning import clean, numeric
 from iort_analysis.drives.clock import on_one_clock
 from iort_analysis.drives.drive import Drive, Repair
-from iort_analysis.drives.motion import motion_stream, moving, pose_of, vesc_of, with_position
+from iort_analysis.drives.motion import Motion, motion_among, pose_of, vesc_of, with_position
 from iort_analysis.drives.transform import with_derived
 from iort_analysis.samples.blocks import Block, ordered
 from iort_contract.catalog.derived import Vehicle
@@ -27,7 +27,7 @@ def build(
     raw = {name: ordered(block) for name, block in sorted(streams.items()) if len(block.times_us)}
     numbers = {name: with_position(numeric(block)) for name, block in raw.items()}
     names = {name: block.columns.keys() for name, block in numbers.items()}
-    is_moving = _Motion(numbers, motion_stream(names))
+    is_moving = _Moving(numbers, motion_among(names))
     cleaned: dict[str, Block] = {}
     repairs: list[Repair] = []
     for name, block in numbers.items():
@@ -49,12 +49,12 @@ def build(
     )
 
 
-class _Motion:
+class _Moving:
     """Whether the car moves at some times, by the stream that tells; never, if none does."""
 
-    def __init__(self, streams: Mapping[str, Block], stream: str | None) -> None:
-        block = None if stream is None else streams[stream]
-        self._moves = None if block is None else moving(block.columns)
+    def __init__(self, streams: Mapping[str, Block], motion: Motion | None) -> None:
+        block = None if motion is None else streams[motion.stream]
+        self._moves = None if motion is None or block is None else motion.moves(block.columns)
         self._times = None if block is None else block.times_us
 
     def __call__(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:

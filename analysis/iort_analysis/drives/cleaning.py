@@ -5,14 +5,16 @@ All of it is numpy over whole columns: an hour of a motor controller is 180,000 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT, Repair
+from iort_analysis.drives.motion import is_vesc
 from iort_analysis.samples.blocks import Block, Column
-from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS
+from iort_contract.catalog.vesc import ABSENT_FROM, MEASURED, VESC_FIELDS
 
 Moving = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
 
@@ -21,6 +23,13 @@ _PAUSE_INTERVALS, _PAUSE_US = 10, 500_000
 # A value is frozen that stays exactly equal for this long while the car moves, and this many times longer
 # than it usually stays.
 _FROZEN_US, _FROZEN_TIMES = 5_000_000, 20
+# How sure a receiver is of its position is no sensor of the car's: gnss_hAcc, position_covariance.0, hdop.
+_ACCURACY = re.compile(
+    r"(?:.*[._])?(?:[hvs]_?acc(?:uracy)?|accuracy|[ghpv]?dop|\w*(?:covariance|std_?dev|sigma|uncertainty).*)",
+    re.IGNORECASE,
+)
+# A counter's changes have one sign but for so many, such as a reset.
+_RESETS = 0.01
 # Hampel: this many scaled median absolute deviations from the median of this many samples on either side.
 _HAMPEL, _HALF = 8.0, 7
 _MAD_TO_SIGMA = 1.4826
@@ -56,7 +65,8 @@ def clean(stream: str, block: Block, moving: Moving) -> tuple[Block, list[Repair
     last = np.append(times[1:] != times[:-1], True) if len(times) else np.empty(0, dtype=np.bool_)
     same = np.flatnonzero(~last)
     distinct = block.take(last) if len(same) else block
-    cleaning = _Cleaning(stream, distinct.times_us, moving(distinct.times_us))
+    sensors = MEASURED if is_vesc(stream, distinct.columns) else frozenset[str]()
+    cleaning = _Cleaning(stream, distinct.times_us, moving(distinct.times_us), sensors)
     if len(same):
         cleaning.repairs.append(
             Repair(SAME_TIME, stream, "", int(times[same[0]]), int(times[same[-1]]), len(same))
@@ -79,8 +89,10 @@ def pause_us(times: NDArray[np.int64]) -> int:
 class _Cleaning:
     """The cleaning of one stream, and its repairs so far."""
 
-    def __init__(self, stream: str, times: NDArray[np.int64], moves: NDArray[np.bool_]) -> None:
-        self._stream, self._times = stream, times
+    def __init__(
+        self, stream: str, times: NDArray[np.int64], moves: NDArray[np.bool_], sensors: frozenset[str]
+    ) -> None:
+        self._stream, self._times, self._sensors = stream, times, sensors
         self._moves, self._moved = moves, np.append(0, np.cumsum(moves))
         self.repairs: list[Repair] = []
 
@@ -110,7 +122,12 @@ class _Cleaning:
         return self._nulled(SENSOR_FAULT, name, column, bad)
 
     def _without_frozen(self, name: str, column: Column) -> Column:
-        """NaN where a value stays exactly equal for far longer than it usually does while the car moves."""
+        """NaN where a sensor's value stays exactly equal for far longer than it usually does while the car
+        moves."""
+        if name not in self._sensors and (
+            (self._sensors and name in VESC_FIELDS) or _ACCURACY.fullmatch(name) or _counts(column)
+        ):
+            return column
         times = self._times
         changes = np.flatnonzero(column[1:] != column[:-1]) + 1
         # A field that hardly changes has no usual time to stay.
@@ -124,6 +141,10 @@ class _Cleaning:
         in_motion = self._moved[ends] - self._moved[starts] >= 0.9 * (ends - starts)
         usual = float(np.quantile(lasted[in_motion & ~long], 0.95)) if (in_motion & ~long).any() else np.inf
         frozen = long & in_motion & (lasted >= _FROZEN_TIMES * max(usual, 1.0)) & ~np.isnan(column[starts])
+        if name not in self._sensors:
+            # A set point comes back to its values, and rests there; a sensor's noise does not.
+            values, times_there = np.unique(column[starts], return_counts=True)
+            frozen &= times_there[np.searchsorted(values, column[starts])] == 1
         for start, end in zip(starts[frozen].tolist(), ends[frozen].tolist(), strict=True):
             self._repaired(FROZEN, name, np.array([start, end - 1]), end - start)
         return np.where(np.repeat(frozen, ends - starts), np.nan, column) if frozen.any() else column
@@ -168,6 +189,13 @@ class _Cleaning:
     def _repaired(self, kind: str, name: str, places: NDArray[np.intp], samples: int) -> None:
         first, last = int(self._times[places[0]]), int(self._times[places[-1]])
         self.repairs.append(Repair(kind, self._stream, name, first, last, samples))
+
+
+def _counts(column: Column) -> bool:
+    """Whether a field only grows, or only falls."""
+    steps = np.diff(column[~np.isnan(column)])
+    falls, rises = np.count_nonzero(steps < 0), np.count_nonzero(steps > 0)
+    return bool(min(falls, rises) <= _RESETS * max(falls, rises))
 
 
 def _floats(column: Column) -> Column | None:

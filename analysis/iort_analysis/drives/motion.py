@@ -3,37 +3,78 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.samples.blocks import Block, Column
+from iort_contract.catalog.streams import CATALOG
+from iort_contract.catalog.vesc import VESC, VESC_STREAM
 
-# A field of speed, and the absolute value above which the car moves: a few centimetres a second. The first
-# one that a stream has counts.
-MOTION = {
-    "speed": 200.0,  # erpm
-    "speed_meters_per_sec": 0.05,
-    "twist.twist.linear.x": 0.05,
-    "linear.x": 0.05,
-}
+# The last parts of fields that have a speed. The first one that a robot has counts: odometries and receivers
+# measure it, and a speed or a twist may be a command.
+_SPEEDS = (
+    "twist.twist.linear.x",
+    "speed_meters_per_sec",
+    "speed_mps",
+    "gnss_gVel",
+    "velocity",
+    "twist.linear.x",
+    "speed",
+    "linear.x",
+)
+# The absolute value above which a car moves, by the unit: a few centimetres a second.
+_LEAST = {"erpm": 200.0, "m/s": 0.05}
+# ROS has speeds in SI units (REP 103).
+_USUAL = "m/s"
 _VESC = frozenset({"speed", "voltage_input", "current_motor"})
 # Where the usual messages have a position and a direction: an odometry, a stamped pose, a pose.
 _PLACES = ("pose.pose.", "pose.", "")
 
 
-def motion_field(names: Collection[str]) -> str | None:
-    """The field that tells whether the car moves; None if there is none."""
-    return next((name for name in MOTION if name in names), None)
+def is_vesc(stream: str, names: Collection[str]) -> bool:
+    """Whether a stream's fields are a motor controller's: by its name in the catalogue, or by its fields."""
+    return stream == VESC_STREAM or frozenset(names) >= _VESC
 
 
-def moving(columns: Mapping[str, Column]) -> NDArray[np.bool_] | None:
-    """Whether the car moves, for every sample; None if no field tells."""
-    name = motion_field([name for name, column in columns.items() if column.dtype.kind == "f"])
-    if name is None:
-        return None
-    with np.errstate(invalid="ignore"):
-        return np.abs(columns[name]) > MOTION[name]
+class Motion(NamedTuple):
+    """The field of a stream that tells whether the car moves, and its unit."""
+
+    stream: str
+    field: str
+    unit: str
+
+    @property
+    def least(self) -> float:
+        """The absolute value above which the car moves, in the unit."""
+        return _LEAST[self.unit]
+
+    def moves(self, columns: Mapping[str, Column]) -> NDArray[np.bool_] | None:
+        """Whether the car moves, for every sample of the stream; None if the field has no numbers."""
+        column = columns.get(self.field)
+        if column is None or column.dtype.kind != "f":
+            return None
+        with np.errstate(invalid="ignore"):
+            return np.abs(column) > self.least
+
+
+def motion_of(stream: str, names: Collection[str]) -> Motion | None:
+    """What tells of motion in a stream with these fields; None if nothing does."""
+    if is_vesc(stream, names) and "speed" in names:
+        return Motion(stream, "speed", VESC.unit("speed"))
+    for speed in _SPEEDS:
+        for name in sorted(names):
+            if name == speed or name.endswith(f".{speed}"):
+                unit = CATALOG[stream].unit(name) if stream in CATALOG else ""
+                return Motion(stream, name, unit if unit in _LEAST else _USUAL)
+    return None
+
+
+def moving(stream: str, columns: Mapping[str, Column]) -> NDArray[np.bool_] | None:
+    """Whether the car moves, for every sample of a stream; None if no field tells."""
+    motion = motion_of(stream, [name for name, column in columns.items() if column.dtype.kind == "f"])
+    return None if motion is None else motion.moves(columns)
 
 
 def vescs_of(streams: Mapping[str, Collection[str]]) -> list[str]:
@@ -46,10 +87,15 @@ def vesc_of(streams: Mapping[str, Collection[str]]) -> str | None:
     return next(iter(vescs_of(streams)), None)
 
 
-def motion_stream(streams: Mapping[str, Collection[str]]) -> str | None:
-    """The stream that tells whether the car moves: the motor controller's, or the first one with a speed."""
-    with_speed = (name for name, fields in streams.items() if motion_field(fields) is not None)
-    return vesc_of(streams) or min(with_speed, default=None)
+def motion_among(streams: Mapping[str, Collection[str]]) -> Motion | None:
+    """What tells of a robot's motion: its motor controller's speed, or else the best field that it has."""
+    told = [motion for name, fields in sorted(streams.items()) if (motion := motion_of(name, fields))]
+    return min(told, key=lambda one: _rank(one, vesc_of(streams)), default=None)
+
+
+def _rank(motion: Motion, vesc: str | None) -> tuple[bool, int]:
+    places = (i for i, speed in enumerate(_SPEEDS) if f".{motion.field}".endswith(f".{speed}"))
+    return motion.stream != vesc, next(places)
 
 
 def pose_of(streams: Mapping[str, Block]) -> str | None:

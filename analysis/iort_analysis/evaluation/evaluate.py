@@ -77,7 +77,14 @@ class _Comparison:
             self.unusual.add(parameter.name)
         if parameter.kind:
             finding = _of_parameter(result, parameter, texts.changed(parameter, found, expected, whose))
-            self.findings.append(replace(finding, effect=effect, baseline=expected.interval(found.unit), p=p))
+            self.findings.append(
+                replace(
+                    finding,
+                    effect=texts.rounded(effect),
+                    baseline=texts.rounded(expected.interval(found.unit)),
+                    p=p,
+                )
+            )
 
 
 def _expected(
@@ -125,7 +132,11 @@ def _trends(result: DriveResult, earlier: Sequence[Measured]) -> Iterable[Findin
         finding = _of_parameter(result, parameter, texts.trending(parameter, newest, effect, found.days))
         at = having[0].estimates[name]
         yield replace(
-            finding, subject=f"{name}_trend", effect=effect, baseline=at, p=min(1.0, p[parameter.worse])
+            finding,
+            subject=f"{name}_trend",
+            effect=texts.rounded(effect),
+            baseline=texts.rounded(at),
+            p=min(1.0, p[parameter.worse]),
         )
 
 
@@ -154,7 +165,7 @@ def _of_event(result: DriveResult, event: Event) -> Finding:
         stream=event.stream,
         fields=event.fields,
         text=event.text,
-        effect=event.effect,
+        effect=None if event.effect is None else texts.rounded(event.effect),
         p=event.p,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from iort_analysis.evaluation.baselines import Baseline
@@ -36,6 +37,16 @@ def complete(finding: Finding, explained: Sequence[Finding]) -> str:
     if alternatives := KINDS[finding.kind].alternatives:
         sentences.append(f"The data cannot tell this from {' or '.join(alternatives)}")
     return ". ".join(sentences)
+
+
+def rounded(estimate: Estimate) -> Estimate:
+    """The estimate with the digits that it deserves: three of its interval's width, or six without one."""
+    size = estimate.high - estimate.low or 1e-3 * abs(estimate.value)
+    if not size:
+        return estimate
+    places = 2 - math.floor(math.log10(size))
+    value, low, high = (round(float(each), places) for each in estimate[:3])
+    return Estimate(value, low, high, estimate.unit)
 
 
 def _with_interval(estimate: Estimate) -> str:

@@ -81,6 +81,9 @@ VESC = Stream(
 VESC_FIELDS = {field.name: field for field in VESC.fields}
 # Field -> the value at and below which its sensor is not fitted; for whole columns.
 ABSENT_FROM = {f.name: NO_SENSOR_DEGC for f in VESC_FIELDS.values() if f.unit == "degC"}
+# What the controller's sensors measure. Its counters and codes may stand still for long, and so may the duty
+# cycle, which it sets itself.
+MEASURED = frozenset(f.name for f in VESC_FIELDS.values() if f.unit in {"V", "A", "degC", "erpm", "deg"})
 
 
 def absent(field: str, value: Value) -> bool:

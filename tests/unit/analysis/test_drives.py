@@ -9,6 +9,7 @@ import pytest
 
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT
+from iort_analysis.drives.motion import motion_among
 from iort_analysis.samples.blocks import Block, join
 from tests.unit.analysis.simulated import HZ, KEY, START_US, VEHICLE, changed, streams
 
@@ -82,6 +83,30 @@ def test_streams_come_onto_the_motor_controllers_clock() -> None:
     # A turn through pi passes no 0.
     known = heading[:999]
     assert (np.abs(np.angle(np.exp(1j * np.diff(known)))) < 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("streams_of", "stream", "field", "least"),
+    [
+        ({"vesc": {"speed": 0.0}}, "vesc", "speed", 200),
+        ({"board": dict.fromkeys(("speed", "voltage_input", "current_motor"), 0.0)}, "board", "speed", 200),
+        ({"base": {"speed": 0.0}}, "base", "speed", 0.05),
+        (
+            {"cmd": {"drive.speed": 0.0}, "odom": {"twist.twist.linear.x": 0.0}},
+            "odom",
+            "twist.twist.linear.x",
+            0.05,
+        ),
+        ({"gps": {"gnss_gVel": 0.0}, "a": {"linear.x": 0.0}}, "gps", "gnss_gVel", 0.05),
+        ({"pose": {"x": 0.0, "groundspeed": 0.0}}, None, None, None),
+    ],
+)
+def test_the_field_that_tells_of_motion_has_the_unit_of_its_stream(
+    streams_of: dict, stream: str | None, field: str | None, least: float | None
+) -> None:
+    motion = motion_among(streams_of)
+    told = (None, None, None) if motion is None else (motion.stream, motion.field, motion.least)
+    assert told == (stream, field, least)
 
 
 def test_derived_quantities_follow_the_car() -> None:

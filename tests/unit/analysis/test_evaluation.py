@@ -103,6 +103,16 @@ def test_an_event_counts_by_its_chance_or_by_its_miner() -> None:
     assert [finding.from_us - at for finding in found] == [1, 2]
 
 
+def test_a_findings_numbers_have_the_digits_that_their_interval_deserves() -> None:
+    effects = [Estimate(5.63999, 5.63999, 5.720001, "s"), Estimate(3.0, 3.0, 3.0, "1"), None]
+    at = key(100).start_us
+    events = [Event("analysis_failed", at + i, at, "", (), "text", one) for i, one in enumerate(effects)]
+
+    found = evaluate([result(0.03, *events)], [], [])
+
+    assert [finding.effect for finding in found] == [Estimate(5.64, 5.64, 5.72, "s"), effects[1], None]
+
+
 def test_one_cause_is_one_finding() -> None:
     usual = {"speed_to_erpm_gain": 4614.0, "rolling_current_a": 4.0, "voltage_drift_v": 0.0}
     units = {"speed_to_erpm_gain": "erpm per m/s", "rolling_current_a": "A", "voltage_drift_v": "V"}

@@ -477,6 +477,41 @@ def test_a_field_that_comes_later_tells_of_motion(cloud: Deployed) -> None:
     assert planned["motion"] == "vesc"
 
 
+def test_a_speed_is_in_the_unit_of_its_stream(cloud: Deployed) -> None:
+    """A field named speed is in erpm where a motor controller has it, and in m/s elsewhere."""
+    times = START_US + np.arange(300 * 10, dtype=np.int64) * 100_000
+    # Two drives at 1.5 m/s, and a minute and a half between them.
+    there = (times - START_US) // S
+    speed = np.where((there > 20) & (there < 100) | (there > 200) & (there < 280), 1.5, 0.0)
+    cloud.register(CAR, "base", "told")
+    cloud.record({"base": Block(times, {"speed": speed, "steering_angle": speed / 10})})
+
+    planned = cloud.run()
+
+    assert [one["motion"] for one in planned] == ["base", "base"]
+    assert [(one["start_us"] - START_US) // S for one in planned] == [11, 191]
+
+
+def test_a_robot_that_records_and_never_moves_is_a_finding(cloud: Deployed) -> None:
+    vesc = streams(90)["vesc"]
+    # Its speed is in m/s, though its stream is a motor controller's.
+    slow = Block(vesc.times_us, {**vesc.columns, "speed": vesc.columns["speed"] / 4614})
+    cloud.register(CAR)
+    cloud.record({"vesc": slow})
+    cloud.record(later({"vesc": slow.take(slice(0, 30 * HZ))}, 300), first_seq=90)
+
+    (planned,) = cloud.run()
+
+    assert planned["start_us"] == START_US
+    (found,) = [one for one in cloud.table.findings(CAR) if one.kind == "never_moved"]
+    assert (found.severity, found.stream, found.fields) == ("info", "vesc", ("speed",))
+    assert found.text.startswith("the robot recorded 90 s and never moved: vesc.speed was ")
+    assert found.text.endswith(" erpm at most, and above 200 it moves")
+    # As soon as a drive is recorded, it alone counts.
+    cloud.record(later({"vesc": vesc}, 600), first_seq=120)
+    assert [(one["start_us"] - START_US) // S for one in cloud.run()] == [600]
+
+
 def test_the_row_of_a_drive_with_thousands_of_null_fields_fits_in_an_item() -> None:
     missing = {f"a_stream_{i // 100}.{'f' * 60}{i}": "the field is null in every sample" for i in range(5000)}
     drive = DriveKey(CAR, START_US, RUN)

@@ -10,6 +10,7 @@ from iort_analysis.mining.anomalies.dropouts import mine_dropouts
 from iort_analysis.mining.anomalies.faults import mine_faults
 from iort_analysis.mining.anomalies.frozen import mine_frozen
 from iort_analysis.mining.anomalies.gaps import mine_gaps
+from iort_analysis.mining.anomalies.motionless import mine_motionless
 from iort_analysis.mining.anomalies.readings import readings
 from iort_analysis.mining.anomalies.slip import mine_slip
 from iort_analysis.mining.anomalies.underway import mine_underway
@@ -19,7 +20,7 @@ from iort_analysis.results import Mined
 
 def mine(drive: Drive) -> Mined:
     """All anomalies of a drive."""
-    parts = [mine_faults(drive), mine_frozen(drive), mine_gaps(drive)]
+    parts = [mine_motionless(drive), mine_faults(drive), mine_frozen(drive), mine_gaps(drive)]
     samples = readings(drive)
     if isinstance(samples, str):
         parts.append(Mined(missing={"anomalies": samples}))

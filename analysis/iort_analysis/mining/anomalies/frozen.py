@@ -4,32 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from iort_analysis.drives.drive import FROZEN, Drive, Repair
 from iort_analysis.results import Event, Mined
-from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.analysis.findings import Estimate
 
 KIND = "sensor_stuck"
-# The units of what a sensor measures; counters and codes may stand still.
-_MEASURED = frozenset({"V", "A", "degC", "erpm", "1", "deg"})
 # So many fields at once are not their sensors' fault, but that of the link: `gaps` finds it.
-_LINK = 6
+_LINK = 5
 
 
 def mine_frozen(drive: Drive) -> Mined:
     """An event for each sensor that was stuck. Fields that stand still together are one sensor's."""
-    frozen = [repair for repair in drive.repairs if repair.kind == FROZEN and _measured(drive, repair)]
+    frozen = [repair for repair in drive.repairs if repair.kind == FROZEN]
     sensors: dict[tuple[str, ...], list[list[Repair]]] = {}
     for together in _together(frozen):
-        fields = tuple(repair.field for repair in together)
+        fields = _fields(together)
         if len(fields) < _LINK:
             sensors.setdefault((together[0].stream, *fields), []).append(together)
-    return Mined(events=[_event(times) for _, times in sorted(sensors.items())])
-
-
-def _measured(drive: Drive, repair: Repair) -> bool:
-    field = VESC_FIELDS.get(repair.field) if repair.stream == drive.vesc else None
-    return field is None or field.unit in _MEASURED
+    return Mined(events=[_event(drive, times) for _, times in sorted(sensors.items())])
 
 
 def _together(repairs: Iterable[Repair]) -> Iterable[list[Repair]]:
@@ -44,12 +38,23 @@ def _together(repairs: Iterable[Repair]) -> Iterable[list[Repair]]:
         yield group
 
 
-def _event(times: list[list[Repair]]) -> Event:
+def _fields(together: Iterable[Repair]) -> tuple[str, ...]:
+    """The fields of some repairs, each once."""
+    return tuple(dict.fromkeys(repair.field for repair in together))
+
+
+def _event(drive: Drive, times: list[list[Repair]]) -> Event:
     longest = max((group[0] for group in times), key=lambda repair: repair.end_us - repair.start_us)
-    fields = tuple(repair.field for repair in times[0])
-    seconds = (longest.end_us - longest.start_us) / 1e6
-    text = f"{' and '.join(fields)} kept the same value for {seconds:.0f} s while the car moved"
+    fields = _fields(times[0])
+    # It stood from some time after the sample before to some time before the sample after.
+    seconds, step_s = (longest.end_us - longest.start_us) / 1e6, _step_s(drive, longest.stream)
+    effect = Estimate(seconds, seconds, seconds + 2 * step_s, "s")
+    text = f"the value of {' and '.join(fields)} stayed the same for {seconds:.3g} s while the car moved"
     if len(times) > 1:
         text += f", the longest of {len(times)} times"
-    effect = Estimate(seconds, seconds, seconds, "s")
     return Event(KIND, longest.start_us, longest.end_us, longest.stream, fields, text, effect)
+
+
+def _step_s(drive: Drive, stream: str) -> float:
+    """The usual time between two samples of a stream."""
+    return float(np.median(np.diff(drive.streams[stream].times_us))) / 1e6

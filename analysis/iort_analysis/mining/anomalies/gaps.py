@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.drives.motion import motion_field, moving
+from iort_analysis.drives.motion import motion_of
 from iort_analysis.results import Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_analysis.statistics.intervals import sides
@@ -34,7 +34,7 @@ def mine_gaps(drive: Drive) -> Mined:
     usual = max(float(np.median(steps)), _LEAST_STEP_S)
     gaps = (steps > _INTERVALS * usual) & (steps < max(_PAUSE_S, 2 * _INTERVALS * usual))
     gaps &= ~_others_pause(drive, times)
-    repeated = _repeated(block)
+    repeated = _repeated(drive.vesc or "", block)
     lost = np.where(gaps, steps / usual - 1, 0.0) + repeated
     places = np.flatnonzero(lost)
     share = float(lost.sum() / (lost.sum() + len(times)))
@@ -65,15 +65,16 @@ def _others_pause(drive: Drive, times: NDArray[np.int64]) -> NDArray[np.bool_]:
     return silent
 
 
-def _repeated(block: Block) -> NDArray[np.float64]:
+def _repeated(stream: str, block: Block) -> NDArray[np.float64]:
     """Between samples: how many samples before came again and again while the car moved."""
     columns = {name: column for name, column in block.columns.items() if column.dtype.kind == "f"}
-    if motion_field(columns) is None or len(columns) < _REPEATED:
+    motion = motion_of(stream, columns)
+    if motion is None or len(columns) < _REPEATED:
         return np.zeros(len(block.times_us) - 1)
     same = np.ones(len(block.times_us) - 1, dtype=np.bool_)
     for column in columns.values():
         same &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
-    moves = moving(columns)
+    moves = motion.moves(columns)
     if moves is not None:
         same &= moves[1:]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))

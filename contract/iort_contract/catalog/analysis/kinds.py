@@ -133,6 +133,13 @@ KINDS = {
             severity="info",
         ),
         Kind(
+            "never_moved",
+            "a robot recorded and never moved",
+            "nothing, if it stood; if it drove, look at the field of its speed in the history: whether it is "
+            "the car's, and in the unit that the text names",
+            severity="info",
+        ),
+        Kind(
             ANALYSIS_FAILED,
             "a drive could not be analysed",
             "the text has the reason; the samples are kept, so `iort analyse` can try it again",

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from iort_analysis.drives.building import build
-from iort_analysis.drives.motion import motion_field
+from iort_analysis.drives.motion import motion_of
 from iort_analysis.mining import laps
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
@@ -59,7 +59,7 @@ def laps_within(
     """The laps from ``start_us`` to before ``end_us``; raises `StationError` over ``most`` values."""
     streams: dict[str, Block] = {}
     for name in inventory.check_recorded(cloud, robot):
-        if name in OWN_STREAMS or not _tells_laps(inventory.newest_block(cloud, robot, name)):
+        if name in OWN_STREAMS or not _tells_laps(name, inventory.newest_block(cloud, robot, name)):
             continue
         read = query(cloud, robot, name, start_us, end_us, progress=progress, most=most)
         streams[name] = Block(read.times_us, dict(read.columns))
@@ -67,6 +67,6 @@ def laps_within(
     return laps.mine(drive)
 
 
-def _tells_laps(block: Block) -> bool:
+def _tells_laps(stream: str, block: Block) -> bool:
     """Whether a stream like this one has a position or a speed."""
-    return position_fields(block.columns) is not None or motion_field(block.columns) is not None
+    return position_fields(block.columns) is not None or motion_of(stream, block.columns) is not None

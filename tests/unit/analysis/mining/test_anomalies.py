@@ -20,7 +20,7 @@ from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.analysis.kinds import KINDS
 from iort_contract.catalog.analysis.parameters import PARAMETERS
-from tests.unit.analysis.simulated import KEY, START_US, changed, streams
+from tests.unit.analysis.simulated import HZ, KEY, START_US, changed, streams
 
 _CAR = 300  # apart from the cars of the proof
 HEALTHY = FaultConfig("payload", 1e-9)
@@ -97,7 +97,9 @@ def test_a_fault_that_comes_and_goes_is_an_event(
     assert drive.key.start_us <= event.start_us < event.end_us <= drive.end_us
     if kind == "sensor_stuck":
         assert (event.start_us - drive.key.start_us) / 1e6 == pytest.approx(100, abs=0.1)
-        assert "kept the same value for 15 s" in event.text
+        assert "the value of current_motor stayed the same for 15 s" in event.text
+        assert event.effect is not None
+        assert event.effect.low <= 15 <= event.effect.high < 15.1
     elif kind == "cell_dropout":
         assert event.effect is not None
         assert event.effect.value == pytest.approx(0.8, abs=0.05)
@@ -118,6 +120,56 @@ def test_the_cars_own_numbers_need_not_be_known() -> None:
     drive = driven()[0]
     assert drive.vehicle is None
     assert not mined().missing
+
+
+def _standing(column: np.ndarray, *stretches: tuple[int, int]) -> np.ndarray:
+    """The column with the value at the beginning of each stretch of seconds all along it."""
+    made = column.copy()
+    for first_s, last_s in stretches:
+        made[first_s * HZ : last_s * HZ] = made[first_s * HZ]
+    return made
+
+
+def test_what_is_no_sensor_may_stand_still() -> None:
+    """The controller sets the duty cycle; a board that coasts draws no charge; a receiver is as sure as it
+    was; and a servo is told the same angle."""
+    vesc, chance = streams(120)["vesc"], np.random.default_rng(1)
+    n = len(vesc.times_us)
+    grown = np.cumsum(chance.uniform(0, 1e-4, n))
+    others = {
+        "duty_cycle": _standing(vesc.columns["duty_cycle"], (20, 29)),
+        "amp_hours_setup": _standing(grown, (30, 45), (60, 70)),
+        "watt_hours_setup": _standing(-40 * grown, (32, 47), (60, 75)),
+        "gnss_vAcc": _standing(chance.normal(3, 0.1, n), (30, 60), (70, 90)),
+        "position_covariance.0": _standing(chance.normal(3, 0.1, n), (30, 60)),
+    }
+    angle = chance.normal(0.5, 0.1, n)
+    for first in range(0, n, 20 * HZ):
+        angle[first : first + 8 * HZ] = 0.5304
+    made = {
+        **streams(120),
+        "vesc": Block(vesc.times_us, {**vesc.columns, **others}),
+        "servo": Block(vesc.times_us, {"data": angle}),
+    }
+
+    drive = build(KEY, made)
+
+    assert drive.repairs == []
+    assert not anomalies.mine(drive).events
+
+
+def test_a_field_that_stands_twice_is_named_once() -> None:
+    vesc, chance = streams(120)["vesc"], np.random.default_rng(1)
+    noise = {name: chance.normal(0, 1, len(vesc.times_us)) for name in ("accX", "accY")}
+    columns = {
+        "accX": _standing(noise["accX"], (10, 50)),
+        "accY": _standing(noise["accY"], (12, 25), (30, 45)),
+    }
+
+    (event,) = anomalies.mine(build(KEY, {"vesc": vesc, "imu": Block(vesc.times_us, columns)})).events
+
+    assert (event.kind, event.stream, event.fields) == ("sensor_stuck", "imu", ("accX", "accY"))
+    assert event.text.startswith("the value of accX and accY stayed the same for 40 s")
 
 
 def test_samples_that_come_again_are_an_intermittent_link() -> None:
