@@ -176,11 +176,6 @@ class Settings(BaseModel):
     keep_customer_key: Flag = Field(
         default=False, description="keeps that key without using it, for data that it has encrypted"
     )
-    old_telemetry: Flag = Field(
-        default=False,
-        description="keeps the telemetry table of a deployment from before batches had ids, in every stage, "
-        "beside the new one: [upgrading](../how-to/upgrading.md)",
-    )
     alarm_email: Annotated[str | None, BeforeValidator(_email)] = Field(
         default=None,
         description="receives alarms, alerts and the budget's mails; AWS asks this address for its consent "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aws_cdk import App, CfnOutput, Duration, RemovalPolicy
+from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
@@ -10,7 +10,7 @@ from aws_cdk import aws_s3 as s3
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.requests.files import FILES_PREFIX
-from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, T_US, TOPIC
+from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from stacks.parts.base import PlatformStack
 from stacks.parts.encryption import Encryption
 from stacks.settings import Settings
@@ -18,8 +18,6 @@ from stacks.settings import Settings
 # Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not
 # move objects below 128 KB, which it would make dearer.
 _RARE_AFTER_DAYS = 30
-# The telemetry table's construct id before batches had ids.
-OLD_TELEMETRY = "Telemetry"
 _TEXT = dynamodb.AttributeType.STRING
 
 
@@ -33,7 +31,6 @@ class Storage(PlatformStack):
     def __init__(self, app: App, settings: Settings) -> None:
         super().__init__(app, "storage", settings)
         self.encryption = Encryption.of(self, settings)
-        # Not the old table's name, which had the time alone as its key: see docs/how-to/upgrading.md.
         self.telemetry = self._table(
             "Batches",
             output="TelemetryTable",
@@ -43,8 +40,6 @@ class Storage(PlatformStack):
             expires=True,
             stream=dynamodb.StreamViewType.NEW_IMAGE,
         )
-        if settings.old_telemetry:
-            self._old_telemetry()
         self.summary = self._table("Summary", partition=TOPIC, sort=SECOND, expires=True)
         self.robots = self._table("Robots", partition=ROBOT)
         # A row an hour of a stream, and the marks of what is to be archived.
@@ -83,25 +78,6 @@ class Storage(PlatformStack):
         )
         CfnOutput(self, output or f"{name}Table", value=table.table_name)
         return table
-
-    def _old_telemetry(self) -> None:
-        """The unchanged telemetry table of a deployment from before batches had ids. It stays in every stage,
-        unwritten; `iort adopt` copies from it.
-
-        The stacks that import its exports are updated after this one, and CloudFormation removes no export
-        that is in use.
-        """
-        table = self._table(
-            OLD_TELEMETRY,
-            output="OldTelemetryTable",
-            partition=TOPIC,
-            sort=T_US,
-            expires=True,
-            stream=dynamodb.StreamViewType.NEW_IMAGE,
-        )
-        table.apply_removal_policy(RemovalPolicy.RETAIN)
-        for value in (table.table_name, table.table_arn, table.table_stream_arn):
-            self.export_value(value)
 
     def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:
         """Let a role change only these attributes of a robot's row: a name's admission and its vehicle are in

@@ -34,7 +34,6 @@ _POLL_S = 10.0
 _OF_ITS_OWN = {
     "stage": DEV,
     "site": "false",
-    "old_telemetry": "false",
     "customer_key": "false",
     "keep_customer_key": "false",
     "device_defender": "false",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Union
 
 SCHEMA_VERSION = 1
-# Schema version of the record lane: batches of version 1 had no id.
+# Schema version of the record lane.
 BATCH_VERSION = 2
 DEFAULT_NAMESPACE = "iort"
 

@@ -21,7 +21,6 @@ FLIPS: dict[str, dict[str, Any]] = {
     "site": {"site": True},
     "without PubNub": {"live_transport": IOT, "drivers": True, "site": True, "site_robots": ["car1"]},
     "no nightly analysis": {"nightly_analysis": False},
-    "old table": {"old_telemetry": True},
     "properties": {
         "retention_days": 7,
         "archive": False,

@@ -11,8 +11,6 @@ from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
 from aws_cdk import aws_stepfunctions as stepfunctions
 
-from stacks.storage import OLD_TELEMETRY
-
 
 @dataclass(frozen=True)
 class Watched:
@@ -38,9 +36,7 @@ class Watched:
                 if isinstance(construct, lambda_.Function):
                     functions[construct.node.id] = construct
                 elif isinstance(construct, dynamodb.Table):
-                    # The old table gets no writes, and its exports would tie it to an alarm's stack.
-                    if construct.node.id != OLD_TELEMETRY:
-                        tables[construct.node.id] = construct
+                    tables[construct.node.id] = construct
                 elif isinstance(construct, sqs.Queue):
                     queues[construct.node.id] = construct
                 elif isinstance(construct, stepfunctions.StateMachine):

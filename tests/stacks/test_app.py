@@ -103,7 +103,6 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         True,
     )
     assert settings(embedded="false").embedded is False
-    assert (settings().old_telemetry, settings(old_telemetry="true").old_telemetry) == (False, True)
     assert given.reserved_for_live == 0
     assert settings().reserved_for_live == 0 == Usage().live_concurrency
     assert settings(stage="prod").reserved_for_live == 5
@@ -133,7 +132,6 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"live_concurrency": "many"}, ["live_concurrency", "'many'"]),
         ({"live_concurrency": [5]}, ["live_concurrency", "[5]"]),
         ({"embedded": "maybe"}, ["embedded", "'maybe'", "true", "false"]),
-        ({"old_telemetry": "yes"}, ["old_telemetry", "'yes'", "true", "false"]),
         ({"stage": "test"}, ["stage", "'test'", "dev or prod"]),
         ({"alarm_email": "nobody"}, ["alarm_email", "'nobody'"]),
         ({"alarm_email": "a@b.org,c@d.org"}, ["alarm_email"]),

@@ -12,7 +12,6 @@ from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import rule_name
 from stacks.settings import PROD, Settings
-from stacks.storage import OLD_TELEMETRY
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
@@ -179,17 +178,12 @@ def changes(clients: Clients, settings: Settings) -> Found:
     deployed = stack(clients, storage)
     if deployed is None:
         return fine("nothing is deployed")
-    used = _used_exports(clients, storage)
-    if used["Key"] and not (settings.customer_key or settings.keep_customer_key):
+    used = _key_users(clients, storage)
+    if used and not (settings.customer_key or settings.keep_customer_key):
         return stops(
-            f"customer_key was true and is false now: {_used_by(used['Key'])} the key, whose "
+            f"customer_key was true and is false now: {_used_by(used)} the key, whose "
             "export CloudFormation does not remove, and what is encrypted already would have no key",
             "in two steps: first -c keep_customer_key=true, later without it (docs/how-to/deploy.md)",
-        )
-    if used[OLD_TELEMETRY] and not settings.old_telemetry:
-        return stops(
-            f"deployed is the telemetry table of before batches had ids: {_used_by(used[OLD_TELEMETRY])} it",
-            "in two steps: deploy with -c old_telemetry=true, then `iort adopt` (docs/how-to/upgrading.md)",
         )
     tags = {tag["Key"]: tag["Value"] for tag in deployed.get("Tags", [])}
     if tags.get("stage") == PROD != settings.stage:
@@ -208,18 +202,13 @@ def changes(clients: Clients, settings: Settings) -> Found:
     return fine("none that must not be")
 
 
-def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
-    """The stacks that import the storage stack's key or old telemetry table."""
+def _key_users(clients: Clients, storage: str) -> list[str]:
+    """The stacks that import the storage stack's key."""
     client = clients.client("cloudformation")
-    used: dict[str, list[str]] = {"Key": [], OLD_TELEMETRY: []}
-    exports = [one["Name"] for one in listed(client, "list_exports", "Exports")]
-    for what, importers in used.items():
-        # The CDK names an export by its reading, the construct, and a hash.
-        prefixes = tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
-        for name in exports:
-            if name.startswith(prefixes):
-                importers.extend(_importers(client, name))
-    return used
+    # The CDK names an export by its reading, the construct, and a hash.
+    prefixes = tuple(f"{storage}:ExportsOutput{how}Key" for how in ("FnGetAtt", "Ref"))
+    exports = (one["Name"] for one in listed(client, "list_exports", "Exports"))
+    return [user for name in exports if name.startswith(prefixes) for user in _importers(client, name)]
 
 
 def _importers(client: Any, export: str) -> list[str]:

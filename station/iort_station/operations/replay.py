@@ -7,14 +7,13 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from enum import Enum
 from functools import partial
 from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.checks import COMPACT, json_object
+from iort_contract.checks import json_object
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_item
@@ -35,7 +34,6 @@ from iort_station.cloud import Cloud
 from iort_station.data.stored.batches import telemetry_table
 from iort_station.errors import StationError
 from iort_station.operations.quarantine import CONTENTS, DeadLetter, key, load
-from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 
 # After this many attempts a person must look at it.
 MAX_REPLAYS = 3
@@ -76,8 +74,7 @@ def replay(
     A record message whose rule failed is published to that rule again; it has arrived when the table holds
     its batch. A batch that Lambda 2 refused is given to Lambda 2 again. Then the dead letter is deleted.
     Each attempt is counted; after `MAX_REPLAYS` there are no more, unless ``again``. Live messages, pings and
-    events are outdated and are not replayed. Batches that were put off go back to their queue. A batch of
-    version 1, whose agent was not updated with the stacks, is replayed in this version.
+    events are outdated and are not replayed. Batches that were put off go back to their queue.
     """
     one = partial(_outcome, cloud, dry_run=dry_run, again=again)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -88,12 +85,11 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
     letter = load(cloud, listed)
     if letter is None:
         return Outcome(listed, Fate.GONE)
-    current, batch = letter, None
+    batch = None
     try:
         _check_kind(letter)
         if letter.source != BY_LATER:
-            current = _current(letter)
-            batch = _batch(current)
+            batch = _batch(letter)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
     except ContractError as error:
@@ -107,12 +103,9 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
         if batch is None:
             problem = _put_off(cloud, letter)
         elif _is_rules(letter):
-            problem = _publish(cloud, current, batch)
-        elif current is not letter and not _stored(cloud, letter.topic, batch):
-            # Lambda 2 reads the table, so the batch must be there.
-            problem = "it is in the old telemetry table: run `iort adopt` first"
+            problem = _publish(cloud, letter, batch)
         else:
-            problem = _summarize(cloud, current)
+            problem = _summarize(cloud, letter)
         if problem:
             return Outcome(letter, Fate.FAILED, problem)
         _delete(cloud, letter)
@@ -132,24 +125,9 @@ def _check_kind(letter: DeadLetter) -> None:
         raise _NotForReplayError("only batches of the record lane are replayed")
 
 
-def _current(letter: DeadLetter) -> DeadLetter:
-    """The dead letter with a batch of version 1 upgraded; raises `ContractError` for an invalid one."""
-    # The quarantine cuts items that are too large for it.
-    value = json_object(letter.payload or b"", "message")
-    if letter.source == BY_STREAM:
-        new = upgraded_item(value) if is_old(plain(value)) else None
-    else:
-        new = upgraded(value) if is_old(value) else None
-    if new is None:
-        return letter
-    try:
-        return replace(letter, payload=COMPACT.encode(new).encode())
-    except ValueError as error:  # 1e400 can be read, and not be written
-        raise ContractError(f"message: {error}") from error
-
-
 def _batch(letter: DeadLetter) -> Batch:
     """The batch in a dead letter; raises `ContractError`."""
+    # The quarantine cuts items that are too large for it.
     value = json_object(letter.payload or b"", "message")
     if letter.source == BY_STREAM:
         return decode_item(plain(value))[1]

@@ -1,4 +1,4 @@
-"""Copies stored batches into the telemetry table from an old table, or from one restored from a backup."""
+"""Copies stored batches into the telemetry table from another one, such as a restored backup."""
 
 from __future__ import annotations
 
@@ -17,19 +17,17 @@ from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.dynamodb import WRITE_ITEMS, TableError, TelemetryTable, plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_item
-from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, T_US, TOPIC
+from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, Topic, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.stored.batches import ahead
 from iort_station.errors import StationError
-from iort_station.recordings.old_batches import is_old, upgraded_item
 
 # A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half
 # of them are left to the robot.
 UNITS_PER_S = 500
 _UNIT_BYTES = 1024
-# The keys of version 1, and of today.
-_KEYS = ([TOPIC, T_US], [TOPIC, BATCH])
+_KEYS = [TOPIC, BATCH]
 
 
 class Left(NamedTuple):
@@ -51,16 +49,11 @@ class Adoption:
     left: list[Left] = field(default_factory=list)
 
 
-def source_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
-    """The table of that name, or else the one that the deployment has kept, and about how many items it has.
+def items_in(cloud: Cloud, name: str) -> int:
+    """About how many items the table of that name has.
 
     Raises `StationError` if the table does not exist, has no batches, or is the telemetry table itself.
     """
-    if name is None:
-        try:
-            name = cloud.output("storage", "OldTelemetryTable")
-        except StationError as error:
-            raise StationError(f"{error} with -c old_telemetry=true, or name a table") from error
     try:
         table = cloud.client("dynamodb").describe_table(TableName=name)["Table"]
     except ClientError as error:
@@ -68,12 +61,11 @@ def source_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
             raise
         raise StationError(f"there is no table {name}") from error
     keys = [key["AttributeName"] for key in sorted(table["KeySchema"], key=itemgetter("KeyType"))]
-    if keys not in _KEYS:
-        allowed = " or ".join(", ".join(one) for one in _KEYS)
-        raise StationError(f"the table {name} has the keys {', '.join(keys)}: must be {allowed}")
+    if keys != _KEYS:
+        raise StationError(f"the table {name} has the keys {', '.join(keys)}: must be {', '.join(_KEYS)}")
     if name == cloud.output("storage", "TelemetryTable"):
         raise StationError(f"{name} is the telemetry table itself")
-    return name, table["ItemCount"]
+    return int(table["ItemCount"])
 
 
 def adopt(
@@ -112,7 +104,7 @@ def _pages(cloud: Cloud, table: str, robot: str | None) -> Iterator[tuple[int, S
         yield page["ScannedCount"], page["Items"]
 
 
-def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterator[dict[str, Any]]:
+def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterator[Item]:
     now_s = time.time()
     for item in items:
         values = plain(item)
@@ -121,14 +113,13 @@ def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterato
             done.expired += 1
             continue
         try:
-            new = upgraded_item(item) if is_old(values) else dict(item)
-            topic, batch = _checked(new, namespace)
+            topic, batch = _checked(item, namespace)
         except ContractError as error:
-            done.left.append(Left(item[TOPIC]["S"], str(values.get(BATCH, values.get(T_US))), str(error)))
+            done.left.append(Left(item[TOPIC]["S"], item[BATCH]["S"], str(error)))
             continue
         done.batches[topic.robot, topic.name] += 1
         done.samples[topic.robot, topic.name] += len(batch.times_us)
-        yield new
+        yield item
 
 
 def _checked(item: Item, namespace: str) -> tuple[Topic, Batch]:

@@ -78,7 +78,7 @@ def test_the_options_of_cdk_json_are_overridden(tmp_path):
     ((_, command, _),) = commands.said
     given = dict(pair.split("=", 1) for pair in command if "=" in pair)
     assert given["stage"] == "dev"
-    assert (given["site"], given["old_telemetry"], given["customer_key"]) == ("false", "false", "true")
+    assert (given["site"], given["customer_key"]) == ("false", "true")
 
 
 def test_an_interrupt_does_not_end_the_teardown():

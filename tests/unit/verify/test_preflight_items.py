@@ -16,7 +16,6 @@ ALL = dict.fromkeys(deployed.STACKS, "UPDATE_COMPLETE")
 LIVE = ("AWS::Lambda::Function", "Live848578DF", "iort-processing-Live")
 LOG = {"roleArn": ROLE, "defaultLogLevel": "ERROR", "disableAllLogs": False}
 KEY = "iort-storage:ExportsOutputFnGetAttKey961B73FDArn5A860C43"
-OLD = "iort-storage:ExportsOutputRefTelemetryE3B0C442ABCDEF01"
 
 
 def exported(name, *importers):
@@ -218,20 +217,6 @@ CASES = [
             "none that must",
         )
         for key in ("customer_key", "keep_customer_key")
-    ),
-    (
-        "changes",
-        {},
-        stack_answers(ALL) | exported(OLD, "iort-processing"),
-        STOPS,
-        "iort-processing imports it",
-    ),
-    (
-        "changes",
-        {"old_telemetry": True},
-        stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(OLD, "iort-processing"),
-        FINE,
-        "none that must",
     ),
     (
         "changes",

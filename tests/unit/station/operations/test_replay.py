@@ -12,8 +12,7 @@ from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate, replay
-from tests.fakes import item_of, item_of_message
-from tests.unit.station.recordings.old_messages import old_message
+from tests.fakes import item_of
 
 TOPIC = build_topic(RECORD, "car", "vesc")
 NOW_MS = 1_700_000_000_000
@@ -102,53 +101,6 @@ future = json.dumps(item_of(GOOD, TOPIC) | {"received_ms": {"N": "1"}}).encode()
 def test_an_unreadable_entry_is_refused_and_the_next_one_is_replayed(odd, source):
     fates = outcomes(bad=(source, odd), good=(BY_STREAM, whole))
     assert fates == [Fate.REFUSED, Fate.WOULD]
-
-
-# --- batches of version 1, before batches had ids ------------------------------------------------------
-
-
-def old_item(**changes):
-    return json.dumps(item_of_message(old_message(GOOD, **changes), TOPIC)).encode()
-
-
-@pytest.mark.parametrize(
-    ("source", "payload"),
-    [(f"{BY_RULE} iort_record", old_message(GOOD)), (BY_STREAM, old_item())],
-    ids=["rule", "stream"],
-)
-def test_a_batch_of_version_1_is_replayed(source, payload):
-    assert outcomes(old=(source, payload)) == [Fate.WOULD]
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"t": -5}, "must be from 1970 on"),
-        ({"samples": "AAAA"}, "samples must be base64 of zlib"),
-        ({"v": 0}, ", got 0"),
-    ],
-    ids=["1970", "samples", "version"],
-)
-@pytest.mark.parametrize("source", [BY_STREAM, f"{BY_RULE} iort_record"])
-def test_an_invalid_batch_of_version_1_is_refused(source, changes, reason):
-    payload = old_item(**changes) if source == BY_STREAM else old_message(GOOD, **changes)
-    (outcome,) = replayed(old=(source, payload))
-    assert outcome.fate is Fate.REFUSED
-    assert reason in outcome.detail
-
-
-def test_an_entry_with_an_unstorable_number_does_not_stop_the_next():
-    odd = old_message(GOOD)[:-1] + b',"more":1e400}'
-    assert outcomes(odd=(f"{BY_RULE} iort_record", odd), good=(BY_STREAM, whole)) == [
-        Fate.REFUSED,
-        Fate.WOULD,
-    ]
-
-
-def test_a_batch_only_in_the_old_table_is_not_sent_to_lambda_2():
-    """Lambda 2 would find no batch, and the entry would be deleted."""
-    (outcome,) = replayed(old=(BY_STREAM, old_item()), dry_run=False)
-    assert (outcome.fate, "iort adopt" in outcome.detail) == (Fate.FAILED, True)
 
 
 @pytest.mark.parametrize("prefix", ["", "$aws/rules/iort_record/"])

@@ -1,4 +1,4 @@
-"""`iort adopt` copies every batch of an old table once and completely, or reports it."""
+"""`iort adopt` copies every batch of another table once and completely, or reports it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import pytest
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import RECORD, build_topic
 from iort_station.errors import StationError
-from iort_station.recordings.adopt import Left, adopt, source_table
+from iort_station.recordings.adopt import Left, adopt, items_in
 from tests.fakes import TELEMETRY, item_of_message
-from tests.unit.station.recordings.old_messages import old_message
 
 OLD, T0 = "old", 1_700_000_000_000_000
 LATER = 4_000_000_000
@@ -24,16 +23,12 @@ class Cloud:
 
     namespace = "iort"
 
-    def __init__(self, dynamodb, *, taken=25, kept=True):
-        self.dynamodb, self.taken, self.kept = dynamodb, taken, kept
+    def __init__(self, dynamodb, *, taken=25):
+        self.dynamodb, self.taken = dynamodb, taken
         self.calls = 0
 
     def output(self, _stack, name):
-        if name == "OldTelemetryTable" and not self.kept:
-            raise StationError(
-                "stack iort-storage has no output OldTelemetryTable; deploy the current stacks"
-            )
-        return {"TelemetryTable": TELEMETRY, "OldTelemetryTable": OLD}[name]
+        return {"TelemetryTable": TELEMETRY}[name]
 
     def client(self, service):
         assert service == "dynamodb"
@@ -53,15 +48,11 @@ class Cloud:
 
 @pytest.fixture
 def old(dynamodb):
-    """Puts messages of version 1 into a table as the older record rule did."""
-    types = {"topic": "S", "t": "N"}
+    """Puts messages into a table that DynamoDB restored from a backup."""
+    layout = dynamodb.describe_table(TableName=TELEMETRY)["Table"]
     dynamodb.create_table(
         TableName=OLD,
-        KeySchema=[
-            {"AttributeName": "topic", "KeyType": "HASH"},
-            {"AttributeName": "t", "KeyType": "RANGE"},
-        ],
-        AttributeDefinitions=[{"AttributeName": name, "AttributeType": kind} for name, kind in types.items()],
+        **{name: layout[name] for name in ("KeySchema", "AttributeDefinitions")},
         BillingMode="PAY_PER_REQUEST",
     )
 
@@ -78,6 +69,10 @@ def slept(monkeypatch):
     waits = []
     monkeypatch.setattr(time, "sleep", waits.append)
     return waits
+
+
+def message(batch, **changes):
+    return json.dumps({**json.loads(encode_batch(batch)), **changes}).encode()
 
 
 def batch(i):
@@ -99,9 +94,9 @@ def of_today(i, topic=None):
     return item_of_message(encode_batch(batch(i)), topic or build_topic(RECORD, "car", "vesc"), LATER)
 
 
-def test_every_batch_is_stored_in_todays_form(dynamodb, old):
-    old(*(old_message(batch(i)) for i in range(60)))
-    old(old_message(batch(0)), robot="car-2", stream="tf")
+def test_every_batch_is_stored_as_it_was(dynamodb, old):
+    old(*(message(batch(i)) for i in range(60)))
+    old(message(batch(0)), robot="car-2", stream="tf")
     before, read = stored(dynamodb, OLD), []
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST, progress=read.append)
     assert done.batches == {("car", "vesc"): 60, ("car-2", "tf"): 1}
@@ -114,7 +109,7 @@ def test_every_batch_is_stored_in_todays_form(dynamodb, old):
 
 
 def test_a_second_adoption_changes_nothing(dynamodb, old):
-    old(*(old_message(batch(i)) for i in range(30)), more={"N": "7"})
+    old(*(message(batch(i)) for i in range(30)), more={"N": "7"})
     first = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     after = stored(dynamodb)
     assert all(item["more"] == {"N": "7"} for item in after)
@@ -126,14 +121,14 @@ def test_a_second_adoption_changes_nothing(dynamodb, old):
 def test_one_robot_can_be_adopted_alone(dynamodb, old):
     """Robots whose names only begin with the same text are left out."""
     for robot in ("car", "car2", "other"):
-        old(old_message(batch(0)), robot=robot)
+        old(message(batch(0)), robot=robot)
     done = adopt(Cloud(dynamodb), OLD, robot="car", units_per_s=FAST)
     assert done.batches == {("car", "vesc"): 1}
     assert stored(dynamodb) == [of_today(0)]
 
 
 def test_a_dry_run_reports_the_same_and_writes_nothing(dynamodb, old):
-    old(*(old_message(batch(i)) for i in range(3)), old_message(batch(9), boot="?"))
+    old(*(message(batch(i)) for i in range(3)), message(batch(9), codec="later"))
     dry = adopt(Cloud(dynamodb), OLD, units_per_s=FAST, dry_run=True)
     assert stored(dynamodb) == []
     assert dry == adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
@@ -143,54 +138,52 @@ def test_a_dry_run_reports_the_same_and_writes_nothing(dynamodb, old):
 @pytest.mark.parametrize(
     ("changes", "cause"),
     [
-        ({"t": -5}, "time must be from 1970 on, got -5 us"),
         ({"samples": "AAAA"}, "samples must be base64 of zlib"),
         ({"codec": "later"}, "got 'later'"),
         ({"v": 9}, ", got 9"),
         ({"n": 7}, "must have 7 dt"),
         ({"robot": "other"}, "in the name of 'other'"),
     ],
-    ids=["1970", "samples", "codec", "version", "number", "other"],
+    ids=["samples", "codec", "version", "number", "other"],
 )
 def test_an_invalid_batch_is_reported_and_its_neighbours_are_adopted(dynamodb, old, changes, cause):
-    old(old_message(batch(0)), old_message(batch(1), **changes), old_message(batch(2)))
+    old(message(batch(0)), message(batch(1), **changes), message(batch(2)))
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     (left,) = done.left
-    t_us = changes.get("t", batch(1).t_us)
-    assert left[:2] == Left("dt/iort/car/vesc", str(t_us), "")[:2]
+    assert left[:2] == Left("dt/iort/car/vesc", str(batch(1).id), "")[:2]
     assert cause in left.cause
     assert stored(dynamodb) == [of_today(0), of_today(2)]
     assert len(stored(dynamodb, OLD)) == 3
 
 
 def test_a_batch_of_another_namespace_is_not_adopted(dynamodb, old):
-    old(old_message(batch(0)), namespace="lab2")
+    old(message(batch(0)), namespace="lab2")
     (left,) = adopt(Cloud(dynamodb), OLD, units_per_s=FAST).left
     assert left.cause == "the namespace must be iort, got lab2"
 
 
 def test_a_batch_of_a_car_with_a_clock_years_ahead_is_adopted(dynamodb, old):
-    old(old_message(batch(0)), received_ms={"N": "1000"})
+    old(message(batch(0)), received_ms={"N": "1000"})
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     assert (done.left, stored(dynamodb)) == ([], [{**of_today(0), "received_ms": {"N": "1000"}}])
 
 
 def test_an_expired_batch_is_not_adopted(dynamodb, old):
-    old(old_message(batch(0)), expires_s=1_700_000_000)
-    old(old_message(batch(1)))
+    old(message(batch(0)), expires_s=1_700_000_000)
+    old(message(batch(1)))
     done = adopt(Cloud(dynamodb), OLD, units_per_s=FAST)
     assert (done.expired, stored(dynamodb)) == (1, [of_today(1)])
 
 
 def test_unprocessed_items_are_sent_again(dynamodb, old):
-    old(*(old_message(batch(i)) for i in range(20)))
+    old(*(message(batch(i)) for i in range(20)))
     cloud = Cloud(dynamodb, taken=8)
     adopt(cloud, OLD, units_per_s=FAST)
     assert (cloud.calls, len(stored(dynamodb))) == (3, 20)
 
 
 def test_items_that_stay_unprocessed_are_an_error_with_advice(dynamodb, old, slept):
-    old(old_message(batch(0)))
+    old(message(batch(0)))
     with pytest.raises(StationError, match=r"1 items of telemetry not written .*do it again"):
         adopt(Cloud(dynamodb, taken=0), OLD, units_per_s=FAST)
     assert slept
@@ -198,47 +191,30 @@ def test_items_that_stay_unprocessed_are_an_error_with_advice(dynamodb, old, sle
 
 def test_the_write_rate_is_limited(dynamodb, old, slept):
     """A topic is one partition, and the robot writes to it at the same time."""
-    old(*(old_message(batch(i)) for i in range(100)))
+    old(*(message(batch(i)) for i in range(100)))
     adopt(Cloud(dynamodb), OLD, units_per_s=5)
     # A small batch is one unit, and 25 are written at once.
     assert len(slept) == 4
     assert sum(slept) == pytest.approx(100 / 5, abs=4)
 
 
-def test_a_table_restored_from_a_backup_is_copied_as_it_is(dynamodb):
-    layout = dynamodb.describe_table(TableName=TELEMETRY)["Table"]
-    dynamodb.create_table(
-        TableName="restored",
-        **{name: layout[name] for name in ("KeySchema", "AttributeDefinitions")},
-        BillingMode="PAY_PER_REQUEST",
-    )
-    bad = {**of_today(2), "samples": {"S": "AAAA"}}
-    for item in (of_today(0), of_today(1), bad):
-        dynamodb.put_item(TableName="restored", Item=item)
-    done = adopt(Cloud(dynamodb), "restored", units_per_s=FAST)
-    assert stored(dynamodb) == [of_today(0), of_today(1)]
-    assert [left.key for left in done.left] == [bad["batch"]["S"]]
-
-
 # --- which table ----------------------------------------------------------------------------------------
 
 
-def test_the_source_is_the_kept_table_or_the_named_one(dynamodb, old):
-    old(old_message(batch(0)))
-    assert source_table(Cloud(dynamodb), None) == (OLD, 1)
-    assert source_table(Cloud(dynamodb, kept=False), OLD) == (OLD, 1)
+def test_the_number_of_items_is_that_of_the_table(dynamodb, old):
+    old(message(batch(0)))
+    assert items_in(Cloud(dynamodb), OLD) == 1
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        (None, "no output OldTelemetryTable.*old_telemetry=true, or name a table"),
         ("nowhere", "there is no table nowhere"),
-        ("summary", "summary has the keys topic, second: must be topic, t or topic, batch"),
+        ("summary", "summary has the keys topic, second: must be topic, batch"),
         (TELEMETRY, "telemetry is the telemetry table itself"),
     ],
-    ids=["none kept", "none there", "summaries", "itself"],
+    ids=["none there", "summaries", "itself"],
 )
 def test_an_invalid_table_is_an_error(dynamodb, name, words):
     with pytest.raises(StationError, match=words):
-        source_table(Cloud(dynamodb, kept=False), name)
+        items_in(Cloud(dynamodb), name)

@@ -22,13 +22,7 @@ _LISTED = 20
 @commands.command("adopt", epilog=examples("adopt telemetry-restored --dry-run"))
 def adopt_(
     context: typer.Context,
-    table: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="TABLE",
-            help="For example one restored from a backup. Default: the one that old_telemetry kept.",
-        ),
-    ] = None,
+    table: Annotated[str, typer.Argument(metavar="TABLE", help="For example one restored from a backup.")],
     robot: OneRobot = None,
     units: Annotated[
         int,
@@ -37,16 +31,16 @@ def adopt_(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Copy batches from an old telemetry table, or from one restored from a backup, into the deployment's.
+    """Copy batches from another telemetry table, such as one restored from a backup, into the deployment's.
 
     The other table stays as it is, and a second run changes nothing. Lambda 2 makes the summaries again. Exit
     status 1 if some items cannot be adopted; each is printed with its reason. See docs/how-to/upgrading.md.
     """
     cloud = context.obj.cloud()
     name = None if robot is None else registry.checked(robot)
-    source, count = adopt.source_table(cloud, table)
-    with bar(f"reading {source}", count or None) as progress:
-        done = adopt.adopt(cloud, source, robot=name, units_per_s=units, dry_run=dry_run, progress=progress)
+    count = adopt.items_in(cloud, table)
+    with bar(f"reading {table}", count or None) as progress:
+        done = adopt.adopt(cloud, table, robot=name, units_per_s=units, dry_run=dry_run, progress=progress)
     if as_json:
         adopted = [
             {"robot": robot, "stream": stream, "batches": count, "samples": done.samples[robot, stream]}
