@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -69,6 +69,12 @@ class Cloud:
     # Where the embedded cloud's page is served on this machine, with a slash at the end.
     page: str | None = None
 
+    _calls: ClassVar[dict[str, Any]] = {
+        "retries": {"mode": "standard", "max_attempts": 5},
+        "connect_timeout": 5,
+        "read_timeout": 20,
+    }
+
     @classmethod
     def load(cls, path: Path) -> Cloud:
         """The embedded cloud that wrote ``path``; raises `StationError` if none is running."""
@@ -102,6 +108,11 @@ class Cloud:
             aws_access_key_id=self.access_key_id,
             aws_secret_access_key=self.secret_access_key,
         )
+
+    def urgent(self) -> Cloud:
+        """The same cloud with clients of its own, which give up within seconds: for a stop, which must not
+        wait for what else is asked of the cloud."""
+        return _Urgent(**{each.name: getattr(self, each.name) for each in fields(self)})
 
     def check(self) -> Cloud:
         """Return itself; raises `StationError` if profile, region or credentials are missing."""
@@ -152,9 +163,7 @@ class Cloud:
                     endpoint_url=self.endpoint_url,
                     verify=self.ca_bundle,
                     config=Config(
-                        retries={"mode": "standard", "max_attempts": 5},
-                        connect_timeout=5,
-                        read_timeout=20,
+                        **self._calls,
                         # botocore's own text is made anew for each request, in a tenth of a millisecond.
                         user_agent="iort",
                     ),
@@ -211,6 +220,16 @@ class Cloud:
             ) from error
         except BotoCoreError as error:
             raise StationError(f"stack {stack} cannot be read: {error}") from error
+
+
+class _Urgent(Cloud):
+    _calls: ClassVar[dict[str, Any]] = {
+        "retries": {"mode": "standard", "max_attempts": 2},
+        "connect_timeout": 2,
+        "read_timeout": 3,
+        # A fleet is stopped at once.
+        "max_pool_connections": 32,
+    }
 
 
 @cache

@@ -45,9 +45,10 @@ class CloudOptions:
                 f"iort; --embedded or {EMBEDDED_VARIABLE} names its file from anywhere else"
             )
         if embedded and (self.local or (not said and embedded.exists())):
+            cloud = _alive(Cloud.load(embedded), embedded)
             if not self.local:
                 say(f"on the embedded cloud of {embedded}")
-            return _alive(Cloud.load(embedded), embedded)
+            return cloud
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:
             return cloud.check()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -64,14 +65,32 @@ def motion(cloud: Cloud, robots: Iterable[str]) -> dict[str, Motion]:
 
 
 def stop(cloud: Cloud, robots: Iterable[str], *, by: str, fleet: bool = False) -> dict[str, str]:
-    """Stop robots without waiting for them; `motion` tells what they have confirmed.
+    """Stop robots without waiting for them, nor for a reading; `motion` tells what they have confirmed.
 
     Robots that are not connected stop before they take a command. Every robot is tried. Returns why, for
     each one for which it failed. ``by`` is who stops them; ``fleet`` is a stop that the release of the fleet
-    ends. Raises `StationError` for a robot that is not registered, before any is tried.
+    ends. Whether the names are registered is for `take_back` to see, after the stop.
     """
     change = encode_stop(_pressed(by), fleet=fleet)
-    return _changed(cloud, robots, lambda robot: _change(cloud, robot, change))
+    return _tried(cloud, robots, lambda robot: _change(cloud, robot, change))
+
+
+def take_back(cloud: Cloud, robots: Iterable[str]) -> dict[str, str]:
+    """Undo the stop of names that nobody has registered; returns why, by name. A registry that does not
+    answer takes nothing back."""
+
+    def look(robot: str) -> str:
+        try:
+            if registry.find(cloud, robot) is not None:
+                return ""
+            data = cloud.client("iot-data")
+            with contextlib.suppress(data.exceptions.ResourceNotFoundException):
+                data.delete_thing_shadow(thingName=robot, shadowName=SHADOW)
+            return str(registry.not_registered(cloud, robot))
+        except (BotoCoreError, ClientError, StationError):
+            return ""
+
+    return {robot: reason for robot, reason in _each(cloud, robots, look).items() if reason}
 
 
 def release(
@@ -125,7 +144,10 @@ def _changed(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None])
     known = {str(row["robot"]) for row in registry.listed(cloud)}
     if strangers := sorted(set(wanted) - known):
         raise StationError(f"not registered: {', '.join(strangers)}; nothing is changed")
+    return _tried(cloud, wanted, change)
 
+
+def _tried(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None]) -> dict[str, str]:
     def tried(robot: str) -> str:
         try:
             change(robot)
@@ -133,7 +155,7 @@ def _changed(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None])
             return str(error)
         return ""
 
-    return {robot: error for robot, error in _each(cloud, wanted, tried).items() if error}
+    return {robot: error for robot, error in _each(cloud, robots, tried).items() if error}
 
 
 def _motion(cloud: Cloud, robot: str) -> Motion:

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
+from botocore.exceptions import BotoCoreError, ClientError
+
 from iort_contract.messages.page import Answer, MotionAnswer, MotionEntry
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
@@ -37,6 +39,10 @@ class _Fleet:
                 self._read_s = time.monotonic()
             return self._found
 
+    def names(self) -> list[str]:
+        """The robots as they were last read, if they ever were."""
+        return list(self._found)
+
     def forget(self) -> None:
         """Read again when asked next: a stop must not seem to be gone."""
         with self._lock:
@@ -61,8 +67,16 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
 
 
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """The action ``stop``."""
-    fleet = _fleet(cloud)
+    """The action ``stop``. It shares no connection with what is read."""
+    fleet, urgent = _fleet(cloud), cloud.urgent()
+
+    def everyone() -> list[str]:
+        try:
+            return list(registry.presence(urgent))
+        except (BotoCoreError, ClientError):
+            if not fleet.names():
+                raise
+            return fleet.names()
 
     def stop(asked: Mapping[str, str]) -> MotionAnswer:
         """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
@@ -71,14 +85,15 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         if wanted is None:
             raise StationError("stopped must be true or false")
         one = [check_robot(asked["robot"])] if asked.get("robot") else None
-        robots = one or list(registry.presence(cloud))
+        robots = one or everyone()
         if wanted:
-            failed = stopping.stop(cloud, robots, by=user(), fleet=one is None)
+            failed = stopping.stop(urgent, robots, by=user(), fleet=one is None)
+            failed |= stopping.take_back(urgent, set(one or ()) - set(fleet.names()))
         else:
             seen_ms = whole(asked, "seen_ms", 0, 10**15)
-            failed = stopping.release(cloud, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
+            failed = stopping.release(urgent, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
         fleet.forget()
-        return _told(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
+        return _told(stopping.motion(urgent, [robot for robot in robots if robot not in failed]), failed)
 
     return {"stop": stop}
 

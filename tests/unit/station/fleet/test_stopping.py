@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from botocore.exceptions import ClientError
+from typer.testing import CliRunner
 
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.control.driving import NO_MOTION, DriveLimits, encode_limits
+from iort_station.cli.verbs.fleet.stop import commands
 from iort_station.errors import StationError
 from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
 from iort_station.page.answers import control, motion
+from tests.waiting import GUARD_S
 
 # A page that shows every stop.
 NOW = {"seen_ms": str(10**15)}
@@ -23,13 +28,21 @@ LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 5
 
 
 class Shadows:
-    """The shadows of two robots. ``broken`` is one whose shadow cannot be changed."""
+    """A cloud with the rows of two robots, and their shadows. ``broken`` is a robot whose shadow cannot be
+    changed."""
 
     class exceptions:
         class ResourceNotFoundException(Exception):
             """There is no shadow."""
 
     def __init__(self) -> None:
+        self.rows: dict[str, dict[str, Any]] = {
+            name: {"robot": {"S": name}, "online": {"BOOL": True}} for name in ("car7", "car8")
+        }
+        # The registry answers once it is set.
+        self.registry = threading.Event()
+        self.registry.set()
+        self.changed: list[str] = []
         self.states: dict[str, Any] = {"car7": {"reported": {"drive": encode_limits(LIMITS)}}}
         self.broken = ""
         self.version = 1
@@ -38,6 +51,27 @@ class Shadows:
 
     def client(self, _service: str) -> Shadows:
         return self
+
+    def urgent(self) -> Shadows:
+        return self
+
+    def output(self, _noun: str, name: str) -> str:
+        return name
+
+    def get_item(self, *, TableName: str, Key: Any, ConsistentRead: bool) -> dict[str, Any]:
+        assert self.registry.wait(GUARD_S)
+        row = self.rows.get(Key["robot"]["S"])
+        return {"Item": row} if row else {}
+
+    def get_paginator(self, _operation: str) -> Shadows:
+        return self
+
+    def paginate(self, *, TableName: str) -> list[dict[str, Any]]:
+        assert self.registry.wait(GUARD_S)
+        return [{"Items": list(self.rows.values())}]
+
+    def delete_thing_shadow(self, *, thingName: str, shadowName: str) -> None:
+        del self.states[thingName]
 
     def get_thing_shadow(self, *, thingName: str, shadowName: str) -> dict[str, Any]:
         if thingName not in self.states:
@@ -53,15 +87,18 @@ class Shadows:
         if document.get("version", self.version) != self.version:
             raise ClientError({"Error": {"Code": "ConflictException"}}, "UpdateThingShadow")
         self.states[thingName] = _merged(self.states.get(thingName, {}), document["state"])
+        self.changed.append(thingName)
+        self.answer(thingName)
+
+    def answer(self, robot: str) -> None:
+        """A robot hears of the change."""
 
     def confirm(self, robot: str, *, stopped: bool) -> None:
         self.states[robot].setdefault("reported", {})["motion"] = {"stopped": stopped}
 
 
 @pytest.fixture
-def cloud(monkeypatch):
-    monkeypatch.setattr(stopping.registry, "listed", lambda _cloud: [{"robot": "car7"}, {"robot": "car8"}])
-    monkeypatch.setattr(motion.registry, "presence", lambda _cloud: {"car7": {}, "car8": {}})
+def cloud():
     return Shadows()
 
 
@@ -191,8 +228,96 @@ def test_the_pages_settings_release_nothing(cloud):
 
 
 def test_a_stranger_or_an_unclear_wish_changes_nothing(cloud):
+    told = motion.actions(cloud)["stop"]({"robot": "car9", "stopped": "true"})
+    assert "robot car9 is not registered; the nearest: car" in told["failed"]["car9"]
+    assert "car9" not in cloud.states
     with pytest.raises(StationError, match="not registered: car9; nothing is changed"):
-        motion.actions(cloud)["stop"]({"robot": "car9", "stopped": "true"})
+        motion.actions(cloud)["stop"]({"robot": "car9", "stopped": "false", **NOW})
     with pytest.raises(StationError, match="stopped must be true or false"):
         motion.actions(cloud)["stop"]({"robot": "car7", "stopped": "yes"})
     assert "desired" not in cloud.states["car7"]
+
+
+def iort_stop(cloud: Shadows, *arguments: str) -> Any:
+    def found() -> Any:
+        if cloud.broken == "everything":
+            raise StationError("the embedded cloud does not answer")
+        return cloud
+
+    return CliRunner().invoke(commands, list(arguments), obj=SimpleNamespace(cloud=found))
+
+
+class Robots(Shadows):
+    """Robots that answer at once: car7 stops, and car8 has no motion command."""
+
+    def answer(self, robot: str) -> None:
+        if robot == "car7":
+            self.confirm(robot, stopped=self.states[robot]["desired"]["motion"]["stopped"])
+            self.states[robot]["reported"]["moves"] = True
+        elif self.states[robot]["desired"]["motion"]["stopped"]:
+            rejects(self, robot)
+        else:
+            self.states[robot]["reported"]["rejected"] = {}
+
+
+def test_the_command_names_first_and_in_plain_words_who_does_not_stand():
+    cloud = Robots()
+    done = iort_stop(cloud, "--all")
+    assert done.stdout.splitlines() == [
+        f"car8: NOT STOPPED: a stop does nothing there: {NO_MOTION}",
+        "car7: stopped",
+    ]
+    assert "NOT known to stand: car8." in done.stderr
+    assert done.exit_code == 1
+    released = iort_stop(cloud, "--all", "--release")
+    assert "car7: released" in released.stdout
+    assert "car8: was not stopped" in released.stdout
+    assert "stays stopped" not in released.output
+    assert released.exit_code == 0
+
+
+def test_a_named_robot_is_stopped_and_its_answer_told_while_the_registry_is_silent():
+    cloud = Robots()
+    cloud.registry.clear()
+    try:
+        done = iort_stop(cloud, "car7")
+        assert done.stdout == "car7: stopped\n"
+        assert "stop sent to car7" in done.stderr
+    finally:
+        cloud.registry.set()
+
+
+def test_a_robot_that_does_not_answer_is_told_after_a_second_with_what_else_stops_it(cloud):
+    done = iort_stop(cloud, "car7", "--seconds", "1.2")
+    assert "no answer after 1 s from car7" in done.stderr
+    assert "use the switch at the car" in done.stderr
+    assert "car7: NOT CONFIRMED: it has not answered" in done.stdout
+    assert done.exit_code == 1
+
+
+def test_a_robot_that_is_away_is_not_waited_for_nor_said_to_stand(cloud):
+    cloud.rows["car7"]["online"] = {"BOOL": False}
+    done = iort_stop(cloud, "car7", "--seconds", str(GUARD_S))
+    assert "car7: NOT CONFIRMED: it is not connected" in done.stdout
+    assert "NOT known to stand: car7" in done.stderr
+    assert done.exit_code == 0
+
+
+def test_a_stranger_is_no_stopped_robot(cloud):
+    done = iort_stop(cloud, "car9", "--seconds", str(GUARD_S))
+    assert "car9: NOT STOPPED: robot car9 is not registered" in done.stdout
+    assert done.exit_code == 1
+    assert "car9" not in cloud.states
+
+
+@pytest.mark.parametrize("broken", ["everything", "car7"])
+def test_a_stop_that_reaches_no_cloud_says_first_that_nothing_was_stopped(cloud, broken):
+    cloud.broken = broken
+    done = iort_stop(cloud, "car7")
+    first, ends, *rest = str(done.exception).splitlines()
+    assert first == "NOTHING WAS STOPPED."
+    assert "0.5 s after the last command" in ends
+    assert "10 s at most" in ends
+    assert "use the switch at the car" in ends
+    assert rest[-1].startswith("The cloud: ")
+    assert done.exit_code == 1

@@ -97,7 +97,8 @@ class _Seat:
     """One driver, one car, and the broker between them."""
 
     def __init__(self, cloud: Cloud, robot: str, driver: Driver) -> None:
-        self._cloud, self._robot, self._driver = cloud, robot, driver
+        self._urgent, self._robot, self._driver = cloud.urgent(), robot, driver
+        self._namespace = cloud.namespace
         self._keys, self._begun = Keys(), ""
         self._heard: queue.SimpleQueue[tuple[str, bytes, int]] = queue.SimpleQueue()
         self._topic = build_topic(CMD, robot, driver.limits.command, cloud.namespace)
@@ -167,7 +168,7 @@ class _Seat:
         self._keys.let_go()
         # The broker is faster than the shadow.
         self._tick(now_us)
-        failed = stopping.stop(self._cloud, [self._robot], by=self._driver.by)
+        failed = stopping.stop(self._urgent, [self._robot], by=self._driver.by)
         if failed:
             raise StationError(f"the emergency stop of {self._robot} has failed: {failed[self._robot]}")
         self._stop_asked = True
@@ -177,7 +178,7 @@ class _Seat:
             self._take(*self._heard.get())
         if now_us - self._viewed_us >= VIEW_RENEW_S * 1e6:
             self._viewed_us = now_us
-            self.broker.publish(lease_topic(self._robot, self._cloud.namespace), self._lease)
+            self.broker.publish(lease_topic(self._robot, self._namespace), self._lease)
         driver = self._driver
         driver.hold(held=self._keys.held(now_us), now_us=now_us)
         driver.stick = self._keys.stick(now_us)
