@@ -21,10 +21,11 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 
 from iort_agent.sources.sim.circuit import HALL
-from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT
+from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.messages.control.driving import stick_downlink
 from iort_contract.topics import PING_PATHS
 from iort_station import kept
 from iort_station.errors import StationError
@@ -50,17 +51,7 @@ _SOURCE_RATE_HZ = 50
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
 # `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`, and the stick of page and terminal.
 # Nobody is hurt by a long lease.
-DOWNLINK = {
-    "cmd": {
-        "drive": {
-            "topic": "/drive",
-            "type": DRIVE_TYPE,
-            "partial": True,
-            "motion": {"lease_s": 10.0, "stop": {"drive": {"speed": 0.0}}},
-        }
-    },
-    "drive": {"max_speed_mps": 2.0, "max_steering_rad": 0.4},
-}
+DOWNLINK = stick_downlink(MAX_LEASE_MS)
 _STANDS_S = 60.0
 _STATUS_S = 1.0
 _LOOK_S = 1.0

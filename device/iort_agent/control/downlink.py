@@ -17,6 +17,7 @@ from iort_agent.control.motion.guard import Guard
 from iort_agent.control.peers import Peers
 from iort_agent.control.questions import Questions
 from iort_agent.control.shares import Shares
+from iort_agent.errors import SourceError
 from iort_agent.files.http import downloader
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.uplink import Link
@@ -158,7 +159,12 @@ def make_downlink(
         return None
     node = next((source.node for source in sources if isinstance(source, Ros1Config)), None)
     if graph is None or node is not None:
-        graph = shared(node or DEFAULT_NODE, link.clock)
+        try:
+            graph = shared(node or DEFAULT_NODE, link.clock)
+        except SourceError as error:
+            raise SourceError(
+                f"downlink and share need ROS 1; without it remove them from car.yaml: {error}"
+            ) from error
     guard = None
     if isinstance(graph, Node) and config.moves():
         guard = Guard(graph.base, config.motions(), link.clock, queue)

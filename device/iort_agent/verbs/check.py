@@ -20,6 +20,7 @@ from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status.server import ask
 from iort_agent.verbs.way import way
+from iort_contract.messages.control.driving import NO_MOTION
 
 _EXPIRES_SOON_S = 30 * 86_400
 _LEAST_FREE_BYTES = 50_000_000
@@ -34,6 +35,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
     yield _lanes(config)
+    yield emergency_stop(config)
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
@@ -105,6 +107,15 @@ def _queue(config: Config) -> Iterator[Finding]:
         yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
     else:
         yield Finding("queue", OK, text)
+
+
+def emergency_stop(config: Config) -> Finding:
+    """Whether the robot can be stopped from afar."""
+    commands = [name for name, one in config.downlink.cmd if one.motion is not None]
+    if not commands:
+        todo = "give downlink.cmd a command with motion, or whoever can stop the robot another way"
+        return Finding("emergency stop", WARN, f"does nothing here: {NO_MOTION}", todo)
+    return Finding("emergency stop", OK, f"ends what {', '.join(commands)} moves")
 
 
 def _lanes(config: Config) -> Finding:

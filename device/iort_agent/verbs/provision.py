@@ -25,6 +25,7 @@ from iort_agent.status.server import ask
 from iort_agent.verbs.registration import SEAMS, Seams, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
+from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
 from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
@@ -148,7 +149,8 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
     """Set keys of a configuration and leave everything else, comments included, or write a new one."""
     if not file.exists():
         content = {**settings, "sources": _DEFAULT_SOURCES}
-        _write_private(file, yaml.safe_dump(content, sort_keys=False))
+        downlink = DOWNLINK_NOTE + yaml.safe_dump({"downlink": stick_downlink()}, sort_keys=False)
+        _write_private(file, yaml.safe_dump(content, sort_keys=False) + downlink)
         return
     lines = file.read_text(encoding="utf-8").splitlines()
     for name, value in settings.items():

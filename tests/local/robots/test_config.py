@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry

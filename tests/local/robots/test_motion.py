@@ -39,13 +39,13 @@ def test_a_car_is_driven_stopped_and_released_and_the_stop_outlives_the_agent(em
         assert decode_reported(shadow.reported()).drive.max_speed_mps == 2.0
         # On a slow machine a command may come too late.
         until(lambda: "has accepted drive" in send().output)
-        until(lambda: iort("stop", robot).output == f"{robot}: stopped\n")
+        until(lambda: iort("stop", robot).stdout == f"{robot}: stopped\n")
         refused = until(lambda: "emergency stop" in str((one := send()).exception) and one)
         assert refused.exit_code == 1
-    assert iort("stop", robot).output == f"{robot}: stopped\n", "as it said before it ended"
+    assert iort("stop", robot).stdout == f"{robot}: stopped\n", "as it said before it ended"
     with driving(car):
         until(lambda: "emergency stop" in str(send().exception))
-        until(lambda: iort("stop", robot, "--release").output == f"{robot}: released\n")
+        until(lambda: iort("stop", robot, "--release").stdout == f"{robot}: released\n")
         until(lambda: "has accepted drive" in send().output)
     until(lambda: list(counts.batches(embedded.cloud, robot, "drive")))
     told = data.query(embedded.cloud, robot, "drive", "-1h", "now")

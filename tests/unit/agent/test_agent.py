@@ -26,7 +26,6 @@ from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.sim.graph import DRIVE_TYPE
 from iort_agent.sources.sim.source import SimConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.interface import REJECT_NEW, Spool
@@ -36,6 +35,7 @@ from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.messages.message_type import MessageType, message_type
 from tests.agent_fakes import Loopback, Published
 

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,15 +27,17 @@ from iort_agent.errors import AgentError, BusyError, NotRunningError
 from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.sources import OK, WARN
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import server as status_server
 from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.status.server import StatusServer, ask, fetch
 from iort_agent.status.text import render
-from iort_agent.verbs.check import FAIL, check
+from iort_agent.verbs.check import FAIL, check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
+from iort_contract.messages.control.driving import stick_downlink
 from tests.agent_fakes import Loopback, ManualClock
 
 
@@ -469,3 +472,15 @@ def test_status_shows_the_counts_of_the_sources() -> None:
         "source    VESC",
     ]
     assert "\n".join(lines) in render(read(Status, state))
+
+
+@pytest.mark.parametrize(
+    ("more", "level"), [((), WARN), ((yaml.safe_dump({"downlink": stick_downlink()}),), OK)]
+)
+def test_a_robot_that_no_stop_stops_is_found_before_one_is_needed(
+    tmp_path: Path, more: tuple[str, ...], level: str
+) -> None:
+    from tests.unit.agent.test_agent import config_file
+
+    finding = emergency_stop(load_config(config_file(tmp_path, "{type: sim}", *more)))
+    assert finding.level == level

@@ -40,6 +40,14 @@ DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SETTINGS_UNKNOWN, NO_GUARD = (
     "settings_unknown",
     "guard_not_ready",
 )
+# The ROS type of a car that a stick drives, as the simulated one.
+DRIVE_TYPE = "ackermann_msgs/AckermannDriveStamped"
+# Above `downlink` in a car.yaml that is written for a simulated car.
+DOWNLINK_NOTE = """\
+# What `iort drive`, `iort send` and the page move, and what the emergency stop ends: without a command with
+# motion, a stop does nothing. These are the simulated car's. For a ROS 1 car, name its own topic and type
+# (docs/how-to/drive.md); a car without ROS 1 cannot be moved by commands: remove the section.
+"""
 # Why a robot rejects a stop, and what its operators are told before they need one.
 NO_MOTION = "nothing to stop: downlink.cmd has no command with motion"
 # Not of a command: the lease ended, or an emergency stop began, and the robot was stopped.
@@ -60,6 +68,16 @@ REFUSALS: Mapping[str, str] = {
     NO_ROS: "the agent is not in the ROS graph",
     CLOSED: "the agent is ending",
 }
+
+
+def stick_downlink(lease_ms: int = DRIVE_LEASE_MS) -> dict[str, Any]:
+    """The section `downlink` of the car.yaml of a simulated car: one command, which a stick drives and a stop
+    ends."""
+    motion = {"lease_s": lease_ms / 1000, "stop": {"drive": {"speed": 0.0}}}
+    return {
+        "cmd": {"drive": {"topic": "/drive", "type": DRIVE_TYPE, "partial": True, "motion": motion}},
+        "drive": {"max_speed_mps": 2.0, "max_steering_rad": 0.4},
+    }
 
 
 @dataclass(frozen=True)

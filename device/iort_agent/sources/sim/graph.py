@@ -11,9 +11,9 @@ from iort_agent.ros1.json_message import decode
 from iort_agent.ros1.trigger import OnTrigger
 from iort_agent.sources.sim.driver import Wish
 from iort_contract.messages.control.commands import MAX_LEASE_MS
+from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.ros1.definition import Definition, parse
 
-DRIVE_TYPE = "ackermann_msgs/AckermannDriveStamped"
 _RULE = "=" * 80
 _DRIVE = parse(
     DRIVE_TYPE,

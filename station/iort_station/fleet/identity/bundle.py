@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
 from iort_station.cloud import Cloud
 
 
@@ -35,7 +36,11 @@ def write_bundle(
     config["sources"] = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
     config["queue"] = {"path": "queue.db"}
     config.update(settings)
-    write_private(bundle.config, yaml.safe_dump(config, sort_keys=False))
+    text = yaml.safe_dump(config, sort_keys=False)
+    # Other sources may have no ROS graph to take commands.
+    if not {"sources", "downlink"} & settings.keys():
+        text += DOWNLINK_NOTE + yaml.safe_dump({"downlink": stick_downlink()}, sort_keys=False)
+    write_private(bundle.config, text)
 
 
 def connection(

@@ -9,12 +9,14 @@ from typing import Mapping
 
 import pytest
 
+from iort_agent.config import load_config
 from iort_agent.errors import BusyError, IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
 from iort_agent.verbs import provision as provision_module
 from iort_agent.verbs.provision import provision
 from iort_agent.verbs.registration import Seams, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.control.driving import DRIVE_LEASE_MS
 
 
 class Cloud:
@@ -118,6 +120,16 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
     pending = Pending(**{**values, **other}, asked_s=time.time() if asked_s is None else asked_s)
     keep(folder, pending)
     return pending
+
+
+def test_a_new_configuration_simulates_a_car_that_can_be_driven_and_stopped(
+    claim: Path, aws: Exchange
+) -> None:
+    config = load_config(provision(claim, robot="car", seams=aws.seams))
+    limits = config.downlink.drive_limits()
+    assert limits is not None
+    assert (limits.max_speed_mps, limits.lease_ms) == (2.0, DRIVE_LEASE_MS)
+    assert config.downlink.moves()
 
 
 def taken_up(claim: Path, aws: Exchange) -> str:

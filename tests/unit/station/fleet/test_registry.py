@@ -6,8 +6,11 @@ from decimal import Decimal
 
 import pytest
 
+from iort_agent.config import load_config
+from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+from iort_station.fleet.identity.bundle import Bundle, write_bundle
 from tests.fakes import ROBOTS, serialize
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
 
@@ -63,3 +66,21 @@ def test_set_vehicle_changes_only_the_given_parameters(dynamodb):
     with pytest.raises(StationError, match="robot nobody is not registered"):
         registry.set_vehicle(cloud, "nobody", {"speed_to_erpm_gain": 1.0})
     assert registry.find(cloud, "nobody") is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "moves"),
+    [
+        ({}, True),
+        # A bag, or a VESC without ROS, takes no commands.
+        ({"sources": [{"type": "vesc", "port": "/dev/null"}]}, False),
+        ({"downlink": {}}, False),
+    ],
+)
+def test_a_written_configuration_has_the_motion_command_of_its_source(tmp_path, settings, moves):
+    cloud = Cloud(mqtt_host="localhost", root_ca_pem="ca")
+    bundle = Bundle("car7", tmp_path)
+    write_bundle(cloud, bundle, "certificate", "key", settings)
+    downlink = load_config(bundle.config).downlink
+    assert downlink.moves() is moves
+    assert (downlink.drive_limits() is not None) is moves

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.control.driving import NO_MOTION, DriveLimits, encode_limits
+from iort_station.cli.verbs.fleet.robots import commands as robots
 from iort_station.cli.verbs.fleet.stop import commands
 from iort_station.errors import StationError
 from iort_station.fleet.control import stopping
@@ -37,7 +38,8 @@ class Shadows:
 
     def __init__(self) -> None:
         self.rows: dict[str, dict[str, Any]] = {
-            name: {"robot": {"S": name}, "online": {"BOOL": True}} for name in ("car7", "car8")
+            name: {"robot": {"S": name}, "online": {"BOOL": True}, "connected_ms": {"N": "1"}}
+            for name in ("car7", "car8")
         }
         # The registry answers once it is set.
         self.registry = threading.Event()
@@ -321,3 +323,17 @@ def test_a_stop_that_reaches_no_cloud_says_first_that_nothing_was_stopped(cloud,
     assert "use the switch at the car" in ends
     assert rest[-1].startswith("The cloud: ")
     assert done.exit_code == 1
+
+
+def test_the_list_of_robots_says_before_it_is_needed_whom_a_stop_does_not_stop(cloud):
+    cloud.states = {"car7": {"reported": {"moves": True}}, "car8": {"reported": {"moves": False}}}
+    cloud.rows["car9"] = {"robot": {"S": "car9"}}
+    asked = SimpleNamespace(cloud=lambda: cloud)
+    listed = CliRunner().invoke(robots, ["list", "--json"], obj=asked)
+    assert [(one["robot"], one["stoppable"]) for one in json.loads(listed.stdout)] == [
+        ("car7", True),
+        ("car8", False),
+        ("car9", None),
+    ]
+    shown = CliRunner().invoke(robots, ["list"], obj=asked)
+    assert f"an emergency stop does NOT stop car8: {NO_MOTION}" in shown.stderr

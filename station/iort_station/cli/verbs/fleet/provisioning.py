@@ -18,6 +18,10 @@ from iort_station.output import check_free
 
 commands = typer.Typer()
 
+_STOP = (
+    "An emergency stop ends what downlink.cmd in car.yaml moves: the simulated car's command is there. Name "
+    "your robot's own before you drive it (docs/how-to/drive.md)."
+)
 _Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
 _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
@@ -36,7 +40,7 @@ def add(
     where, config = f"Copy {bundle.folder} to it, then run there", f"{bundle.folder.name}/car.yaml"
     if cloud.mqtt_endpoint == "127.0.0.1":
         where, config = "This cloud is for robots of this machine alone; run here", str(bundle.config)
-    text = f"{name} is registered. {where}:\n\n  iort-agent run --config {config}"
+    text = f"{name} is registered. {where}:\n\n  iort-agent run --config {config}\n\n{_STOP}"
     tell({"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)}, text, as_json=as_json)
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 import typer
+from botocore.exceptions import ClientError
 from rich.table import Table
 
 from iort_contract.catalog.analysis.car import KNOWN
+from iort_contract.messages.control.driving import NO_MOTION
 from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
@@ -36,9 +38,10 @@ from iort_station.cli.options import AsJson, From, Last, Robot, When, Yes, agree
 from iort_station.cli.progress import reading
 from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import examples, say
+from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
 from iort_station.fleet import registry, robots
-from iort_station.fleet.control import shadow
+from iort_station.fleet.control import shadow, stopping
 from iort_station.fleet.identity import certificates, claims
 from iort_station.times import iso_s, stamped, time_us
 
@@ -47,6 +50,8 @@ commands.add_typer(provisioning.commands)
 commands.add_typer(tags.commands)
 # A pipe has no width at which a line must end.
 _PIPE_WIDTH = 10_000
+# Whether an emergency stop ends its motion; None before the robot has said so.
+_STOPPABLE = {True: "yes", False: "NO", None: "?"}
 
 
 @commands.command(
@@ -114,9 +119,11 @@ def set_(
 @commands.command("list", epilog=examples("robots list"))
 def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
-    rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
+    cloud = context.obj.cloud()
+    rows = sorted(robots.listed(cloud), key=lambda row: str(row[ROBOT]))
+    stoppable = {name: one.stoppable for name, one in _motion(cloud, rows).items()}
     if as_json:
-        print_json([_as_json(row) for row in rows])
+        print_json([{**_as_json(row), "stoppable": stoppable.get(str(row[ROBOT]))} for row in rows])
         return
     if not rows:
         errors.print("no robot is registered; `iort robots add NAME` registers one")
@@ -124,11 +131,14 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
     table = Table(box=None, pad_edge=False)
     # A name must be complete to be copied; long parameters have a second line.
     table.add_column("robot", min_width=max(len(str(row[ROBOT])) for row in rows))
-    for heading in ("connection", "agent", "parameters"):
+    for heading in ("connection", "stop", "agent", "parameters"):
         table.add_column(heading, overflow="fold")
     for row in rows:
-        table.add_row(row[ROBOT], _connection(row), row.get(AGENT_VERSION, ""), _parameters(row))
+        stop = _STOPPABLE[stoppable.get(str(row[ROBOT]))]
+        table.add_row(row[ROBOT], _connection(row), stop, row.get(AGENT_VERSION, ""), _parameters(row))
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
+    if moving := [str(row[ROBOT]) for row in rows if stoppable.get(str(row[ROBOT])) is False]:
+        say(f"an emergency stop does NOT stop {', '.join(moving)}: {NO_MOTION}")
 
 
 @commands.command("show", epilog=examples("robots show car7"))
@@ -140,11 +150,12 @@ def show(
     """Show a robot: its connection, its share of Lambda 2, its provisioning, its certificates."""
     cloud = context.obj.cloud()
     row, held = registry.get(cloud, name), certificates.attached(cloud, name)
-    over = shadow.over_share(cloud, name)
+    over, motion = shadow.over_share(cloud, name), stopping.motion(cloud, [name])[name]
     if as_json:
         print_json(
             {
                 **_as_json(row),
+                "stoppable": motion.stoppable,
                 OVER_SHARE: over
                 and {
                     "batches": over.batches,
@@ -169,6 +180,7 @@ def show(
     # An identifier must be complete to be copied.
     table.add_column(overflow="fold")
     table.add_row("connection", _connection(row))
+    table.add_row("stop", motion.why_not or "an emergency stop ends its motion")
     if over is not None:
         since, last = (iso_s(at_ms * 1000) for at_ms in (over.since_ms, over.last_ms))
         text = f"over: {over.batches} batches put off since {since}, the last at {last}"
@@ -211,6 +223,15 @@ def remove(
         tell({"removed": one}, f"{one} is removed", as_json=as_json)
     count = claims.revoke_all(cloud)
     tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
+
+
+def _motion(cloud: Cloud, rows: Iterable[Mapping[str, Any]]) -> Mapping[str, stopping.Motion]:
+    """Of robots whose shadows may be read."""
+    try:
+        return stopping.motion(cloud, [str(row[ROBOT]) for row in rows])
+    except ClientError as error:
+        say(f"whether a stop ends their motion cannot be read: {error}")
+        return {}
 
 
 def _parameter(text: str) -> tuple[str, float]:
