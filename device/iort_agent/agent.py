@@ -11,7 +11,7 @@ from iort_agent.common.logs import Troubles, set_level
 from iort_agent.common.version import agent_version
 from iort_agent.config import Config
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.motion.commands import Operator
+from iort_agent.control.motion.commands import Operator, refuse_commands
 from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.upload import make_uploader
@@ -107,6 +107,8 @@ class Agent:
             root_ca=config.root_ca,
             queue=config.queue.path,
         )
+        if self.downlink is None:
+            refuse_commands(link, self.shadow.answer)
         self.uploads = make_uploads(config.files, uploader, clock)
         self.attachments = make_attachments(
             config.files, robot=config.robot, clock=clock, uploads=self.uploads

@@ -233,7 +233,8 @@ class MotionAnswer(TypedDict):
 
 
 class SendAnswer(TypedDict):
-    """Answers ``send``: null if the robot did not answer, or its reason if it rejected the command."""
+    """Answers ``send``: null if the robot did not answer, with the reason if it is not connected; or its
+    reason if it rejected the command."""
 
     accepted: bool | None
     reason: str

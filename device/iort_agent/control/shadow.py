@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 _AGAIN_S, _FETCH_AGAIN_S = 30.0, 5.0
 # AWS limits a shadow document to 8 KB. A rejected value is quoted up to this length.
 _MAX_VALUE_CHARS = 200
+_MAX_ANSWERS = 16
 _NOT_FOUND = 404
 
 
@@ -102,8 +103,13 @@ class Shadow:
         return self._reported is not None and self._fetch_at is None
 
     def answer(self, name: str, command: Command, rejection: str | None) -> None:
-        """Report the outcome of a command; only the newest of each name is kept."""
+        """Report the outcome of a command; only the newest of each name is kept, and of
+        some names only."""
         outcome = ACCEPTED if rejection is None else _quoted(rejection)
+        self._answers.pop(name, None)
+        while len(self._answers) >= _MAX_ANSWERS:
+            # Names that nobody has given the robot must not fill the shadow.
+            del self._answers[next(iter(self._answers))]
         self._answers[name] = Outcome(command.session, command.seq, outcome)
         self._report_at = self._clock.monotonic()
 

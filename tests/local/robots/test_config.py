@@ -55,9 +55,9 @@ def test_a_running_agent_applies_a_setting_and_answers(iort, bundle, embedded):
         assert withdrawn.exit_code == 0, withdrawn.output
         assert settings(withdrawn)["live.rate_hz"] == 10
         assert "fields.vesc" not in settings(withdrawn)
-        # The agent accepts only the commands in its car.yaml, and this file has none.
-        unheard = iort("send", car.robot, "drive", "{}", "--seconds", "0")
-        assert "downlink.cmd.drive" in str(unheard.exception)
+        # This car.yaml has no commands: the agent says so, and nobody waits.
+        unknown = iort("send", car.robot, "drive", "{}", "--valid-ms", "60000", "--seconds", "60")
+        assert "no such command; car.yaml has no downlink.cmd" in str(unknown.exception)
 
 
 def test_a_change_for_an_offline_robot_is_pending(iort, bundle):

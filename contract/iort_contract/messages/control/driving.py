@@ -50,6 +50,8 @@ DOWNLINK_NOTE = """\
 """
 # Why a robot rejects a stop, and what its operators are told before they need one.
 NO_MOTION = "nothing to stop: downlink.cmd has no command with motion"
+# Why a robot rejects a command of any kind.
+NO_COMMAND = "no_such_command"
 # Not of a command: the lease ended, or an emergency stop began, and the robot was stopped.
 STOPPED = "stopped"
 REFUSALS: Mapping[str, str] = {

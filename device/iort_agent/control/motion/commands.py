@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, Mapping, Sequence
 
+from iort_agent.common.schema import did_you_mean
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.motion.driving import limited
 from iort_agent.control.motion.guard import Guard
 from iort_agent.control.motion.named import Motion, Named
 from iort_agent.control.motion.stops import STOP_AHEAD_MS
-from iort_agent.mqtt.uplink import MqttMessage
+from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.control.commands import Command, decode_command
-from iort_contract.messages.control.driving import NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
+from iort_contract.messages.control.driving import NO_COMMAND, NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)
@@ -40,6 +42,40 @@ class Operator:
     answer: Callable[[str, Command, str | None], None]
     drove: Callable[[Mapping[str, Value]], None]
     settings_known: Callable[[], bool]
+
+
+class Unknown:
+    """Answers commands that a robot does not have: who sent one need not wait. ``known`` are the others."""
+
+    def __init__(
+        self,
+        known: Sequence[str],
+        rejections: ThrottledLog,
+        answer: Callable[[str, Command, str | None], None],
+    ) -> None:
+        self._known, self._rejections, self._answer = known, rejections, answer
+
+    def refuse(self, message: MqttMessage) -> None:
+        name = message.topic.rsplit("/", 1)[-1]
+        known = f"known: {', '.join(self._known)}" if self._known else "car.yaml has no downlink.cmd"
+        reason = f"{NO_COMMAND.replace('_', ' ')}{did_you_mean(name, self._known)}; {known}"
+        try:
+            offered = decode_command(message.payload)
+        except ContractError as error:
+            self._rejections.warn(f"{CMD} malformed", f"{message.topic}: rejected: {error}")
+            return
+        self._rejections.warn(f"{CMD} {NO_COMMAND}", f"{message.topic}: rejected: {reason}")
+        if offered.answer:
+            self._answer(name, offered, reason)
+
+
+def refuse_commands(link: Link, answer: Callable[[str, Command, str | None], None]) -> None:
+    """Answer every command to a robot that takes none."""
+    link.uplink.subscribe(_all(link), Unknown((), ThrottledLog(_log, link.clock), answer).refuse)
+
+
+def _all(link: Link) -> str:
+    return f"{CMD}/{link.namespace}/{link.robot}/+"
 
 
 class Commands:
@@ -76,10 +112,10 @@ class Commands:
                 name, settings, definition, skew_s=config.clock_skew_s, motion=motion, limits=limits
             )
             command.check(self._clock.now_us())
-            topic = bridge.link.topic(CMD, name)
-            self._commands[topic] = command
+            self._commands[bridge.link.topic(CMD, name)] = command
             self._graph.advertise(settings.topic, settings.type)
-            bridge.link.uplink.subscribe(topic, self._on_message)
+        self._unknown = Unknown([name for name, _ in config.cmd], bridge.rejections, operator.answer)
+        bridge.link.uplink.subscribe(_all(bridge.link), self._on_message)
         bridge.link.uplink.on_connection(self._on_connection)
 
     def set_stopped(self, stopped: bool) -> None:  # noqa: FBT001 - a setting's value
@@ -197,7 +233,10 @@ class Commands:
         self._wake()
 
     def _on_message(self, message: MqttMessage) -> None:
-        command = self._commands[message.topic]
+        command = self._commands.get(message.topic)
+        if command is None:
+            self._unknown.refuse(message)
+            return
         try:
             offered = decode_command(message.payload)
         except ContractError as error:

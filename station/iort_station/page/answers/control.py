@@ -40,7 +40,8 @@ def actions(cloud: Cloud) -> dict[str, Answer]:
 
 
 def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
-    """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves."""
+    """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves;
+    ``takeover`` takes the wheel from whoever drives."""
     try:
         message = json.loads(text(asked, "message"))
     except (ValueError, RecursionError) as error:
@@ -49,10 +50,18 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
         raise StationError("the message must be a JSON object with the fields of the ROS message")
     lease_ms = whole(asked, "lease_ms", 1, MAX_LEASE_MS) if asked.get("lease_ms") else None
     began = time.monotonic()
-    sent = commands.send(cloud, text(asked, "robot"), text(asked, "command"), message, lease_ms=lease_ms)
+    takeover = asked.get("takeover") == "true"
+    sent = commands.send(
+        cloud,
+        text(asked, "robot"),
+        text(asked, "command"),
+        message,
+        lease_ms=lease_ms,
+        takeover=takeover,
+    )
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
-        return {"accepted": None, "reason": "", "after_ms": after_ms}
+        return {"accepted": None, "reason": sent.offline, "after_ms": after_ms}
     accepted = sent.outcome == ACCEPTED
     return {"accepted": accepted, "reason": "" if accepted else sent.outcome, "after_ms": after_ms}
 

@@ -682,7 +682,7 @@ export interface MotionAnswer {
   readonly failed: Readonly<Record<string, string>>;
 }
 
-/** Answers ``send``: null if the robot did not answer, or its reason if it rejected the command. */
+/** Answers ``send``: null if the robot did not answer, with the reason if it is not connected; or its reason if it rejected the command. */
 export interface SendAnswer {
   readonly accepted: boolean | null;
   readonly reason: string;

@@ -94,6 +94,7 @@ export class Commands {
       const { accepted, reason, after_ms } = await act<SendAnswer>("send", { robot, command, message: JSON.stringify(message), lease_ms });
       if (accepted) told = ["good", `${command} accepted after ${age(after_ms / 1000)}`];
       else if (accepted === false) told = ["bad", `${command} rejected: ${reason.replaceAll("_", " ")}`];
+      else if (reason) told = ["bad", reason];
       else told = ["bad", `No answer within ${age(after_ms / 1000)}. Does its agent run, and has its car.yaml downlink.cmd.${command}?`];
     } catch (error) {
       if (!(error instanceof AnswerError)) throw error;

@@ -9,8 +9,11 @@ import pytest
 
 from iort_agent.clock import SystemClock
 from iort_agent.common.state import ClockOffset
+from iort_agent.control.motion.commands import refuse_commands
 from iort_agent.control.motion.stops import STOP_AHEAD_MS
-from tests.agent_fakes import ManualClock
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_contract.messages.control.commands import Command, encode_command
+from tests.agent_fakes import Loopback, ManualClock, link_of
 from tests.unit.agent.control.downlink_rig import CONFIG, LEASE_MS, T0, FakeGuard, Rig, doubles
 
 
@@ -350,3 +353,23 @@ def test_a_ros_library_that_fails_once_does_not_keep_the_car_from_stopping() -> 
     assert rig.graph.stopped.wait(5)
     assert not failures
     rig.downlink.close()
+
+
+def test_an_unknown_command_is_rejected_at_once_with_the_known_names() -> None:
+    rig = Rig()
+    rig.send({"data": 1.0}, name="sped", answer=True)
+    ((name, seq, reason),) = rig.answers
+    assert (name, seq) == ("sped", 0)
+    assert reason == "no such command (did you mean speed?); known: speed, say"
+    assert rig.refused() == {"cmd no_such_command": 1}
+
+
+def test_a_robot_without_commands_rejects_every_command_at_once() -> None:
+    clock, dispatcher = ManualClock(), Dispatcher()
+    uplink, answers = Loopback(clock, dispatcher), []
+    refuse_commands(link_of(uplink, clock), lambda *answer: answers.append(answer))
+    uplink.connect()
+    command = Command("feedbeef", 1, 0, 2, 500, {}, answer=True)
+    uplink.deliver("cmd/iort/car1/drive", encode_command(command))
+    dispatcher.run_pending()
+    assert answers == [("drive", command, "no such command; car.yaml has no downlink.cmd")]

@@ -366,3 +366,11 @@ def test_outcomes_of_commands_are_reported_until_the_run_ends() -> None:
     rig.shadow._follow()
     rig.settle()
     assert not rig.reported.get("commands")
+
+
+def test_unknown_names_do_not_fill_the_shadow() -> None:
+    rig = Rig()
+    for i in range(40):
+        rig.shadow.answer(f"name{i}", Command("feedbeef", 1, i, 2, 500, {}), "no such command")
+    rig.settle()
+    assert list(rig.reported["commands"]) == [f"name{i}" for i in range(24, 40)]

@@ -11,7 +11,7 @@ from iort_contract.messages.control.commands import MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.topics import ACCEPTED
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.control import commands as fleet_commands
 
@@ -36,31 +36,45 @@ def send(
     seconds: Annotated[
         float, typer.Option(min=0, help="How long to wait for the robot's answer.")
     ] = fleet_commands.ANSWER_S,
+    takeover: Annotated[
+        bool, typer.Option("--takeover", help="Take the wheel from whoever drives; refused otherwise.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Send a command and print the robot's answer.
 
-    Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own,
-    which takes over from the one that drives.
+    Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own:
+    while another one drives, also an earlier call of yours, a motion is refused unless it has --takeover.
     """
     asked = _message(message)
     cloud = context.obj.cloud()
     with errors.status(f"waiting for {robot}"):
-        command, said = fleet_commands.send(
-            cloud, robot, name, asked, lease_ms=lease_ms, valid_ms=valid_ms, seconds=seconds
+        command, said, offline = fleet_commands.send(
+            cloud,
+            robot,
+            name,
+            asked,
+            lease_ms=lease_ms,
+            valid_ms=valid_ms,
+            seconds=seconds,
+            takeover=takeover,
+            on_offline=say,
         )
     if as_json:
         sent = {"robot": robot, "command": name, "session": command.session, "seq": command.seq}
         print_json({**sent, "outcome": said})
     elif said == ACCEPTED:
         out.print(f"{robot} has accepted {name}")
+    if offline:
+        raise StationError(f"{offline}, and has not answered")
     if said is None:
         raise StationError(
             f"{robot} has not answered within {seconds:g} s: is its agent running, and has its car.yaml "
             f"downlink.cmd.{name}?"
         )
     if said != ACCEPTED:
-        raise StationError(f"{robot} has rejected {name}: {said}")
+        advice = fleet_commands.advice(said)
+        raise StationError(f"{robot} has rejected {name}: {said}{advice and f': {advice}'}")
 
 
 def _message(text: str) -> dict[str, Any]:
