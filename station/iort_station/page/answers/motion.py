@@ -19,8 +19,9 @@ from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
 from iort_station.page.answers.parameters import text, whole
 
-# Every open page asks for the fleet, and each robot costs a read of its shadow.
-_KEPT_S = 3.0
+# Every open page asks for the fleet, and each robot costs a read of its shadow. For a while after a stop or a
+# release somebody waits for the robots' word.
+_KEPT_S, _KEPT_WAITING_S, _WAITING_S = 3.0, 0.1, 20.0
 
 
 class _Fleet:
@@ -29,24 +30,25 @@ class _Fleet:
     def __init__(self, cloud: Cloud) -> None:
         self._cloud = cloud
         self._lock = threading.Lock()
-        self._read_s = -_KEPT_S
+        self._read_s = self._changed_s = float("-inf")
         self._found: dict[str, stopping.Motion] = {}
 
     def motion(self) -> dict[str, stopping.Motion]:
         with self._lock:
-            if time.monotonic() - self._read_s >= _KEPT_S:
+            began_s = time.monotonic()
+            kept_s = _KEPT_WAITING_S if began_s - self._changed_s < _WAITING_S else _KEPT_S
+            if began_s - self._read_s >= kept_s:
                 self._found = stopping.motion(self._cloud, registry.presence(self._cloud))
-                self._read_s = time.monotonic()
+                self._read_s = began_s
             return self._found
 
     def names(self) -> list[str]:
         """The robots as they were last read, if they ever were."""
         return list(self._found)
 
-    def forget(self) -> None:
-        """Read again when asked next: a stop must not seem to be gone."""
-        with self._lock:
-            self._read_s = -_KEPT_S
+    def changed(self) -> None:
+        """A stop or a release was asked for: read again when asked next, and often. Waits for no reading."""
+        self._changed_s, self._read_s = time.monotonic(), float("-inf")
 
 
 @functools.cache
@@ -92,7 +94,7 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         else:
             seen_ms = whole(asked, "seen_ms", 0, 10**15)
             failed = stopping.release(urgent, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
-        fleet.forget()
+        fleet.changed()
         return _told(stopping.motion(urgent, [robot for robot in robots if robot not in failed]), failed)
 
     return {"stop": stop}

@@ -78,7 +78,7 @@ export class Viewing {
       return;
     }
     const asked = { robots: robots.join(","), viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms), ...(this.connected ? { broker: "yes" } : {}) };
-    act("view", asked, lease_ms === 0)
+    act("view", asked, { keepalive: lease_ms === 0 })
       .then(() => {
         this.error = "";
         // A car that is looked at again meanwhile may have heard of it before it heard of the end.

@@ -2,6 +2,7 @@
 
 import { KEY_HEADER } from "../base/contract";
 import { kept } from "../base/kept";
+import { AT_ONCE, laneOf } from "./lanes";
 
 /** The server's key, as this browser keeps it: see admission.ts. */
 export const KEPT_KEY = "key";
@@ -11,23 +12,33 @@ export class AnswerError extends Error {}
 type Parameters = Readonly<Record<string, string>>;
 
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
-export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
-  const answer = await get(`${name}.json`, parameters, signal);
-  return (await answer.json()) as T;
+export function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
+  return laneOf(name).run(async (end) => (await (await get(`${name}.json`, parameters, end)).json()) as T, signal);
 }
 
 /**
  * Have the server change something, with `keepalive` even if the page is closed meanwhile. Throws `AnswerError` if it
  * does not, or if the change is refused.
  */
-export async function act<T>(name: string, parameters: Parameters, keepalive = false): Promise<T> {
+export function act<T>(name: string, parameters: Parameters, { keepalive = false, signal }: { readonly keepalive?: boolean; readonly signal?: AbortSignal } = {}): Promise<T> {
   const headers = { "Content-Type": "application/json", [KEY_HEADER]: kept(KEPT_KEY) ?? "" };
-  const answer = await answered(`${name}.json`, { method: "POST", keepalive, headers, body: JSON.stringify(parameters) });
-  return (await answer.json()) as T;
+  const request: RequestInit = { method: "POST", priority: "high", keepalive, headers, body: JSON.stringify(parameters) };
+  // The last word of a page that is closed cannot wait.
+  const lane = keepalive ? AT_ONCE : laneOf(name);
+  return lane.run(async (end) => (await (await answered(`${name}.json`, { ...request, ...(end ? { signal: end } : {}) })).json()) as T, signal);
 }
 
 /** Ask for a file, and report the bytes received; throws `AnswerError` also if the file is cut off. */
-export async function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<{ readonly content: Blob; readonly name: string }> {
+export function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<Downloaded> {
+  return laneOf(name).run(() => downloaded(name, parameters, received, signal), signal);
+}
+
+interface Downloaded {
+  readonly content: Blob;
+  readonly name: string;
+}
+
+async function downloaded(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<Downloaded> {
   const answer = await get(name, parameters, signal);
   const parts: Uint8Array<ArrayBuffer>[] = [];
   let size = 0;
@@ -55,10 +66,12 @@ async function answered(address: string, request: RequestInit): Promise<Response
   try {
     answer = await fetch(address, request);
   } catch (error) {
-    if (request.signal?.aborted) throw error;
+    if (request.signal?.aborted && !isTimeout(request.signal.reason)) throw error;
     throw new AnswerError("The page's server does not answer. Is it still running?");
   }
   if (answer.ok) return answer;
   const body = (await answer.json().catch(() => ({}))) as { error?: unknown };
   throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
 }
+
+const isTimeout = (reason: unknown): boolean => reason instanceof DOMException && reason.name === "TimeoutError";

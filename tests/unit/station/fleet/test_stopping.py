@@ -6,6 +6,7 @@ import io
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -120,6 +121,26 @@ def test_a_stop_of_the_fleet_is_seen_at_once(cloud):
     assert not ask({})["robots"]["car8"]["asked"]
     act({"stopped": "true"})
     assert ask({})["robots"]["car8"]["asked"]
+
+
+def test_a_stop_waits_for_no_reading_of_the_fleet(cloud):
+    ask, act = motion.answers(cloud)["motion"], motion.actions(cloud)["stop"]
+    reading, go = threading.Event(), threading.Event()
+
+    def held() -> None:
+        cloud.read = lambda: None
+        reading.set()
+        assert go.wait(GUARD_S)
+
+    cloud.read = held
+    with ThreadPoolExecutor(2) as pool:
+        try:
+            slow = pool.submit(ask, {})
+            assert reading.wait(GUARD_S)
+            assert pool.submit(act, {"stopped": "true"}).result(GUARD_S)["robots"]["car7"]["asked"]
+        finally:
+            go.set()
+        slow.result(GUARD_S)
 
 
 def test_a_robot_with_impossible_limits_keeps_no_other_from_its_stop(cloud):
