@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.control.driving import NO_MOTION
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
@@ -47,6 +48,7 @@ TRACEBACK = """[ERROR] ValueError: the gain of car-7 must not be 0
   File "/var/task/functions/live.py", line 61, in handler
     publish(event)"""
 NOW_S = time.time()
+WHY_NOT = f"a stop does nothing there: {NO_MOTION}"
 _LONG = "a_field_" + "x" * 99
 
 
@@ -102,6 +104,8 @@ class Lab:
         self.streams = [VESC_STREAM]
         # The cars that were stopped alone.
         self.alone: set[str] = set()
+        # The cars without a command that moves them, which reject a stop.
+        self.unstoppable: set[str] = set()
         self.notes: list[dict[str, Any]] = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
@@ -143,12 +147,12 @@ class Lab:
     def motion(self, asked: Mapping[str, str]) -> dict[str, Any]:
         cars = {
             name: {
-                "asked": told,
-                "stopped": stands,
-                "reason": "",
-                "stands": stands,
-                "stoppable": True,
-                "why_not": "",
+                "asked": told and name not in self.unstoppable,
+                "stopped": stands and name not in self.unstoppable,
+                "reason": NO_MOTION if told and name in self.unstoppable else "",
+                "stands": stands and name not in self.unstoppable,
+                "stoppable": name not in self.unstoppable,
+                "why_not": WHY_NOT if name in self.unstoppable else "",
                 "alone": told and name in self.alone,
                 "by": "operator@lab" if told else "",
                 "at_ms": round(NOW_S * 1000) if told else 0,

@@ -68,11 +68,11 @@ class Page {
     this.registry = new Registry(config);
     this.viewing = new Viewing(config, (lease) => this.feed.lease(lease));
     this.waiting = new Waiting(config, this.registry);
-    this.stops = new StopControl(config, byId("top"), () => this.drive.show());
+    this.stops = new StopControl(config, (robot) => this.registry.presence(robot)?.online, () => this.drive?.show());
     this.drive = new DrivePanel(config, this.stops.stops);
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
-    this.fleetView = new FleetView(config, this.fleet, table, this.registry);
+    this.fleetView = new FleetView(config, this.fleet, table, this.registry, this.stops.stops);
     this.carView = new CarView(config, this.fleet, table, this.tools, this.drive.node, () => this.arrange());
     this.historyView = new HistoryView(config, table, this.fleet);
     this.insightsView = new InsightsView(config);
@@ -181,6 +181,7 @@ class Page {
         this.carView.values(at);
         this.carView.draw(at);
       }
+      this.bar.speed(view === "car" ? this.carView.speed(at) : undefined);
     }
     if (at - this.clockAt < CLOCK_S) return;
     this.clockAt = at;

@@ -187,7 +187,7 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
         # No car has been heard: it can be stopped all the same.
         page.goto(f"{server.url}#/car/car-1")
         page.get_by_role("button", name="Stop car-1").click()
-        until(lambda: words.inner_text().startswith("Not confirmed by car-1."), "the stop to be asked for")
+        page.locator(".stop-moves").get_by_text("NOT standing: car-1 (not confirmed).").wait_for()
         lab.cars["car-1"][1] = lab.confirms = True
         stands = "Emergency stop: car-1 stands."
         until(lambda: words.inner_text().startswith(stands), "the car's confirmation")

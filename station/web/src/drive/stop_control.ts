@@ -1,10 +1,11 @@
 // The emergency stop above every view: of the car that is shown, and else of the fleet. A press stops; only a release
-// asks whether it is meant.
+// asks whether it is meant. Below it is what the cars say: which stand, which do not although they were to, and, before
+// anybody needs it, which cannot be stopped.
 
 import type { Config } from "../base/contract";
-import { el, onPress, setAttribute, Text } from "../base/dom";
-import { when } from "../base/format";
-import { Stops } from "./stops";
+import { byId, el, onPress, setAttribute, Text } from "../base/dom";
+import { age, when } from "../base/format";
+import { ANSWER_MS, Stops } from "./stops";
 
 // A longer list of names says nothing more.
 const NAMED = 6;
@@ -12,24 +13,34 @@ const NAMED = 6;
 export class StopControl {
   readonly stops: Stops;
   private readonly press = el("button", { type: "button", class: "stop-press" });
+  private readonly sent = new Text("stop-sent", "p", { role: "status" });
+  private readonly moves = new Text("stop-moves", "p", { role: "alert" });
   private readonly words = new Text("stop-words", "p", { role: "status" });
+  private readonly unable = new Text("stop-unable", "p");
   private readonly release = el("button", { type: "button", class: "tool stop-release" });
-  private readonly strip: HTMLElement;
+  private readonly stands = el("div", { class: "stop-stands" }, this.words.node, this.release);
   private robot: string | undefined;
   private sure = false;
   // The newest stop when the viewer was asked whether to release it.
   private seen_ms = 0;
 
-  /** `changed` is called when the cars' stops or limits may be others. */
-  constructor(config: Config, header: HTMLElement, changed: () => void) {
-    this.stops = new Stops(config, () => {
+  /** `online` as in `Stops`; `changed` is called when the cars' stops or limits may be others. */
+  constructor(config: Config, online: (robot: string) => boolean | undefined, changed: () => void) {
+    this.stops = new Stops(config, online, () => {
       this.show();
       changed();
     });
-    this.strip = el("div", { class: "stop-strip", hidden: "" }, this.words.node, this.release);
-    header.after(this.strip);
-    this.press.hidden = this.release.hidden = !this.stops.able;
-    if (this.stops.able) header.querySelector("#link")!.before(this.press);
+    const strip = el("div", { class: "stop-strip" }, this.sent.node, this.moves.node, this.stands);
+    const header = byId("top");
+    header.after(strip);
+    // It is read before it is needed, and takes no room later.
+    header.parentElement!.after(this.unable.node);
+    // What stays in sight while the page scrolls covers what is below it.
+    const measured = [[header, "--header"], [strip, "--strip"]] as const;
+    const observer = new ResizeObserver(() => measured.forEach(([node, name]) => document.documentElement.style.setProperty(name, `${node.offsetHeight}px`)));
+    for (const [node] of measured) observer.observe(node);
+    this.press.hidden = !this.stops.able;
+    if (this.stops.able) byId("stop-bar").append(this.press);
     this.press.addEventListener("click", () => void this.stops.set(this.robot, true));
     onPress(this.release, () => {
       if (this.sure) void this.stops.set(this.robot, false, this.seen_ms);
@@ -57,24 +68,54 @@ export class StopControl {
   }
 
   private show(): void {
-    const { stand, pending } = this.stops.stopped;
-    const { fleet, alone } = this.stops.held;
-    const one = this.robot === undefined ? undefined : this.stops.of(this.robot);
-    const texts = [
+    const { stops, robot } = this;
+    const words = stops.names.map((name) => [name, stops.word(name)] as const);
+    const of = (kind: string): (readonly [string, string])[] => words.flatMap(([name, word]) => (word.kind === kind ? [[name, word.why] as const] : []));
+    const stand = of("stands").map(([name]) => name);
+    const released = stand.filter((name) => !stops.of(name)!.asked && stops.of(name)!.reason === "");
+    const { fleet, alone } = stops.held;
+    const one = robot === undefined ? undefined : stops.of(robot);
+    write(this.sent, this.request());
+    write(this.moves, reasons("NOT standing", of("moves")));
+    write(this.words, [
       ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
-      ...(pending.length > 0 ? [`Not confirmed by ${listed(pending)}.`] : []),
+      ...(released.length > 0 ? [`Release not confirmed by ${listed(released)}.`] : []),
       ...(one?.asked && one.by ? [`Stopped by ${one.by}, ${when(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`] : []),
-      ...(this.robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
-      ...(one?.reason ? [`${this.robot} rejects the ${one.asked ? "stop" : "release"}: ${one.reason}.`] : []),
-      ...(this.stops.error ? [`${this.stops.error}.`] : []),
-      ...(this.stops.away ? ["The page's server does not answer: nobody can be stopped here, and cars may stand or move by now."] : []),
-    ];
-    this.words.set(texts.join(" "));
-    this.strip.hidden = texts.length === 0;
-    setAttribute(this.strip, "data-bad", String(pending.length > 0 || this.stops.error !== "" || this.stops.away));
-    const any = this.robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
-    this.release.hidden = !this.stops.able || !any;
+      ...(robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
+      ...(one?.stands && one.reason ? [`${robot} rejects the release: ${one.reason}.`] : []),
+    ].join(" "));
+    write(this.unable, reasons("The stop does not stop", of("unable").filter(([name]) => (robot ?? name) === name)));
+    const any = robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
+    this.release.hidden = !stops.able || !any;
+    this.stands.hidden = this.words.node.hidden && this.release.hidden;
   }
+
+  /** What became of the newest press, and what else there is to do. */
+  private request(): string {
+    const { sent, error, away } = this.stops;
+    const whom = sent?.robot ?? "all cars";
+    if (sent && !sent.late) return `${sent.stopped ? "Stop" : "Release"} sent to ${whom} …`;
+    if (sent) return sent.stopped ? `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may not have been stopped. ${this.advice()}` : `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may or may not have been released.`;
+    if (error) return `${error}${error.endsWith(".") ? "" : "."}${error.startsWith("Not") ? "" : ` ${this.advice()}`}`;
+    return away ? `The page's server does not answer: nobody can be stopped here, and cars may stand or move by now. ${this.advice()}` : "";
+  }
+
+  private advice(): string {
+    const leases = this.stops.names.flatMap((name) => this.stops.of(name)!.drive?.lease_ms ?? []);
+    const within = leases.length > 0 ? `, within ${age(Math.max(...leases) / 1000)} of the last one` : "";
+    return `Press again, and use the switch on the car. By itself ends only what nobody renews: a command with its lease${within}. A planner on board drives on.`;
+  }
+}
+
+function write(text: Text, words: string): void {
+  text.set(words);
+  text.node.hidden = words === "";
+}
+
+/** Names with their reasons: those with the same one together. */
+function reasons(title: string, of: readonly (readonly [string, string])[]): string {
+  const groups = [...new Set(of.map(([, why]) => why))].map((why) => `${listed(of.flatMap(([name, its]) => (its === why ? [name] : [])))} (${why})`);
+  return groups.length > 0 ? `${title}: ${groups.join("; ")}.` : "";
 }
 
 function listed(names: readonly string[]): string {

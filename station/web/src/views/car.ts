@@ -2,7 +2,7 @@
 
 import { LOG_STREAM, type Config, type FieldTable } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
-import { age, AS_SENT, linear, type Linear } from "../base/format";
+import { age, AS_SENT, linear, number, type Linear } from "../base/format";
 import { setAddress, type Query } from "../base/route";
 import { AgentLog } from "../car/agent_log";
 import { Board } from "../car/board";
@@ -190,6 +190,15 @@ export class CarView {
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };
     this.state.set(linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`);
+  }
+
+  /** The newest speed with its unit, and whether it is old; undefined for a car without one. */
+  speed(now: number): { readonly text: string; readonly old: boolean } | undefined {
+    const { robot } = this;
+    const vesc = robot?.vesc(this.table);
+    if (!robot || !vesc?.sample.has("speed")) return undefined;
+    const { value, unit = "m/s", digits = 2 } = GAUGES.find(({ name }) => name === "speed_mps")!.show((field) => numeric(vesc.sample.get(field)), robot, this.fleet.speed(robot.name));
+    return { text: `${number(value, digits)} ${unit}`, old: robot.freshness(now) !== "live" };
   }
 
   /** Who drives the car. */

@@ -3,6 +3,7 @@
 import type { Config, FieldTable } from "../base/contract";
 import { byName, el, Text } from "../base/dom";
 import type { Query } from "../base/route";
+import type { Stops } from "../drive/stops";
 import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
 import type { Robot } from "../live/robot";
@@ -51,6 +52,7 @@ export class FleetView {
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
     private readonly registry: Registry,
+    private readonly stops: Stops,
   ) {
     this.tools = new FleetTools(registry, table, () => (this.placedAt = -Infinity));
     this.offline = new OfflineCars(config);
@@ -79,7 +81,7 @@ export class FleetView {
     this.refresh = () => {
       for (const name of this.seen) {
         const robot = this.fleet.robots.get(name);
-        if (robot) this.cards.get(name)?.update(robot, this.fleet, this.table, now, linked);
+        if (robot) this.cards.get(name)?.update(robot, { fleet: this.fleet, table: this.table, stop: this.stops.word(name) }, now, linked);
       }
     };
     this.refresh();

@@ -9,9 +9,16 @@ import type { Fleet } from "../live/fleet";
 import { hottest, type Robot } from "../live/robot";
 import { CARD_FIELD, numeric } from "../live/stream";
 
+/** What an emergency stop means for the car, and why it does not stand or cannot be stopped. */
+export interface StopWord {
+  readonly kind: "stands" | "moves" | "unable" | "";
+  readonly why: string;
+}
+
 export class Card {
   readonly node: HTMLElement;
   private readonly state = new Text("card-state");
+  private readonly stop = new Text("card-stop");
   private inside: Inside | undefined;
 
   constructor(readonly name: string) {
@@ -22,10 +29,10 @@ export class Card {
     );
   }
 
-  update(robot: Robot, fleet: Fleet, table: FieldTable, now: number, linked: boolean): void {
+  update(robot: Robot, { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: StopWord }, now: number, linked: boolean): void {
     if (!this.inside) {
       this.inside = new Inside();
-      this.node.append(...this.inside.nodes);
+      this.node.append(this.stop.node, ...this.inside.nodes);
     }
     const fresh = robot.freshness(now);
     const shown = linked || fresh === "live" ? fresh : "unlinked";
@@ -33,6 +40,9 @@ export class Card {
     const driver = robot.driver(now);
     this.state.set(driver !== undefined ? `${driver} drives` : { live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
     setAttribute(this.node, "data-fault", String(robot.fault(table) !== undefined));
+    setAttribute(this.node, "data-stop", stop.kind);
+    this.stop.set({ stands: "stands: emergency stop", moves: `does NOT stand: ${stop.why}`, unable: "no emergency stop", "": "" }[stop.kind]);
+    this.stop.node.title = stop.why;
     this.inside.update(robot, fleet, table, now);
   }
 }

@@ -56,6 +56,15 @@ export class StatusBar {
     this.announce(link, at);
   }
 
+  /** The car's speed beside its stop, in sight while the page scrolls. */
+  speed(speed: { readonly text: string; readonly old: boolean } | undefined): void {
+    const node = byId("speed-now");
+    node.hidden = speed === undefined;
+    if (!speed) return;
+    write("speed-now-value", speed.text);
+    setAttribute(node, "data-old", String(speed.old));
+  }
+
   /** The number of raised alarms, on every view. */
   private badge(at: number): void {
     this.alarms.clock(at);
