@@ -28,7 +28,7 @@ from typing_extensions import Self
 from iort_contract.cloud import PUBNUB
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
-from iort_station.kept import LEDGER
+from iort_station.kept import LEDGER, announced
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
 from local.deployment import ROOT, deploy
@@ -165,8 +165,10 @@ class EmbeddedCloud:
                 certificate=self.certificate("files", self.listen.hosts),
             )
             self.state.serve(self._exit, "files", door)
-        self.cloud.save(self.folder / EMBEDDED.name)
-        self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
+        file = self.folder / EMBEDDED.name
+        self.cloud.save(file)
+        self._exit.callback(file.unlink, missing_ok=True)
+        self._exit.enter_context(announced(file))
 
     def _find_ports(self) -> dict[str, int]:
         servers = ("gateway", "mqtt", "relay", *(["pubnub"] if self.live == PUBNUB else []))

@@ -1,4 +1,4 @@
-"""The operator's cloud: an AWS account, or the embedded cloud of a checkout.
+"""The operator's cloud: an AWS account, or an embedded cloud of this machine.
 
 It provides clients of AWS' services, the outputs of the stacks, and the address for robots.
 """
@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import socket
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache, cached_property
 from pathlib import Path
@@ -16,6 +19,7 @@ from urllib.parse import urlsplit
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_station import kept
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
@@ -32,6 +36,10 @@ EMBEDDED = Path("build/local/cloud.json")
 # The environment variable with the path of such a file.
 EMBEDDED_VARIABLE = "IORT_EMBEDDED"
 
+# Who has set one of these wants an AWS account.
+AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
+# An embedded cloud runs on this machine.
+_CONNECT_S = 5.0
 # An embedded cloud has its own credentials; the profile in AWS_PROFILE may not exist.
 _NO_PROFILE = {"profile": (None, None, None, None)}
 
@@ -40,6 +48,20 @@ def find_embedded(folder: Path) -> Path | None:
     """The file of the embedded cloud that runs in the checkout around ``folder``; None if none runs."""
     places = (each / EMBEDDED for each in (folder, *folder.parents))
     return next((place for place in places if place.is_file()), None)
+
+
+def embedded_here() -> Path | None:
+    """The file of the embedded cloud that a command means which names none: that of the checkout around this
+    folder, or else that of `make up`; None if neither runs."""
+    up = kept.folder() / kept.CLOUD
+    return find_embedded(Path.cwd()) or (up if up.is_file() else None)
+
+
+def _running() -> str:
+    """The embedded clouds that this user runs, as advice."""
+    files = kept.running()
+    named = "; ".join(f"iort --embedded {shlex.quote(str(file))}" for file in files)
+    return f"These run: {named}" if files else "`make up` or `make demo` starts one"
 
 
 def without_proxy(host: str) -> None:
@@ -74,6 +96,61 @@ class Cloud:
         "connect_timeout": 5,
         "read_timeout": 20,
     }
+
+    @classmethod
+    def find(
+        cls,
+        *,
+        namespace: str = DEFAULT_NAMESPACE,
+        profile: str | None = None,
+        region: str | None = None,
+        local: bool = False,
+        embedded: Path | None = None,
+        say: Callable[[str], object] = lambda _line: None,
+    ) -> Cloud:
+        """The cloud that `iort` means, here and with these options: an embedded one that runs here, unless an
+        option or a variable of the environment selects AWS. ``say`` takes a line with the choice.
+
+        Raises `StationError` if none runs and AWS' credentials are missing.
+        """
+        aws_named = profile or region or any(os.environ.get(name) for name in AWS_NAMED)
+        if embedded is None and (named := os.environ.get(EMBEDDED_VARIABLE)):
+            embedded = Path(named)
+        file = embedded or embedded_here()
+        if local and file is None:
+            raise StationError(
+                f"no embedded cloud is running: {Path.cwd()} and the folders above it have no {EMBEDDED}, "
+                f"and {kept.folder()} no {kept.CLOUD}. --embedded or {EMBEDDED_VARIABLE} names its file from "
+                f"anywhere else. {_running()}"
+            )
+        if file and (local or (not aws_named and file.exists())):
+            cloud = cls.load(file).answering(file)
+            if not local:
+                say(f"on the embedded cloud of {file}")
+            return cloud
+        cloud = cls(namespace=namespace, profile=profile, region=region)
+        try:
+            cloud.check()
+        except StationError as error:
+            if aws_named:
+                raise
+            raise StationError(f"{error}. No embedded cloud runs here either. {_running()}") from error
+        say(f"on AWS, in {cloud.region_name}{f' with the profile {profile}' if profile else ''}")
+        return cloud
+
+    def answering(self, file: Path) -> Cloud:
+        """Return itself; raises `StationError` if this embedded cloud has ended without removing its file."""
+        if self.endpoint_url is None:
+            return self
+        address = urlsplit(self.endpoint_url)
+        try:
+            socket.create_connection((address.hostname or "", address.port or 0), _CONNECT_S).close()
+        except OSError as error:
+            raise StationError(
+                f"the embedded cloud of {file} does not answer: was it killed? `make up` or `make "
+                "demo` starts one"
+            ) from error
+        return self
 
     @classmethod
     def load(cls, path: Path) -> Cloud:

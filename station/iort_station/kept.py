@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -34,6 +35,32 @@ def _data(environment: Mapping[str, str]) -> Path:
         environment.get("XDG_DATA_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".local/share"
     )
     return Path(home) / "iort"
+
+
+def running(environment: Mapping[str, str] = os.environ) -> list[Path]:
+    """The files of the embedded clouds that this user runs, wherever their folders are."""
+    links = _links(environment)
+    return sorted(link.readlink() for link in links.iterdir() if link.exists()) if links.is_dir() else []
+
+
+@contextmanager
+def announced(file: Path) -> Iterator[None]:
+    """Have `running` list an embedded cloud during the block."""
+    link = _links(os.environ) / hashlib.sha256(bytes(file.absolute())).hexdigest()[:16]
+    # Without a home to write to, its commands name it by --embedded.
+    with suppress(OSError):
+        link.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        link.unlink(missing_ok=True)
+        link.symlink_to(file.absolute())
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            link.unlink(missing_ok=True)
+
+
+def _links(environment: Mapping[str, str]) -> Path:
+    return folder(environment).with_name("running")
 
 
 def lock_of(folder: Path) -> Path:

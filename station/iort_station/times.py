@@ -27,6 +27,7 @@ _UNITS_US = {
 # A century.
 _MOST_US = 36_525 * _UNITS_US["d"]
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|m|h|d|w)")
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?([zZ]|[+-]\d\d(:?\d\d)?)?")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -40,8 +41,9 @@ def duration_us(text: str) -> int:
 
 
 def time_us(value: Time, now_us: int) -> int:
-    """Parse a time: microseconds since the epoch, a datetime, or a text such as ``now``, ``-10m`` or
-    ``2026-05-04T10:00:00+02:00``. A time without a zone is local to this machine.
+    """Parse a time: microseconds since the epoch, a datetime, or a text such as ``now``, ``-10m``, ``20:04``
+    or ``2026-05-04T10:00:00+02:00``. Without a zone it is local to this machine; without a date it is the
+    newest one that has been.
 
     Raises `UsageError`.
     """
@@ -57,18 +59,32 @@ def time_us(value: Time, now_us: int) -> int:
     try:
         # Python 3.10 reads neither Z nor fractions other than 3 or 6 digits.
         normal = re.sub(r"\.(\d{1,6})\d*", lambda m: "." + m[1].ljust(6, "0"), text)
-        return time_us(datetime.fromisoformat(re.sub(r"[zZ]$", "+00:00", normal)), now_us)
+        normal = re.sub(r"[zZ]$", "+00:00", normal)
+        if not _CLOCK.fullmatch(text):
+            return time_us(datetime.fromisoformat(normal), now_us)
+        # The zone's own day may be another one than this machine's.
+        clock = datetime.fromisoformat(f"2000-01-01T{'0' * (normal[1] == ':')}{normal}").timetz()
+        today = datetime.fromtimestamp(now_us / 1e6, clock.tzinfo).date()
+        at_us = time_us(datetime.combine(today, clock), now_us)
+        return (
+            at_us if at_us <= now_us else time_us(datetime.combine(today - timedelta(days=1), clock), now_us)
+        )
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"time must be now, -10m for ten minutes ago, or ISO 8601 such as 2026-05-04T10:00:00Z, "
+            "time must be now, -10m for ten minutes ago, 20:04, or ISO 8601 such as 2026-05-04T10:00:00Z, "
             f"got {value!r}"
         ) from error
+
+
+def is_clock(text: str) -> bool:
+    """Whether a time's text has no date."""
+    return _CLOCK.fullmatch(text.strip()) is not None
 
 
 def has_zone(text: str) -> bool:
     """Whether a time's text has a time zone, or needs none."""
     text = text.strip()
-    clock = text.partition("T")[2] or text.partition(" ")[2]
+    clock = text if is_clock(text) else text.partition("T")[2] or text.partition(" ")[2]
     return text == "now" or text.startswith("-") or re.search(r"([zZ]|[+-]\d\d(:?\d\d)?)$", clock) is not None
 
 

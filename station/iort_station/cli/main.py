@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -22,7 +23,11 @@ from iort_station.errors import StationError, UsageError
 _GARBAGE_AFTER = 50_000
 # Without markup, help needs no rich, whose import takes as long as everything else.
 app = typer.Typer(
-    cls=Verbs, no_args_is_help=True, rich_markup_mode=None, help="The operator's station of iort."
+    cls=Verbs,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="The operator's station of iort.",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -83,6 +88,10 @@ def main() -> None:
         _end(f"AWS refused a call: {error}")
     except BotoCoreError as error:
         _end(f"AWS could not be called: {error}")
+    except BrokenPipeError:
+        # Whoever read the pipe has seen enough. Python would complain about the rest at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         _end(said(error))
     except KeyboardInterrupt:

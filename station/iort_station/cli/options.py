@@ -19,7 +19,7 @@ from iort_station import kept
 from iort_station.cli import completion
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
-from iort_station.times import duration_us, has_zone, time_us
+from iort_station.times import duration_us, has_zone, is_clock, time_us
 from iort_station.upkeep.state import VERSION
 
 Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
@@ -43,7 +43,9 @@ Where = Annotated[
 Every = Annotated[str | None, typer.Option("--every", help="Combine samples: 100ms, 1s, 1m.")]
 From = Annotated[
     str | None,
-    typer.Option("--from", help="Start time: -10m, 2026-05-04T10:00:00Z. With --to alone: the beginning."),
+    typer.Option(
+        "--from", help="Start time: -10m, 20:04, 2026-05-04T10:00:00Z. With --to alone: the beginning."
+    ),
 ]
 To = Annotated[str | None, typer.Option("--to", help="End time (exclusive). With --from alone: now.")]
 Last = Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d; or all.")]
@@ -86,6 +88,20 @@ def state_folder(context: typer.Context, state: Path | None) -> Path:
     if state is None and embedded is not None and (embedded.parent / VERSION).exists():
         state = embedded.parent
     return (state or kept.folder()).expanduser().absolute()
+
+
+def running_state(context: typer.Context, state: Path | None) -> Path:
+    """The state folder of the cloud that every other verb would use, or of --state.
+
+    Raises `UsageError` if that cloud is one that is thrown away.
+    """
+    file: Path | None = context.obj.file()
+    if state is None and file is not None and not (file.parent / VERSION).exists():
+        raise UsageError(
+            f"the cloud here is that of {file}, which is thrown away at its end: --state names the folder of "
+            f"one of `make up`, by default {kept.folder()}"
+        )
+    return state_folder(context, file.parent if state is None and file is not None else state)
 
 
 def agreed(question: str, *, yes: bool) -> None:
@@ -136,6 +152,9 @@ class When:
             raise UsageError("give --last, or --from and --to")
         start_us = None if self.start is None else _time_us(self.start, now_us)
         end_us = now_us if self.end is None else _time_us(self.end, now_us)
+        if start_us is not None and start_us > end_us and self.end is not None and is_clock(self.end):
+            # That time of day after the start.
+            end_us += duration_us("1d")
         if start_us is not None and start_us > end_us:
             raise UsageError("the range ends before it starts")
         return Range(start_us, end_us)
@@ -147,7 +166,8 @@ def _time_us(text: str, now_us: int) -> int:
     if not has_zone(text):
         # Another season may have another offset than today.
         zone = datetime.fromtimestamp(t_us / 1e6).astimezone()
-        say(f"{text} is read as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
+        day = f"{zone:%Y-%m-%d} " if is_clock(text) else ""
+        say(f"{text} is read as {day}{zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
     return t_us
 
 

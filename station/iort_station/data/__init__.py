@@ -3,7 +3,7 @@
     from iort_station import data
     from iort_station.cloud import Cloud
 
-    ride = data.query(Cloud(), "car7", "vesc", "-10m", "now", fields=["speed", "speed_mps"])
+    ride = data.query(Cloud.find(), "car7", "vesc", "-10m", "now", fields=["speed", "speed_mps"])
     ride.times_us, ride.columns["speed_mps"], ride.unit("speed"), ride.frame()
 
 It uses the contract, `iort_station.fleet` for the registry, and `iort_station.cloud`.

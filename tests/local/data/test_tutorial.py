@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from iort_station.cloud import EMBEDDED
+from iort_station.cloud import AWS_NAMED, EMBEDDED
 from local.deployment import ROOT
 from tests.local.conftest import recorded, run_agent
 
@@ -21,11 +21,13 @@ def follow(embedded, bundle, tmp_path, monkeypatch):
     (tmp_path / EMBEDDED.parent.parent).mkdir(parents=True)
     (tmp_path / EMBEDDED.parent).symlink_to(embedded.folder)
     monkeypatch.chdir(tmp_path)
+    for name in AWS_NAMED:
+        monkeypatch.delenv(name, raising=False)
 
     def run(page):
         code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
-        names = {"EMBEDDED": EMBEDDED}
-        exec(re.sub(r'"car\d"', repr(car.robot), code.replace("Cloud()", "Cloud.load(EMBEDDED)")), names)
+        names = {}
+        exec(re.sub(r'"car\d"', repr(car.robot), code), names)
         return names
 
     return run

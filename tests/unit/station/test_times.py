@@ -21,6 +21,10 @@ NOW = 1_700_000_000_123_456
         ("2023-11-14T22:13:20Z", 1_700_000_000_000_000),
         ("2023-11-14 23:13:20.5+01:00", 1_700_000_000_500_000),
         ("2023-11-14T22:13:20.123456789Z", 1_700_000_000_123_456),
+        ("22:13:20Z", 1_700_000_000_000_000),
+        ("22:14Z", 1_700_000_040_000_000 - 86_400_000_000),
+        ("00:13+02:00", 1_699_999_980_000_000),
+        ("9:00Z", 1_699_952_400_000_000),
         (17, 17),
         (datetime(1970, 1, 1, 0, 0, 1, tzinfo=timezone.utc), 1_000_000),
     ],
@@ -36,9 +40,15 @@ def test_a_time_without_a_zone_is_in_this_machines_zone():
     assert has_zone("2023-11-14T22:13:20Z")
     assert has_zone("2023-11-14 22:13+01:00")
     assert has_zone("-10m")
+    assert has_zone("20:04Z")
+    assert not has_zone("20:04")
+    assert time_us("20:04", NOW) in {
+        datetime(2023, 11, day, 20, 4).timestamp() * 1e6  # noqa: DTZ001 - on purpose
+        for day in (13, 14, 15)
+    }
 
 
-@pytest.mark.parametrize("text", ["", "soon", "-10", "2023-13-01", "10m"])
+@pytest.mark.parametrize("text", ["", "soon", "-10", "2023-13-01", "10m", "25:00", "20:60", "20:04:61"])
 def test_an_invalid_time_is_refused(text):
     with pytest.raises(StationError, match=r"must be .*, got"):
         time_us(text, NOW)

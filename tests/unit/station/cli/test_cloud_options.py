@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from urllib.request import proxy_bypass
 
 import pytest
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 from iort_station import kept
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
-from iort_station.cloud import Cloud, find_embedded
+from iort_station.cloud import EMBEDDED, Cloud, find_embedded
 from iort_station.errors import StationError
 from iort_station.page import keys
 
@@ -66,6 +67,56 @@ def test_the_error_outside_a_checkout_says_how_to_name_the_file(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
         CloudOptions("iort", None, None, local=True, embedded=None).cloud()
+
+
+def test_outside_a_checkout_the_clouds_that_run_are_named(tmp_path, monkeypatch):
+    """Every verb names them, and `Cloud.find` in a notebook; one that has ended is not named."""
+    monkeypatch.chdir(tmp_path)
+    running = tmp_path / "a checkout" / "cloud.json"
+    running.parent.mkdir()
+    Cloud(namespace="lab").save(running)
+    advice = f"iort --embedded '{running}'"
+    with kept.announced(running):
+        assert advice in str(CliRunner().invoke(app, ["robots", "list"]).exception)
+        with pytest.raises(StationError, match=re.escape(advice)):
+            Cloud.find()
+        assert Cloud.find(embedded=running).namespace == "lab"
+        monkeypatch.setenv("IORT_EMBEDDED", str(running))
+        assert Cloud.find().namespace == "lab"
+        monkeypatch.delenv("IORT_EMBEDDED")
+        running.unlink()
+        assert kept.running() == [], "it was killed, and its folder removed"
+    with pytest.raises(StationError, match="`make up` or `make demo` starts one"):
+        Cloud.find()
+
+
+def test_a_notebook_in_a_checkout_finds_its_cloud_as_the_command_does(tmp_path, monkeypatch):
+    file = tmp_path / EMBEDDED
+    file.parent.mkdir(parents=True)
+    Cloud(namespace="lab").save(file)
+    monkeypatch.chdir(tmp_path)
+    said = []
+    assert Cloud.find(say=said.append).namespace == "lab"
+    assert said == [f"on the embedded cloud of {file}"]
+    monkeypatch.setenv("AWS_REGION", "eu-west-1")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
+    assert Cloud.find(say=said.append).namespace == "iort"
+    assert said[1:] == ["on AWS, in eu-west-1"]
+
+
+def test_a_backup_means_the_cloud_that_other_verbs_mean(tmp_path, monkeypatch):
+    """In the folder of a demo it does not take the cloud of `make up` without a word."""
+    file = tmp_path / EMBEDDED
+    file.parent.mkdir(parents=True)
+    Cloud(namespace="lab").save(file)
+    monkeypatch.chdir(tmp_path)
+    kept.folder().mkdir(parents=True)
+    refused = str(CliRunner().invoke(app, ["backup", "cloud.tar"]).exception)
+    assert f"the cloud here is that of {file}, which is thrown away" in refused
+    assert str(kept.folder()) in refused
+    named = CliRunner().invoke(app, ["backup", "cloud.tar", "--state", str(kept.folder())])
+    assert f"of the cloud that is kept in {kept.folder()}" in named.stderr
 
 
 def test_the_environment_names_an_embedded_cloud(tmp_path):

@@ -73,5 +73,7 @@ def test_every_command_prints_by_the_console():
     assert printing == {
         ("cli/main.py", "f\"iort {version('iort-station')}\""),
         ("cli/words.py", "visible(f'iort: {text}')"),
+        # Made visible a cell at a time.
+        ("cli/tables.py", "stamp.ljust(len(_TIME_WIDE))"),
         ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': live.sample})"),
     }

@@ -110,12 +110,27 @@ def test_parquet_has_values_of_several_kinds_as_texts(values):
     assert table.column("mixed").to_pylist() == [*map(str, values), None]
 
 
+def test_a_file_has_every_row_and_field_with_units():
+    found = result(3000)
+    found.columns["name"][7] = "two\nlines\x1b"
+    found.columns["a_name_that_is_longer_than_its_values"] = np.arange(3000)
+    file = io.StringIO()
+    tables.plain(found, file)
+    head, units, *rows = file.getvalue().splitlines()
+    assert head.split() == ["time", "(UTC)", *found.columns]
+    assert units.split() == ["erpm", "A"]
+    assert len(rows) == 3000
+    assert [row.split()[2] for row in rows[1500:1502]] == ["2250", "2251.5"]
+    assert "two\\nlines\\u001b" in rows[7]
+    assert len({len(row) for row in rows[8:]}) == 1, "its columns are straight"
+
+
 def test_a_terminal_shows_units_and_both_ends():
     console = Console(width=120, file=io.StringIO())
     shown = tables.terminal(result(1000), 120)
     console.print(shown.table)
     text = console.file.getvalue()
-    assert shown.left_out == []
+    assert (shown.rows, shown.left_out) == (40, [])
     assert "current_motor" in text
     assert "erpm" in text
     assert "22:13:20.123456" in text
@@ -176,6 +191,11 @@ def test_ranges_are_parsed(capsys):
     assert (found.start_us, found.end_us) == (1_700_000_000_000_000, 1_700_000_001_000_000)
     assert capsys.readouterr().err == ""
     assert When().range() == Range(None, None)
+    found = When("00:00Z", "00:00:01Z").range()
+    assert found.end_us - found.start_us == 1_000_000
+    found = When("00:00:01Z", "00:00Z").range()
+    assert found.end_us - found.start_us == 86_399_000_000, "to the next midnight"
+    assert capsys.readouterr().err == ""
     found = When().range("5m")
     assert found.end_us - found.start_us == 300_000_000
     assert "--last all" in capsys.readouterr().err

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from decimal import Decimal
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from functions.shared.tables import attribute
 from iort_contract.catalog.derived import Vehicle
@@ -19,6 +22,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.messages.message_type import MessageType
 from iort_contract.topics import build_topic
 from iort_station import data
+from iort_station.cli.verbs.data import query
 from iort_station.data import conditions, select
 from iort_station.errors import StationError
 from tests.fakes import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
@@ -308,3 +312,42 @@ def test_a_mistyped_robot_of_a_large_fleet_is_answered_with_the_three_nearest_na
         cloud.table.put(ROBOTS, {"robot": serialize(name)})
     with pytest.raises(StationError, match=r"the nearest: lab-a-17, lab-a-07, lab-b-07; `iort robots"):
         data.query(cloud, "lab-a-70", "vesc")
+
+
+class Options:
+    """What `iort query` reads of the options before its name."""
+
+    def __init__(self, cloud):
+        self.cloud = lambda: cloud
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [("b.csv", b"time,speed"), ("b.jsonl", b'{"time'), ("b.parquet", b"PAR1"), ("b.txt", b"time (UTC)")],
+)
+def test_a_file_has_the_format_of_its_ending_and_every_row(tmp_path, name, begins):
+    arguments = ["car", "vesc", "--last", "all"]
+    done = CliRunner().invoke(
+        query.commands,
+        [*arguments, "--out", str(tmp_path / name)],
+        obj=Options(cloud_of(*ride())),
+    )
+    assert done.exit_code == 0, done.exception
+    content = (tmp_path / name).read_bytes()
+    assert content.startswith(begins)
+    if name == "b.parquet":
+        assert pq.read_table(tmp_path / name).num_rows == 100
+    else:
+        assert [value for value in range(100) if not re.search(rb"\b%d\b" % value, content)] == []
+    piped = CliRunner().invoke(query.commands, arguments, obj=Options(cloud_of(*ride())))
+    assert len(piped.stdout.splitlines()) == 102, "the head, the units and every row"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("b.xlsx", "must end in .csv, .jsonl"), ("b", "must end in"), ("b.mcap", "iort export writes .mcap")],
+)
+def test_a_file_of_an_unknown_ending_is_refused_before_the_query(tmp_path, name, said):
+    done = CliRunner().invoke(query.commands, ["car", "vesc", "--out", str(tmp_path / name)])
+    assert said in str(done.exception)
+    assert not (tmp_path / name).exists()

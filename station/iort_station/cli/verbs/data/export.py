@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_station.cli.console import tell
 from iort_station.cli.options import SHORT, AsJson, Force, Robot, When, ranged, to_file
 from iort_station.cli.progress import reading
@@ -17,15 +18,23 @@ from iort_station.times import between_hours
 
 commands = typer.Typer()
 
+# Streams for the station alone, not for people.
+_BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
 
-@commands.command("export", epilog=examples("export car7 vesc --last 10m --out car7.mcap"))
+
+@commands.command(
+    "export",
+    epilog=examples("export car7 vesc --last 10m --out car7.mcap", "export car7 --last 10m --out all.mcap"),
+)
 @ranged
 def export(
     context: typer.Context,
     robot: Robot,
     when: When,
-    streams: Annotated[list[str], typer.Argument(help="One stream or more, for example vesc.")],
     out: Annotated[Path, to_file("The file to write: .mcap or .bag.")],
+    streams: Annotated[
+        list[str] | None, typer.Argument(help="The streams, for example vesc. Default: all.")
+    ] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -36,7 +45,7 @@ def export(
     fields. For CSV and Parquet, use iort query.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data.inventory import check_there  # noqa: PLC0415 - see above
+    from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
     from iort_station.data.selection import select  # noqa: PLC0415 - as above
     from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
@@ -48,6 +57,8 @@ def export(
     check_free(out, force=force)
     within = when.range(SHORT)
     cloud = context.obj.cloud()
+    if not streams:
+        streams = [name for name in check_recorded(cloud, robot) if name not in _BOOKKEEPING]
     written, origin = 0, Origin()
     with kind(out, force=force) as file:
         for stream in dict.fromkeys(streams):

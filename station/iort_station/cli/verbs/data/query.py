@@ -36,6 +36,14 @@ commands = typer.Typer()
 
 
 Format = Literal["table", "csv", "jsonl", "parquet"]
+# A file's format, unless --format says another.
+_ENDINGS: dict[str, Format] = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".txt": "table",
+}
 
 
 @commands.command(
@@ -43,7 +51,7 @@ Format = Literal["table", "csv", "jsonl", "parquet"]
     epilog=examples(
         "query car7 vesc --last 10m --fields speed_mps,voltage_input",
         "query car7 vesc --last 1h --where 'speed_mps > 1.2' --every 1s",
-        "query car7 vesc --last 7d --format parquet --out car7.parquet",
+        "query car7 vesc --last 7d --out car7.parquet",
     ),
 )
 @ranged
@@ -58,7 +66,10 @@ def query(
     summary: Annotated[
         bool, typer.Option("--summary", help="The summary of each second instead of samples.")
     ] = False,
-    form: Annotated[Format, typer.Option("--format", help="The output format.")] = "table",
+    form: Annotated[
+        Format | None,
+        typer.Option("--format", help="The output format. Default: the ending of --out, or else a table."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
     raw: Annotated[
         bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
@@ -86,6 +97,7 @@ def query(
     from iort_station import data  # noqa: PLC0415 - see above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
 
+    form = "jsonl" if as_json else form or _form_of(out)
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
     if out is not None:
@@ -110,7 +122,6 @@ def query(
             progress=progress,
         )
     took_s = time.monotonic() - began
-    form = "jsonl" if as_json else form
     if out is None:
         _write(result, form, sys.stdout, raw=raw)
     else:
@@ -127,6 +138,19 @@ def query(
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
 
 
+def _form_of(out: Path | None) -> Format:
+    """The format that a file's ending names; a device, a pipe and the standard output get a table."""
+    if out is None or (out.exists() and not out.is_file()):
+        return "table"
+    if out.suffix in {".mcap", ".bag"}:
+        raise UsageError(f"iort export writes {out.suffix}, iort query {', '.join(_ENDINGS)}; got {out}")
+    if out.suffix not in _ENDINGS:
+        raise UsageError(
+            f"the file must end in {', '.join(_ENDINGS)}, or --format must say what it is; got {out}"
+        )
+    return _ENDINGS[out.suffix]
+
+
 def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
     from iort_station.recordings import tabular  # noqa: PLC0415 - as above
@@ -137,11 +161,13 @@ def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
         tabular.to_csv(result, file, raw=raw)
     elif form == "jsonl":
         tabular.to_json_lines(result, file)
-    else:
-        # In a file, every column fits.
-        width = None if file.isatty() else 32 + 24 * len(result.columns)
-        console = Console(file=file, width=width)
+    elif file.isatty():
+        console = Console(file=file)
         shown = tables.terminal(result, console.width)
         console.print(shown.table)
+        if shown.rows < len(result):
+            say(f"{shown.rows} of {len(result):,} shown; a pipe or --out FILE.csv gets every one")
         if shown.left_out:
-            say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --format csv")
+            say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --out FILE.csv")
+    else:
+        tables.plain(result, file)

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from iort_station.cli.console import tell
-from iort_station.cli.options import AsJson, Force, State, state_folder
+from iort_station.cli.options import AsJson, Force, State, running_state
 from iort_station.cli.progress import bar
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say
 
 commands = typer.Typer()
 
@@ -30,7 +30,8 @@ def backup_(
     """
     from iort_station.upkeep import backup  # noqa: PLC0415 - SQLite takes longer to load than TAB may take
 
-    folder = state_folder(context, state)
+    folder = running_state(context, state)
+    say(f"of the cloud that is kept in {folder}")
     with bar("backup", backup.size_of(folder) if folder.exists() else None) as progress:
         made = backup.back_up(folder, file, force=force, progress=progress)
     facts = {"file": str(file), "bytes": made.size, "files": len(made.files), "state": str(folder)}

@@ -10,7 +10,7 @@ import typer
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, DryRun, State, state_folder
 from iort_station.cli.progress import bar
-from iort_station.cli.words import examples
+from iort_station.cli.words import examples, say
 from iort_station.times import iso_s
 
 commands = typer.Typer()
@@ -35,6 +35,8 @@ def restore_(
     from iort_station.upkeep import restore  # noqa: PLC0415 - as in `iort backup`
 
     folder, earlier = state_folder(context, state), None
+    if not dry_run:
+        say(f"to {folder}, for `make up`")
     with bar("restore", file.stat().st_size) as progress:
         if dry_run:
             manifest = restore.verify(file, progress)
