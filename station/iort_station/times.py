@@ -99,19 +99,13 @@ def iso_s(t_us: int) -> str:
 
 
 def stamped(name: str, t_us: int | None) -> dict[str, Any]:
-    """A time for JSON: ``name`` as ISO 8601, and ``name_ms`` in milliseconds; both null for None."""
-    return {name: None, f"{name}_ms": None} if t_us is None else {name: iso(t_us), f"{name}_ms": t_us // 1000}
+    """A time for JSON: ``name`` as ISO 8601, and ``name_us`` since the epoch; both null for None."""
+    return {name: None if t_us is None else iso(t_us), f"{name}_us": t_us}
 
 
 def between(extent: Extent) -> dict[str, Any]:
-    """An extent for JSON: its times as ISO 8601 and in milliseconds."""
-    start_us, end_us = extent["from_us"], extent["to_us"]
-    return {
-        "from": iso(start_us),
-        "from_ms": start_us // 1000,
-        "to": iso(end_us),
-        "to_ms": -(-end_us // 1000),
-    }
+    """An extent for JSON."""
+    return {**stamped("from", extent["from_us"]), **stamped("to", extent["to_us"])}
 
 
 def between_hours(archived: Archived) -> dict[str, Any]:

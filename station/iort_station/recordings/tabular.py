@@ -50,7 +50,7 @@ def to_json_lines(result: Result, file: IO[str]) -> None:
     times = iter(result.times_us.tolist())
     for rows in _rows(result):
         for at, *row in rows:
-            sample = {"time": at, "t_us": next(times), **dict(zip(names, row, strict=True))}
+            sample = {"time": at, "time_us": next(times), **dict(zip(names, row, strict=True))}
             file.write(json.dumps(sample) + "\n")
 
 

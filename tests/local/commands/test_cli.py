@@ -37,6 +37,7 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
         [],
     )
     assert all(row.keys() == told.keys() for row in listed)
+    assert not {"session_version", "admit_claim", "admit_fingerprint"} & told.keys()
     shown = iort("robots", "list").stdout
     assert f"{'cli-car':<8}" in shown
     assert "speed_to_erpm_gain 3000" in shown

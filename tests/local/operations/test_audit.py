@@ -103,7 +103,7 @@ def test_each_run_names_the_run_before_it(embedded, bundle):
     _delete(embedded, car.robot, "wheels", {BATCH: str(last)})
     (wheels,) = json.loads(_run(embedded, car.robot, "--stream", "wheels", "--last", "1h").stdout)["streams"]
     (gap,) = wheels["runs"][0]["missing"]
-    assert (gap["first"], gap["last"], gap["before_ms"]) == (last.seq, last.seq, None)
+    assert (gap["first"], gap["last"], gap["before_us"]) == (last.seq, last.seq, None)
     assert not wheels["runs"][1]["missing"]
 
 

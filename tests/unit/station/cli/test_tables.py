@@ -80,13 +80,13 @@ def test_json_lines_keep_null_text_and_microseconds():
     assert len(lines) == 25_000
     assert lines[2] == {
         "time": "2023-11-14T22:13:20.163456Z",
-        "t_us": 1_700_000_000_163_456,
+        "time_us": 1_700_000_000_163_456,
         "speed": 3.0,
         "current_motor": None,
         "name": "ü",
         "on": True,
     }
-    assert lines[-1]["t_us"] == 1_700_000_000_123_456 + 24_999 * 20_000
+    assert lines[-1]["time_us"] == 1_700_000_000_123_456 + 24_999 * 20_000
 
 
 def test_parquet_keeps_times_types_null_and_units():

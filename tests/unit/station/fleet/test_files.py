@@ -189,8 +189,10 @@ def test_list_prints_the_selected_files(iort, store):
     store(name="a.bag")
     key = store(name="b.txt", second=NOON + 1)
     assert iort("list", "car").output.splitlines()[0].split() == ["2023-11-14T22:13:20Z", "7", "a.bag"]
-    (line,) = iort("list", "car", "--name", "*.txt", "--json").output.splitlines()
-    assert json.loads(line)["key"] == key
+    (listed,) = json.loads(iort("list", "car", "--name", "*.txt", "--json").output)
+    assert listed["key"] == key
+    assert listed["written_us"] == (NOON + 1) * 1_000_000
+    assert json.loads(iort("list", "car", "--name", "*.none", "--json").output) == []
     assert iort("list", "car", "--last", "1d").stdout == ""
     assert "give --last, or" in str(iort("list", "car", "--last", "1d", "--to", "now", status=1).exception)
 

@@ -18,7 +18,7 @@ from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples
 from iort_station.data.analysis import findings as stored
 from iort_station.fleet import registry
-from iort_station.times import iso_s
+from iort_station.times import between, iso_s, stamped
 
 commands = typer.Typer()
 _STYLES = {"serious": "bold red", "warning": "yellow", "info": ""}
@@ -56,7 +56,7 @@ def findings(
     if drives:
         analysed = stored.drives(cloud, robot, within.start_us, within.end_us, most=count)
         if as_json:
-            print_json([encode_analysed(one) for one in analysed])
+            print_json([_drive_as_json(one) for one in analysed])
         for one in () if as_json else analysed:
             _show_drive(one)
         found: list[Any] = list(analysed)
@@ -66,7 +66,7 @@ def findings(
         page += "/" if page and not page.endswith("/") else ""
         found = stored.findings(cloud, robot, within.start_us, within.end_us, most=count)
         if as_json:
-            print_json([{**encode_finding(one), "link": history_link(page, one)} for one in found])
+            print_json([_as_json(one, page) for one in found])
         for finding in () if as_json else found:
             _show(finding, page)
     if not found and robot is not None:
@@ -99,6 +99,22 @@ def _show(one: Finding, page: str) -> None:
     out.print(rows)
     # In one piece, to be clicked or copied.
     out.print(Text(f" evidence {history_link(page, one)}"), soft_wrap=True)
+
+
+def _as_json(finding: Finding, page: str) -> dict[str, Any]:
+    evidence = between({"from_us": finding.from_us, "to_us": finding.to_us})
+    start = stamped("start", finding.drive.start_us)
+    return {**encode_finding(finding), **start, **evidence, "link": history_link(page, finding)}
+
+
+def _drive_as_json(analysed: AnalysedDrive) -> dict[str, Any]:
+    content = encode_analysed(analysed)
+    del content["job"]
+    return content | {
+        **stamped("start", analysed.drive.start_us),
+        **stamped("end", analysed.end_us),
+        **stamped("analysed", analysed.analysed_us or None),
+    }
 
 
 def _interval(estimate: Estimate) -> str:

@@ -39,15 +39,18 @@ def list_(
     name: _Name = "*",
     as_json: AsJson = False,
 ) -> None:
-    """List a robot's files in the order of their time. With --json, print a line of JSON for each.
+    """List a robot's files in the order of their time.
 
     The files of a robot that is no longer registered stay, and are listed.
     """
-    within, one = when.range(), None
-    for one in _chosen(context.obj.cloud(), robot, name, within):
-        text = f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}"
-        console.out.print(json.dumps(_as_json(one)) if as_json else text, soft_wrap=True)
-    if one is None:
+    listed = _chosen(context.obj.cloud(), robot, name, when.range())
+    if as_json:
+        console.print_json([_as_json(file) for file in listed])
+        return
+    file = None
+    for file in listed:
+        console.out.print(f"{iso_s(file.second * 1_000_000)}  {file.size:>15,}  {file.name}", soft_wrap=True)
+    if file is None:
         console.errors.print("no matching files", soft_wrap=True)
 
 

@@ -14,6 +14,8 @@ from iort_contract.catalog.analysis.car import KNOWN
 from iort_contract.messages.control.driving import NO_MOTION
 from iort_contract.tables import (
     ADMISSION,
+    ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,
     ADMITTED_MS,
@@ -30,6 +32,7 @@ from iort_contract.tables import (
     OVER_SHARE,
     PRESENCE,
     ROBOT,
+    SESSION_VERSION,
     STREAMS,
 )
 from iort_station.cli import completion
@@ -48,6 +51,8 @@ from iort_station.times import iso_s, stamped, time_us
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
 commands.add_typer(provisioning.commands)
 commands.add_typer(tags.commands)
+# What the cloud's functions keep in the row for themselves.
+_INTERNAL = {SESSION_VERSION, ADMIT_CLAIM, ADMIT_FINGERPRINT}
 # A pipe has no width at which a line must end.
 _PIPE_WIDTH = 10_000
 # Whether an emergency stop ends its motion; None before the robot has said so.
@@ -243,7 +248,7 @@ def _parameter(text: str) -> tuple[str, float]:
 
 
 def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A robot's row with every attribute that a row may have; null is not known."""
+    """A robot's row with every attribute that an operator may use; null is not known."""
     known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, FILES_DAY, FILES_BYTES))
     told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
     told |= {name: float(row[name]) for name in (*robots.F1TENTH, *KNOWN) if name in row}
@@ -254,7 +259,7 @@ def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
     told |= stamped("admit_until", None if until_s is None else int(until_s) * 1_000_000)
     for name in [name for name in told if name.startswith(ALERT_PREFIX)]:
         told |= stamped(name, int(told[name]) * 1_000_000)
-    return told
+    return {name: value for name, value in told.items() if name not in _INTERNAL}
 
 
 def _connection(row: Mapping[str, Any]) -> str:

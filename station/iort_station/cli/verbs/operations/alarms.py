@@ -14,7 +14,7 @@ from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError
 from iort_station.operations.monitoring import alarms
-from iort_station.times import iso_s
+from iort_station.times import iso_s, stamped
 
 commands = typer.Typer()
 _STATES = {"ALARM": "raised", "INSUFFICIENT_DATA": "no data", "OK": "quiet"}
@@ -74,12 +74,10 @@ def _print(alarm: AlarmEntry) -> None:
 def _as_json(alarm: AlarmEntry) -> dict[str, Any]:
     seen = alarm["acknowledged"]
     return {
-        **{name: value for name, value in alarm.items() if name not in ("about", "since_s")},
-        "since": _utc(alarm["since_s"]),
-        "since_ms": round(alarm["since_s"] * 1000),
+        **{name: value for name, value in alarm.items() if name not in {"about", "named", "since_s"}},
+        **stamped("since", round(alarm["since_s"] * 1e6)),
         "for_s": round(time.time() - alarm["since_s"]),
-        "acknowledged": seen
-        and {"by": seen["by"], "at": _utc(seen["at_s"]), "at_ms": round(seen["at_s"] * 1000)},
+        "acknowledged": seen and {"by": seen["by"], **stamped("at", round(seen["at_s"] * 1e6))},
     }
 
 

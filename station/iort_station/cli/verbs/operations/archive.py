@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import MofNCompleteColumn
@@ -33,14 +33,14 @@ _Stream = Annotated[str | None, typer.Argument(help="Only this stream.", autocom
 def show(
     context: typer.Context, robot: _Robot = None, stream: _Stream = None, as_json: AsJson = False
 ) -> None:
-    """List the streams in the archive: hours, samples, bytes. With --json, print a line of JSON for each."""
+    """List the streams in the archive: hours, samples, bytes."""
     cloud = context.obj.cloud()
-    empty = True
+    streams: list[dict[str, Any]] = []
     for topic in archive.topics(cloud, robot, stream):
         rows = list(Archive(cloud, topic).rows())
         if not rows:
             continue
-        empty, name = False, parse_topic(topic)
+        name = parse_topic(topic)
         # The hours of a day are one object.
         size = sum({row.key: row.size_bytes for row in rows}.values())
         facts = {
@@ -54,12 +54,16 @@ def show(
             "refused": sum(row.refused for row in rows),
             "bytes": size,
         }
-        text = (
-            f"{name.robot} {name.name}: {len(rows):,} hours from {rows[0].hour} to {rows[-1].hour}, "
-            f"{facts['samples']:,} samples, {size:,} bytes"
-        )
-        console.tell(facts, text, as_json=as_json)
-    if empty:
+        streams.append(facts)
+        if not as_json:
+            text = (
+                f"{name.robot} {name.name}: {len(rows):,} hours from {rows[0].hour} to {rows[-1].hour}, "
+                f"{facts['samples']:,} samples, {size:,} bytes"
+            )
+            console.out.print(text, soft_wrap=True)
+    if as_json:
+        console.print_json(streams)
+    elif not streams:
         say(_EMPTY)
 
 
@@ -94,21 +98,23 @@ def verify(
 ) -> None:
     """Prove that the archive holds every batch: compare table, manifest and objects. It reads all objects.
 
-    Fails if anything is missing. With --json, print a line of JSON for each stream.
+    Fails if anything is missing.
     """
     cloud = context.obj.cloud()
-    wrong, empty = 0, True
+    wrong, streams = 0, []
     for topic in archive.topics(cloud, robot, stream):
         name, found = parse_topic(topic), archive.verify(cloud, topic)
         wrong += len(found.problems)
         if not found.hours and not found.problems:
             continue
-        empty = False
-        facts = {"robot": name.robot, "stream": name.name, **vars(found)}
+        streams.append({"robot": name.robot, "stream": name.name, **vars(found)})
         lines = [f"{name.robot} {name.name}: {found.hours:,} hours, {found.samples:,} samples"]
         lines += [f"    {hour}: {problem}" for hour, problem in found.problems.items()]
-        console.tell(facts, "\n".join(lines), as_json=as_json)
-    if empty:
+        if not as_json:
+            console.out.print("\n".join(lines), soft_wrap=True)
+    if as_json:
+        console.print_json(streams)
+    elif not streams:
         say(_EMPTY)
     if wrong:
         raise StationError(
