@@ -9,6 +9,7 @@ import pytest
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.message_type import MessageType
 from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
+from iort_contract.ros1.decode import Large
 from iort_contract.ros1.message import Messages, RosType, cut
 from iort_station.data.selection import select
 from iort_station.recordings.published import Export
@@ -87,7 +88,8 @@ def test_an_invalid_batch_is_refused():
     assert "base64" in export.refused.reason
 
 
-A, B = b"a picture", b"another picture"
+A = Large(b"a picture", 0)
+B = Large(b"another picture", 4 + len(A) + len(text("jpeg")))
 WHOLE = u32(len(A)) + A + text("jpeg") + u32(len(B)) + B
 
 
@@ -101,7 +103,7 @@ def attachment(field, at, key, content):
 def with_attachments(*, sha256_of_b=B, key_of_a="k/a"):
     """An image with two contents stored as files."""
     less, at_a = cut(WHOLE, A)
-    less, at_b = cut(less, B)
+    less, at_b = cut(less, B, removed=len(A))
     beside = {**attachment("a", at_a, key_of_a, A), **attachment("b", at_b, "k/b", sha256_of_b)}
     return less, of(IMAGE, [less], **beside)
 
