@@ -69,6 +69,7 @@ LOST = frozenset(
         "disk",
         "left_out",
         "skipped",
+        "unread",
         "bad_cells",
         "structure_not_kept",
         "not_a_number",

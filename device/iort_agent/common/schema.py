@@ -233,6 +233,8 @@ def read_yaml(file: Path) -> Any:
         raise ConfigError(f"{file}: is not UTF-8 text: {error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{file}: must be nested at most some hundred levels deep") from error
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -34,6 +34,7 @@ from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
+from iort_contract.messages.account import lost
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.messages.message_type import MessageType, message_type
@@ -446,6 +447,21 @@ def test_the_agents_metrics_are_a_stream() -> None:
 )
 def test_topic_filters(topic_filter: str, topic: str, expected: bool) -> None:
     assert matches(topic_filter, topic) is expected
+
+
+def test_the_account_names_the_topic_of_a_recording_whose_messages_were_not_read(tmp_path: Path) -> None:
+    from tests.unit.agent.sources.test_bag import STORAGES, described, write_ros2
+
+    def change(topic: Any) -> None:
+        topic["message_count"] += 2
+
+    path = described(write_ros2(tmp_path / "drive", STORAGES[0]), change)
+    rig = Rig(sources=(BagConfig(path=path, speed=0.0),))
+    assert rig.runtime.run(drain_s=10) == 1
+    topic = "$aws/rules/iort_record/dt/iort/car1/account"
+    batches = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
+    texts = [text for batch in batches for text in batch.columns.get("counts", ()) if isinstance(text, str)]
+    assert lost(json.loads(texts[-1])) == {"/sensors/core.unread": 2}
 
 
 def config_file(folder: Path, source: str, more: str = "") -> Path:

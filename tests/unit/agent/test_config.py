@@ -185,6 +185,7 @@ STOP, CRAWL = "motion: {stop: {}}", "motion: {stop: {drive: {speed: 0.1}}}"
         ((SIM, SIM + "port: 88830\n"), ["port: must be ", "got 88830", "1 to 65535"]),
         ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),
         ((SIM, "  - type: sim\n   x: 1\n"), ["is not YAML", "line 8"]),
+        ((SIM, f"  - {'[' * 5000}\n"), ["car.yaml: must be nested at most"]),
     ],
     ids=lambda case: case[1].strip()[:40] if isinstance(case, tuple) else "",
 )

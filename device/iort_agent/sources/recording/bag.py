@@ -17,7 +17,7 @@ from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, WARN, Emit, Finding, SourceConfig
 from iort_agent.sources.recording.look import look_into
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
-from iort_agent.sources.recording.rosbag import Recording
+from iort_agent.sources.recording.rosbag import Recording, Unread
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
@@ -38,7 +38,8 @@ class BagConfig(SourceConfig):
 
     path: Path = setting(existing_path(folder=True))
     topics: tuple[tuple[str, str], ...] | None = setting(
-        pairs(text(check_stream), what="a mapping of ROS topic to stream name"), default=None
+        pairs(text(check_stream), what="a mapping of ROS topic to stream name, such as {/scan: scan}"),
+        default=None,
     )
     speed: float = setting(number(0, 1000), 1.0)
     stamps: str = setting(choice(NOW, ORIGINAL), NOW)
@@ -72,10 +73,13 @@ class BagConfig(SourceConfig):
             yield Finding(title, FAIL, f"{self.path} may not be read", f"chmod a+r {self.path}")
             return
         wanted = set(self.streams())
-        looked = look_into(self.build(SystemClock()).open, wanted, _LOOK_S)
+        source = self.build(SystemClock())
+        looked = look_into(source.open, wanted, _LOOK_S)
         if looked.error:
             yield Finding(title, FAIL, looked.error)
             return
+        for line in source.unread.lines.values():
+            yield Finding(title, FAIL, line)
         if looked.streams:
             yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
         missing = ", ".join(sorted(wanted.difference(looked.streams)))
@@ -93,16 +97,22 @@ class BagSource:
         self._clock = clock
         is_log = config.path.suffix.lower() == ".csv"
         self._log = VescLog(config.path, config.stream, config.stamps) if is_log else None
+        self.unread = Unread()
 
     def report(self) -> Mapping[str, Any]:
-        """The counts of a VESC Tool log's rows. A bag needs none beside the streams' own."""
-        return {} if self._log is None else self._log.report()
+        """The counts of a VESC Tool log's rows; of a bag, by topic, the messages that were not read."""
+        if self._log is not None:
+            return self._log.report()
+        return {topic: {"unread": count} for topic, count in self.unread.counts.copy().items()}
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Play until the end, or for ever with ``loop``. Raises `SourceError`."""
+        """Play until the end, or for ever with ``loop``. Raises `SourceError`, at the end for messages that
+        were not read."""
         config = self._config
         how = Playback(config.speed, config.stamps, config.loop, config.duration_s)
         play(self._recording(), how, self._clock, emit, stop)
+        if self.unread.lines:
+            raise SourceError("; ".join(self.unread.lines.values()))
 
     def open(self) -> ContextManager[Iterator[Message]]:
         """The recording's messages, in the order of recording, for a ``with`` block. Raises `SourceError`."""
@@ -112,7 +122,7 @@ class BagSource:
         config = self._config
         if self._log is None:
             large = config.large == UPLOAD
-            return lambda: Recording(config.path, config.topics, config.stream, large=large)
+            return lambda: Recording(config.path, config.topics, config.stream, self.unread, large=large)
         if config.topics is not None:
             raise SourceError(f"{config.path}: a VESC Tool log has no topics; `stream` names its stream")
         return self._log

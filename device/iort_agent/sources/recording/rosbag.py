@@ -1,16 +1,23 @@
-"""Reads the bags of ROS 1 and ROS 2 with the package rosbags, each message as ROS 1 has it."""
+"""Makes samples of the messages in bags of ROS 1 and ROS 2: each message as ROS 1 has it.
+
+A topic that cannot be read is left out, by name, and so is a message; the others are given. What was read is
+compared with what the recording says that it holds.
+"""
 
 from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Callable, Iterator, Mapping, NamedTuple, Optional, Sequence
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Message
-from iort_agent.sources.recording.unreadable import check_kind, wrapped
+from iort_agent.sources.recording.reader import INDEX, Reader
+from iort_agent.sources.recording.unreadable import wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
@@ -27,43 +34,61 @@ _BELIEVABLE_NS = 3600 * 1_000_000_000
 _ROS2_HEADER = re.compile(
     r"(=+\nMSG: std_msgs/Header\n)\s*(?:time|builtin_interfaces/Time) stamp\n\s*string frame_id(\n|\Z)"
 )
+# ROS 2 may bound a text or an array, which changes nothing in its bytes.
+_BOUND = re.compile(r"(?<=string)<=\d+|(?<=\[)<=\d+(?=\])")
 
 
 class _Kind(NamedTuple):
-    """The type of a topic's messages, and the sample that declares it."""
+    """The type of a topic's messages, and the sample that declares it. ``convert`` makes messages of ROS 1 of
+    those of ROS 2."""
 
     whole: RosType
     sample: Optional[Mapping[str, Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
     stamped: bool
     large: Optional[Decoder]  # noqa: UP045 - as above
+    convert: Optional[Callable[[bytes], bytes]]  # noqa: UP045 - as above
+
+
+class Unread:
+    """What recordings hold and could not give, by topic: ``counts`` of messages, ``lines`` for a person."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.lines: dict[str, str] = {}
+
+    def add(self, topic: str, count: int, line: str) -> None:
+        """Count messages of a topic, and log its first line."""
+        self.counts[topic] += max(0, count)
+        if topic not in self.lines:
+            self.lines[topic] = line
+            _log.warning("%s", line)
 
 
 class Recording:
-    """A bag, open for reading. The library's errors come as `SourceError`."""
+    """A bag, open for reading. The library's errors come as `SourceError`.
+
+    ``unread`` is complete once all messages were given.
+    """
 
     def __init__(
-        self, path: Path, topics: Sequence[tuple[str, str]] | None, stream: str, *, large: bool = False
+        self,
+        path: Path,
+        topics: Sequence[tuple[str, str]] | None,
+        stream: str,
+        unread: Unread,
+        *,
+        large: bool = False,
     ) -> None:
-        try:
-            # Only a robot that plays recordings needs the library: pip install iort-agent[bag].
-            from rosbags.highlevel import AnyReader  # noqa: PLC0415 - optional
-        except ImportError as error:
-            raise SourceError(
-                "playing a bag needs the package rosbags: pip install 'iort-agent[bag]'"
-            ) from error
-        check_kind(path)
-        # rosbags opens the folder of a ROS 2 recording; people name the file in it.
-        in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
         self._path = path
         self._topics = topics
         self._stream = stream
+        self._unread = unread
         self._large = large
-        with wrapped(f"{path}: cannot be opened"):
-            self._reader = AnyReader([path.parent if in_folder else path], default_typestore=_known_types())
+        self._reader = Reader(path)
+        self._kinds: dict[tuple[str, str, str], _Kind] = {}
 
     def __enter__(self) -> Iterator[Message]:
-        with wrapped(f"{self._path}: cannot be read"):
-            self._reader.open()
+        self._reader.open()
         try:
             return self._messages(self._streams())
         except SourceError:
@@ -74,11 +99,8 @@ class Recording:
         self._reader.close()
 
     def _streams(self) -> dict[str, str]:
-        """Wanted ROS topic -> stream. Raises `SourceError`, which lists the recording's topics."""
-        store = self._reader.typestore
-        # Renamed between the versions for Python 3.8 and later.
-        known = store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS
-        there = {c.topic: c.msgtype for c in self._reader.connections}
+        """Wanted ROS topic -> stream, of the topics that can be read. Raises `SourceError`."""
+        there = {c.topic: _named(c.msgtype) for c in self._reader.connections}
         wanted = dict(self._topics or [(t, self._stream) for t, kind in there.items() if kind == VESC_TYPE])
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items())) or "no topic"
         missing = [topic for topic in wanted if topic not in there]
@@ -86,58 +108,77 @@ class Recording:
             raise SourceError(f"{self._path}: no topic {', '.join(missing)}; the recording has {listed}")
         if not wanted:
             raise SourceError(
-                f"{self._path}: no topic of type {VESC_TYPE}, so `topics` must name some; "
-                f"the recording has {listed}"
+                f"{self._path}: no topic of type {VESC_TYPE}, so `topics` must name some, such as "
+                f"`topics: {{/scan: scan}}`; the recording has {listed}"
             )
+        counts = self._reader.counts()
+        for connection in self._reader.connections:
+            topic = connection.topic
+            if topic not in wanted:
+                continue
+            try:
+                self._kinds[_key(connection)] = self._kind(wanted[topic], connection)
+            except SourceError as error:
+                del wanted[topic]
+                self._unread.add(topic, counts[INDEX][topic], str(error))
+        if not wanted:
+            raise SourceError("; ".join(self._unread.lines.values()))
         for topic in wanted:
-            if there[topic] not in known:
-                raise SourceError(
-                    f"{self._path}: the topic {topic} is of type {there[topic]}, whose definition is neither "
-                    "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
-                )
+            there_by = {place: topics.get(topic, 0) for place, topics in counts.items()}
+            if len(set(there_by.values())) > 1:
+                listed = ", ".join(f"{place} has {count:,} messages" for place, count in there_by.items())
+                lost = max(there_by.values()) - there_by[INDEX]
+                self._unread.add(topic, lost, f"{self._path}: topic {topic}: {listed}")
         return wanted
 
     def _messages(self, streams: Mapping[str, str]) -> Iterator[Message]:
         """The messages of these topics, in the order of recording."""
-        reader = self._reader
-        start_ns = int(reader.start_time)
-        iterator = iter(reader.messages(connections=[c for c in reader.connections if c.topic in streams]))
-        kinds: dict[tuple[str, str, str], _Kind] = {}
-        while True:
-            with wrapped(f"{self._path}: is damaged"):
-                found = next(iterator, None)
-                if found is None:
-                    return
-                connection, recorded_ns, raw = found
-                if reader.is2:
-                    raw = reader.typestore.cdr_to_ros1(raw, connection.msgtype)
-                raw = bytes(raw)
-            stream, at_ns = streams[connection.topic], recorded_ns - start_ns
-            # One name may have two definitions, each with its own connection.
-            named = (connection.topic, connection.msgtype, connection.digest)
-            known = named in kinds
-            kind = kinds[named] = kinds[named] if known else self._kind(stream, connection)
+        start_ns, counts = self._reader.start_ns, self._reader.counts()[INDEX]
+        read: Counter[str] = Counter()
+        begun: set[tuple[str, str, str]] = set()
+        for connection, recorded_ns, recorded in self._reader.messages(lambda c: c.topic in streams):
+            topic, key = connection.topic, _key(connection)
+            kind, at_ns = self._kinds[key], recorded_ns - start_ns
+            read[topic] += 1
+            try:
+                raw = recorded if kind.convert is None else bytes(kind.convert(recorded))
+            except Exception as error:  # noqa: BLE001 - a bag library may raise anything
+                why = f"{type(error).__name__}: {error}"
+                line = f"{self._path}: topic {topic}: messages do not fit {connection.msgtype}: {why}"
+                self._unread.add(topic, 1, line)
+                continue
             measured_ns = _measured_ns(raw, recorded_ns) if kind.stamped else recorded_ns
-            if not known and kind.sample is not None:
+            if key not in begun and kind.sample is not None:
                 yield Message(TYPES_STREAM, at_ns, measured_ns, kind.sample)
+            begun.add(key)
             contents: dict[str, Any] = {}
             if kind.large is not None:
                 with suppress(MessageError):
                     values: dict[str, Any] = dict(kind.large.decode(raw))
                     contents = {name: v for name, v in values.items() if isinstance(v, Large) and v}
-            yield Message(stream, at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
+            yield Message(streams[topic], at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
+        for topic in streams:
+            if read[topic] != counts[topic]:
+                self._unread.add(
+                    topic,
+                    counts[topic] - read[topic],
+                    f"{self._path}: topic {topic}: {read[topic]:,} messages were read, {INDEX} has "
+                    f"{counts[topic]:,}",
+                )
 
     def _kind(self, stream: str, connection: Any) -> _Kind:
-        kind = connection.msgtype.replace("/msg/", "/")
+        name = _named(connection.msgtype)
+        kind, convert = name.replace("/msg/", "/"), None
         with wrapped(f"{self._path}: topic {connection.topic}: its type {kind} cannot be read"):
-            text, md5 = self._reader.typestore.generate_msgdef(connection.msgtype, ros_version=1)
             # As recorded: with constants and comments. rosbags for Python 3.8 has the text itself.
-            recorded = getattr(connection.msgdef, "data", connection.msgdef)
+            text, md5 = getattr(connection.msgdef, "data", connection.msgdef), connection.digest
             if self._reader.is2:
+                store = self._store(connection, name)
+                text, _ = store.generate_msgdef(name, ros_version=1)
                 text = _ROS2_HEADER.sub(r"\1uint32 seq\ntime stamp\nstring frame_id\2", text)
+                text = _BOUND.sub("", text)
                 md5 = md5sum(parse(kind, text), text)
-            elif recorded:
-                text, md5 = recorded, connection.digest
+                convert = partial(store.cdr_to_ros1, typename=name)
             definition = parse(kind, text)
         sample = None
         try:
@@ -145,7 +186,44 @@ class Recording:
         except ContractError as error:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         large = Decoder(definition, large=True) if self._large else None
-        return _Kind(RosType(connection.topic, kind, md5, text), sample, definition.stamped(), large)
+        return _Kind(RosType(connection.topic, kind, md5, text), sample, definition.stamped(), large, convert)
+
+    def _store(self, connection: Any, name: str) -> Any:
+        """The library's types for one connection: two topics may define one name differently."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - optional
+        from rosbags.typesys import get_types_from_idl as from_idl  # noqa: PLC0415 - as above
+
+        # rosbags for Python 3.8 has the text itself, and no format beside it.
+        text = getattr(connection.msgdef, "data", connection.msgdef)
+        form = getattr(getattr(connection.msgdef, "format", None), "name", "MSG" if text else "NONE")
+        if form == "NONE":
+            store = _known_types()
+        else:
+            store, types = get_typestore(Stores.EMPTY), {}
+            if text.startswith(_IDL):
+                for part in text.split(_SEPARATOR)[1:]:
+                    types.update(from_idl(part.partition("\n")[2]))
+            else:
+                types = from_idl(text) if form == "IDL" else get_types_from_msg(text, name)
+            store.register(types)
+        # Renamed between the versions for Python 3.8 and later.
+        if name not in (store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS):
+            raise SourceError(
+                f"{self._path}: the topic {connection.topic} is of type {name}, whose definition is neither "
+                "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
+            )
+        return store
+
+
+def _key(connection: Any) -> tuple[str, str, str]:
+    # One name may have two definitions, each with its own connection.
+    return connection.topic, connection.msgtype, connection.digest
+
+
+def _named(msgtype: str) -> str:
+    """The type's name as the library has it. Some recorders leave out the middle."""
+    package, _, name = msgtype.partition("/")
+    return f"{package}/msg/{name}" if name and "/" not in name else msgtype
 
 
 def _measured_ns(raw: bytes, recorded_ns: int) -> int:
@@ -153,6 +231,9 @@ def _measured_ns(raw: bytes, recorded_ns: int) -> int:
     t_ns = stamp_ns(raw)
     return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
 
+
+_SEPARATOR = "=" * 80 + "\n"
+_IDL = f"{_SEPARATOR}IDL: "
 
 # vesc_msgs for ROS 2, since recordings of Foxy and Humble hold no definitions. The order is the wire's.
 _VESC_STATE_ROS2 = """

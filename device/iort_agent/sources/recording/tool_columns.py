@@ -85,7 +85,8 @@ class Columns:
             _Column(at, label, _NAMES.get(label, label)) for at, label in enumerate(labels) if label != TIME
         ]
         self.kept = [column for column in columns if self._is_field(column, first_rows)]
-        self.dropped = [column.label or "(no name)" for column in columns if column not in self.kept]
+        kept = {column.at for column in self.kept}
+        self.dropped = [column.label or "(no name)" for column in columns if column.at not in kept]
 
     def time_of(self, cells: Sequence[str]) -> int:
         """The row's time of day in milliseconds. Raises `BadRowError`."""

@@ -10,7 +10,7 @@ import datetime as dt
 import logging
 import re
 from collections import Counter
-from itertools import chain, islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, Iterator, Sequence
 
@@ -27,6 +27,8 @@ _BEGUN = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
 # This many rows tell what the columns hold.
 _FIRST_ROWS = 100
+# VESC Tool writes about 60 columns.
+_MAX_COLUMNS, _MAX_LINE = 4096, 256 * 1024
 # A fix is older than its row by up to three seconds, and a phone's clock may be off by as much again.
 _GNSS_APART_MS = 60_000
 
@@ -150,7 +152,13 @@ class VescLog:
     def _lines(self) -> Iterator[tuple[int, str]]:
         """The lines that are not empty, numbered as in an editor."""
         try:
-            for number, line in enumerate(self._file, 1):
+            for number in count(1):
+                line = more = self._file.readline(_MAX_LINE)
+                if not line:
+                    return
+                # A line that is longer does not fit the first one, so its beginning is enough.
+                while len(more) == _MAX_LINE and not more.endswith("\n"):
+                    more = self._file.readline(_MAX_LINE)
                 if line.strip():
                     yield number, line.strip()
         except OSError as error:
@@ -161,11 +169,15 @@ class VescLog:
         labels = [label.strip() for label in line.split(separator)]
         if not labels[-1]:
             labels.pop()
+        if len(labels) > _MAX_COLUMNS:
+            raise SourceError(
+                f"{self._path}: it must have at most {_MAX_COLUMNS:,} columns, got {len(labels):,} or more"
+            )
         if TIME not in labels:
             raise SourceError(
                 f"{self._path}: is no VESC Tool log: its first line has no column {TIME}: {line[:80]!r}"
             )
-        twice = sorted({label for label in labels if labels.count(label) > 1})
+        twice = sorted(label for label, count in Counter(labels).items() if count > 1)
         if twice:
             raise SourceError(f"{self._path}: the columns {', '.join(twice)} are there twice")
         return separator, labels

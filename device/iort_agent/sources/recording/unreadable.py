@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Iterator
@@ -23,6 +24,7 @@ _SERVICES = (
     "it holds service events, whose definitions cannot be read: leave them out, "
     "`mcap filter IN.mcap -o OUT.mcap --exclude-topic-regex '.*/_service_event'`"
 )
+_COPIED = "compare the file with its original, or repair it as a recording that was cut off"
 # A part of rosbags' error, and what to do about it.
 _ADVICE = (
     ("index looks damaged", _INDEX),
@@ -43,6 +45,8 @@ _ADVICE = (
     ("Unrecognized storage format", "it must be .bag, .mcap, .db3, .csv, or a folder of ROS 2"),
     ("SRV: ", _SERVICES),
 )
+# These say nothing without the line that raised them.
+_WORDLESS = (AssertionError, KeyError, IndexError, TypeError, AttributeError)
 # The library puts whole message definitions into its errors.
 _LONGEST = 200
 
@@ -61,6 +65,10 @@ def check_kind(path: Path) -> None:
             raise SourceError(f"{path}: is {what} by its content: rename it to {path.stem}{suffix}")
 
 
+class TooLargeError(Exception):
+    """Something in a recording is larger than it may be."""
+
+
 @contextmanager
 def wrapped(what: str) -> Iterator[None]:
     """Turn every error of a bag library into `SourceError`, because damaged files raise anything."""
@@ -68,7 +76,16 @@ def wrapped(what: str) -> Iterator[None]:
         yield
     except SourceError:
         raise
+    except TooLargeError as error:
+        raise SourceError(f"{what.partition(': ')[0]}: {error}") from error
     except Exception as error:
+        if isinstance(error, MemoryError):
+            raise SourceError(f"{what}: a record claims to be larger than the memory") from error
+        if isinstance(error, _WORDLESS):
+            line = traceback.extract_tb(error.__traceback__)[-1].line
+            raise SourceError(
+                f"{what}: its records do not fit together: {type(error).__name__} at `{line}`; {_COPIED}"
+            ) from error
         advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
         text = " ".join(str(error).split())
         text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

@@ -7,13 +7,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Tuple
 
+import mcap.writer
 import numpy as np
 import pytest
+import yaml
 from rosbags import rosbag2
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_agent.errors import SourceError
+from iort_agent.sources import FAIL, OK
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.recording.rosbag import _VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -319,3 +322,133 @@ def test_a_recording_cut_short_says_so(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(SourceError, match=r"a\.bag.*`rosbag reindex` mends"):
         play(path)
+
+
+def described(folder: Path, change: Callable[[Any], None]) -> Path:
+    """The folder with another description of its topics in metadata.yaml."""
+    file = folder / "metadata.yaml"
+    about = yaml.safe_load(file.read_text())
+    for topic in about["rosbag2_bagfile_information"]["topics_with_message_count"]:
+        change(topic)
+    file.write_text(yaml.safe_dump(about))
+    return folder
+
+
+# As the recorders of Foxy to Humble wrote it.
+QOS = """
+- history: 3
+  depth: 0
+  reliability: 1
+  durability: 2
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_topic_is_read_whatever_metadata_yaml_says_of_its_qos(tmp_path: Path, storage: str) -> None:
+    def change(topic: Any) -> None:
+        topic["topic_metadata"]["offered_qos_profiles"] = QOS
+
+    assert len(play(described(write_ros2(tmp_path / "drive", storage), change))) == 10
+
+
+def refused(path: Path, **settings: Any) -> tuple[list[Sample], str, Any]:
+    """The samples, the error after them, and the report, of a recording that is not read to the last message;
+    `iort-agent check` says the same."""
+    out: list[Sample] = []
+    config = BagConfig(path=path, **settings)
+    source = config.build(ManualClock(now_us=NOW))
+    with pytest.raises(SourceError) as raised:
+        source.run(lambda *sample: out.append(sample), threading.Event())
+    return [s for s in out if s[0] != TYPES_STREAM], str(raised.value), source.report()
+
+
+def test_messages_that_are_counted_and_not_there_are_told_by_topic(tmp_path: Path) -> None:
+    def change(topic: Any) -> None:
+        topic["message_count"] += 2
+
+    path = described(write_ros2(tmp_path / "drive", STORAGES[0]), change)
+    samples, error, report = refused(path)
+    assert len(samples) == 10
+    for part in ("topic /sensors/core: ", "10 messages", "has 12"):
+        assert part in error
+    assert report == {"/sensors/core": {"unread": 2}}
+    # The rosbags for Python 3.8 takes metadata.yaml for the index, so only the end tells.
+    told = [FAIL] if "mcap" in STORAGES else []
+    assert [finding.level for finding in BagConfig(path=path).check("a")] == [*told, OK]
+
+
+def write_mcap(path: Path, *topics: tuple[str, str, str, bytes], count: int = 1) -> Path:
+    """An MCAP file with messages of each topic: its name, type, definition and bytes."""
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file, chunk_size=100, compression=mcap.writer.CompressionType.NONE)
+        writer.start(profile="ros2", library="test")
+        for topic, kind, definition, _ in topics:
+            schema = writer.register_schema(kind, "ros2msg", definition.encode())
+            writer.register_channel(topic, "cdr", schema)
+        for i in range(count):
+            for channel, (_, _, _, raw) in enumerate(topics, 1):
+                writer.add_message(channel, START + i, raw, START + i)
+        writer.finish()
+    return path
+
+
+SERVO = ("/servo", "std_msgs/msg/Float64", "float64 data\n", b"\0\1\0\0" + bytes(8))
+needs_mcap = pytest.mark.skipif(
+    "mcap" not in STORAGES, reason="the rosbags for Python 3.8 needs metadata.yaml"
+)
+
+
+@needs_mcap
+def test_a_chunk_that_the_index_leaves_out_is_told(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", SERVO, count=20)
+    content = bytearray(path.read_bytes())
+    # The record of the last chunk in the summary becomes one that no reader knows.
+    index = content.rindex(b"\x08" + (74).to_bytes(8, "little"))
+    content[index] = 0x7F
+    path.write_bytes(content)
+    samples, error, report = refused(path, topics=(("/servo", "servo"),))
+    lost = 20 - len(samples)
+    assert 0 < lost < 20
+    assert f"topic /servo: {20 - lost} messages were read, the index has 20" in error
+    assert report == {"/servo": {"unread": lost}}
+
+
+@needs_mcap
+def test_a_topic_that_cannot_be_read_is_left_out_alone(tmp_path: Path) -> None:
+    wide = ("/wide", "lab_msgs/msg/Wide", "wstring name\n", b"\0\1\0\0\1\0\0\0a\0\0\0")
+    swapped = ("/swapped", SERVO[1], SERVO[2], b"\0\0\0\0" + bytes(8))
+    short = ("/short", SERVO[1], SERVO[2], b"\0\1\0\0" + bytes(2))
+    path = write_mcap(tmp_path / "a.mcap", SERVO, wide, swapped, short, count=3)
+    topics = tuple((topic, topic[1:]) for topic in ("/servo", "/wide", "/swapped", "/short"))
+    samples, error, report = refused(path, topics=topics)
+    assert [stream for stream, _, _ in samples] == ["servo"] * 3
+    for part in (
+        "/wide",
+        "wstring",
+        "topic /swapped: messages do not fit",
+        "little-endian",
+        "topic /short: ",
+    ):
+        assert part in error
+    assert report == {topic: {"unread": 3} for topic in ("/wide", "/swapped", "/short")}
+
+
+@needs_mcap
+def test_bounded_texts_and_arrays_and_old_names_of_types_are_read(tmp_path: Path) -> None:
+    kind, definition = "lab_msgs/msg/Named", "string<=22 name\nfloat64[<=4] xs\nstring<=5[<=3] tags\n"
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, kind))
+    message = store.types[kind](name="hi", xs=np.array([1.0, 2.0]), tags=["a"])
+    raw = bytes(store.serialize_cdr(message, kind))
+    old = ("/servo", "std_msgs/Float64", *SERVO[2:])
+    path = write_mcap(tmp_path / "a.mcap", ("/named", kind, definition, raw), old)
+    samples = play(path, topics=(("/named", "named"), ("/servo", "servo")))
+    assert [(stream, dict(values)) for stream, _, values in samples] == [
+        ("named", {"name": "hi", "xs.0": 1.0, "xs.1": 2.0, "tags.0": "a"}),
+        ("servo", {"data": 0.0}),
+    ]

@@ -367,3 +367,12 @@ def test_whatever_stands_in_it_the_good_rows_come_out(tmp_path: Path, junk: byte
     junk = junk.replace(b";", b"").replace(b"\t", b"")
     path.write_bytes(f"{HEADER}\n{row(1000)}\n".encode() + junk + f"\n{row(1200)}\n".encode())
     assert [t - NOW for _, t, _ in play(path)] == [0, 200_000]
+
+
+def test_a_line_and_a_header_without_an_end_are_bounded(tmp_path: Path) -> None:
+    samples, report = play_and_report(write(tmp_path, row(1000), "\0" * 1_000_000, row(1100)))
+    assert len(samples) == 2
+    assert report["skipped"] == {"columns": 1}
+    wide = ";".join(["ms_today", *(f"x{i}" for i in range(200_000))])
+    with pytest.raises(SourceError, match=r"ride\.csv: it must have at most 4,096 columns"):
+        play(write(tmp_path, row(1000), header=wide))

@@ -1,0 +1,191 @@
+"""Opens the bags of ROS 1 and ROS 2 with the package rosbags, and reads their messages as they were stored.
+
+Nothing is left out in silence: `Reader.counts` has what the files and metadata.yaml say that they hold. The
+files of a ROS 2 folder are read each by its own index, because the library skips the connections that
+metadata.yaml describes in other words. A chunk or message may inflate to `MAX_INFLATED` bytes, since a few
+bytes can stand for gigabytes.
+"""
+
+from __future__ import annotations
+
+import bz2
+import shutil
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any, Callable, Iterator, Mapping, Sequence
+
+from iort_agent.errors import SourceError
+from iort_agent.sources.recording.unreadable import TooLargeError, check_kind, wrapped
+
+# Recorders write chunks of about a megabyte; a chunk is larger only for a message that is.
+MAX_INFLATED = 64 * 1024 * 1024
+_READ = 1024 * 1024
+# Where a file counts what it holds.
+INDEX = "the index"
+
+
+class Reader:
+    """A recording, open for reading. The library's errors come as `SourceError`."""
+
+    def __init__(self, path: Path) -> None:
+        check_kind(path)
+        # The library for Python 3.8 opens folders only, and people name the file in it.
+        in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
+        self._path, self._file = path, path.parent if in_folder else path
+        self.is2 = path.suffix != ".bag"
+        self._parts: list[Any] = []
+
+    def open(self) -> None:
+        """Open all files and read their indexes."""
+        try:
+            # Only a robot that plays recordings needs the library: pip install iort-agent[bag].
+            from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - optional
+            from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415 - optional
+        except ImportError as error:
+            raise SourceError(
+                "playing a bag needs the package rosbags: pip install 'iort-agent[bag]'"
+            ) from error
+        if self.is2:
+            _bound_mcap()
+            if _zstd() is not None:
+                self._check_room()
+        with wrapped(f"{self._path}: cannot be opened"):
+            self._reader: Any = Reader2(self._file) if self.is2 else Reader1(self._file)
+            self._reader.open()
+        if not self.is2:
+            _bound_bag(self._reader.chunks)
+        # A file, the files of a folder, or all that the library for Python 3.8 has.
+        storage = getattr(self._reader, "storage", self._reader)
+        self._parts = list(getattr(storage, "storages", [self._reader]))
+
+    def close(self) -> None:
+        """Close all files."""
+        self._reader.close()
+
+    @property
+    def start_ns(self) -> int:
+        """The time of the first message."""
+        parts = (part if hasattr(part, "start_time") else part.metadata for part in self._parts)
+        return min(int(part.start_time) for part in parts)
+
+    @property
+    def connections(self) -> list[Any]:
+        """What the library knows of each connection of the files."""
+        return [connection for part in self._parts for connection in part.connections]
+
+    def counts(self) -> Mapping[str, Mapping[str, int]]:
+        """Where messages are counted -> topic -> the number of its messages."""
+        counts = {INDEX: _counts(self.connections)}
+        if not self.is2:
+            counts["the list of chunks"] = {name: info.msgcount for name, info in self._reader.topics.items()}
+        elif self._file.is_dir():
+            counts["metadata.yaml"] = _counts(self._reader.connections)
+        return counts
+
+    def messages(self, wanted: Callable[[Any], bool]) -> Iterator[tuple[Any, int, bytes]]:
+        """The messages of the wanted connections: connection, time of recording, and bytes as published."""
+        mode = getattr(self._reader, "compression_mode", None) if self.is2 else None
+        for part in self._parts:
+            connections = [connection for connection in part.connections if wanted(connection)]
+            if not connections:
+                continue
+            iterator = iter(part.messages(connections))
+            while True:
+                with wrapped(f"{self._path}: is damaged"):
+                    message = next(iterator, None)
+                    if message is None:
+                        break
+                    connection, t_ns, raw = message
+                    # The library inflates them itself only if it reads the folder as a whole.
+                    if mode == "message" and part is not self._reader:
+                        raw = inflate("zstd", raw)
+                yield connection, t_ns, bytes(raw)
+
+    def _check_room(self) -> None:
+        """Refuse files that would fill the disk when the library inflates them, into a temporary folder."""
+        files = sorted(self._file.glob("*.zst*")) if self._file.is_dir() else []
+        room = shutil.disk_usage(tempfile.gettempdir()).free // 2 if files else 0
+        for path in files:
+            with wrapped(f"{path}: cannot be inflated"), path.open("rb") as file:
+                for data in inflated("zstd", iter(lambda: file.read(_READ), b"")):
+                    room -= len(data)
+                    if room < 0:
+                        raise SourceError(
+                            f"{path}: inflates to more than half of what is free in {tempfile.gettempdir()}"
+                        )
+
+
+def inflate(kind: str, data: bytes) -> bytes:
+    """Inflate a chunk or a message; raises `TooLargeError` beyond `MAX_INFLATED`."""
+    parts, room = [], MAX_INFLATED
+    for part in inflated(kind, iter([data])):
+        room -= len(part)
+        if room < 0:
+            raise TooLargeError(
+                f"a chunk of {len(data):,} bytes inflates to more than {MAX_INFLATED:,}: write the recording "
+                "again, in smaller chunks"
+            )
+        parts.append(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def inflated(kind: str, pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """Inflate data a part at a time; ``kind`` is bz2, lz4 or zstd. Raises `EOFError` if it ends early."""
+    one: Any = None
+    for data in pieces:
+        while data or (one is not None and not one.needs_input):
+            # What follows the end of a frame is another one.
+            one = _decompressor(kind) if one is None else one
+            part = one.decompress(data, MAX_INFLATED + 1)
+            data = b""  # noqa: PLW2901 - the rest is in the decompressor
+            if part:
+                yield part
+            if one.eof:
+                data, one = one.unused_data or b"", None  # noqa: PLW2901 - as above
+    if one is not None:
+        raise EOFError("compressed data ended before its end-of-stream marker")
+
+
+def _decompressor(kind: str) -> Any:
+    """A decompressor of the standard library's kind; all three are used alike."""
+    if kind == "bz2":
+        return bz2.BZ2Decompressor()
+    if kind == "lz4":
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]  # noqa: PLC0415 - no types
+
+        return LZ4FrameDecompressor()
+    return _zstd().ZstdDecompressor()
+
+
+def _zstd() -> Any:
+    """The module that the library itself uses; None for Python 3.8, whose own cannot be bounded."""
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - optional
+
+    return getattr(storage_mcap, "zstd", None)
+
+
+def _bound_mcap() -> None:
+    """Let the library inflate the chunks of MCAP within the bound, by its table of compressions."""
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - optional
+
+    for kind in ("lz4", "zstd"):
+        if kind != "zstd" or _zstd() is not None:
+            storage_mcap.DECOMPRESSORS[kind] = lambda data, _size, kind=kind: inflate(kind, data)
+
+
+def _bound_bag(chunks: dict[int, Any]) -> None:
+    """Let the library inflate the chunks of ROS 1 within the bound."""
+    from lz4.frame import decompress  # noqa: PLC0415 - optional
+
+    for at, chunk in chunks.items():
+        for kind, unbounded in (("bz2", bz2.decompress), ("lz4", decompress)):
+            if chunk.decompressor is unbounded:
+                chunks[at] = chunk._replace(decompressor=lambda data, kind=kind: inflate(kind, data))
+
+
+def _counts(connections: Sequence[Any]) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for connection in connections:
+        counts[connection.topic] += connection.msgcount
+    return dict(counts)
