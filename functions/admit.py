@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# Both attempts, at their slowest, fit into the function's own timeout, and that fits into AWS' 5 s.
-_CONFIG = Config(connect_timeout=1, read_timeout=1, retries={"mode": "standard", "total_max_attempts": 2})
+# Three calls, at their slowest, fit into the function's own timeout, and that fits into AWS' 5 s. A robot asks again.
+_CONFIG = Config(connect_timeout=0.6, read_timeout=0.6, retries={"total_max_attempts": 1})
 _MAX_TEXT = 800
 SPENT = "another certificate has its admission: `iort robots claim` opens it again"
 # AWS IoT waits 5 s for this function and then registers. An older admission has succeeded or failed.
@@ -168,9 +168,8 @@ def _dynamodb() -> DynamoDBClient:
 
 def _status(certificate: str) -> str | None:
     """A certificate's status at AWS IoT; None if it was deleted."""
-    # Its model is large and rarely needed. A single attempt, since the robot asks again.
-    config = _CONFIG.merge(Config(retries={"total_max_attempts": 1}))
-    iot = cast("IoTClient", botocore.session.get_session().create_client("iot", config=config))
+    # Its model is large and rarely needed.
+    iot = cast("IoTClient", botocore.session.get_session().create_client("iot", config=_CONFIG))
     try:
         answer = iot.describe_certificate(certificateId=certificate)
     except iot.exceptions.ResourceNotFoundException:

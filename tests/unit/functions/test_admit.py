@@ -226,10 +226,10 @@ def test_the_slowest_answer_is_in_time(synthesized):
         if function["Handler"] == "functions.admit.handler"
     )
     config = admit._CONFIG
-    attempts = config.retries["total_max_attempts"]
-    # botocore waits up to a second, at random, before a second attempt.
-    slowest_s = attempts * max(config.connect_timeout, config.read_timeout) + (attempts - 1)
-    assert slowest_s < timeout_s < 5
+    # Botocore waits up to a second, at random, before a second attempt.
+    assert config.retries["total_max_attempts"] == 1
+    # Take the admission, ask for the status of the certificate that has it, take it instead of that.
+    assert 3 * (config.connect_timeout + config.read_timeout) < timeout_s < 5
 
 
 NOW_MS = 1_800_000_000_000
