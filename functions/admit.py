@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# Three calls, at their slowest, fit into the function's own timeout, and that fits into AWS' 5 s. A robot asks again.
+# Three calls, at their slowest, fit into the function's timeout, and that into AWS' 5 s. A robot asks again.
 _CONFIG = Config(connect_timeout=0.6, read_timeout=0.6, retries={"total_max_attempts": 1})
 _MAX_TEXT = 800
 SPENT = "another certificate has its admission: `iort robots claim` opens it again"
