@@ -17,6 +17,7 @@ from iort_analysis.drives.cleaning import MANY_WILD, wild_share
 from iort_analysis.drives.drive import Drive
 from iort_analysis.drives.motion import moving, vescs_of
 from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
+from iort_analysis.mining.gain import with_gain
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
@@ -49,7 +50,7 @@ def analyse(
 
     It never fails because of them: what cannot be computed is in the result's ``missing``, with the reason.
     """
-    drive = build(key, streams, vehicle, known)
+    drive = with_gain(build(key, streams, vehicle, known))
     found = merge(_mined(name, m, drive) for name, m in miners.items())
     if wild := _wild(drive):
         reasons = {name: f"{reason}; {wild}" for name, reason in found.missing.items()}

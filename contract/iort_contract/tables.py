@@ -60,6 +60,9 @@ ITEM_BASE64 = "base64Item"
 VEHICLE_CACHE_S = 60.0
 # Registry: the streams that Lambda 2 has seen of a robot.
 STREAMS = "streams"
+# Registry: when somebody gave the robot's gain. Without it the default is a guess, with which the page shows
+# speeds, and on which the analysis does not rest.
+GAIN_SET_MS = "speed_to_erpm_gain_set_ms"
 # Registry, beside the vehicle parameters: a robot's connection, from the broker's lifecycle events. Times are
 # the broker's; the certificate is the one that the robot connected with.
 ONLINE, LAST_SEEN_MS = "online", "last_seen_ms"

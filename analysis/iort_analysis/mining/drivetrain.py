@@ -12,6 +12,7 @@ only the ratios to the force of an ampere and to the mass are known.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
 from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, fit, propagated
+from iort_contract.catalog.analysis.car import KNOWN
 from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
@@ -48,6 +50,10 @@ _FORCES = (
     "drivetrain_efficiency",
     "brake_drag_n",
 )
+# An efficiency may come out so far above 1 by chance.
+_SHARES, _BEYOND_ONE = frozenset({"drivetrain_efficiency"}), 0.1
+# What the motor moves is the car and what turns in it; with a load, it is some times what was registered.
+_LEAST_OF_KNOWN, _MOST_OF_KNOWN = 0.5, 5.0
 _RATIOS = ("acceleration_per_a_mps2", "friction_per_mass_mps2")
 
 
@@ -62,7 +68,8 @@ def mine(drive: Drive) -> Mined:
         estimates[_GAIN] = gain.of(0, "erpm per m/s")
         registered = float(gain.coefficients[0])
     if registered is None:
-        reason = f"needs the gain: {missing[_GAIN]}; or register it with the robot's vehicle"
+        default = f", also if it is {drive.known[_GAIN]:g}, the default" if _GAIN in drive.known else ""
+        reason = f"needs the gain: {missing[_GAIN]}; or register the car's own{default}: iort robots set"
         return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), reason)})
     motion = _fit_motion(drive, registered)
     if isinstance(motion, str):
@@ -72,7 +79,37 @@ def mine(drive: Drive) -> Mined:
         if isinstance(motor, str)
         else _forces(drive, motion, motor, gain, registered)
     )
+    forces = {**found.estimates, "drivetrain_efficiency": _efficiency(motion)}
+    if impossible := _impossible(forces, drive.known.get("mass_kg")):
+        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), impossible)})
     return Mined({**estimates, **found.estimates}, {**missing, **found.missing})
+
+
+def _impossible(forces: Mapping[str, Estimate], known_kg: float | None) -> str:
+    """Why no car has these forces; empty if one may. They come of one fit, so one of them tells of all."""
+    limits = dict.fromkeys(("friction_n", "brake_drag_n"), (0.0, math.inf))
+    limits["drivetrain_efficiency"] = (0.0, 1.0)
+    limits["effective_mass_kg"] = (
+        (KNOWN["mass_kg"].least, KNOWN["mass_kg"].most)
+        if known_kg is None
+        else (_LEAST_OF_KNOWN * known_kg, _MOST_OF_KNOWN * known_kg)
+    )
+    for name, (least, most) in limits.items():
+        estimate = forces.get(name)
+        if estimate is None:
+            continue
+        if (
+            estimate.high < least
+            or estimate.low > most
+            or (name in _SHARES and estimate.value > most + _BEYOND_ONE)
+        ):
+            limit = f"at least {least:g}" if estimate.value < least else f"at most {most:g}"
+            unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+            return (
+                f"impossible: {name} would be {estimate.value:.3g}{unit}, and is {limit}{unit} in any car: "
+                "look at the gain and at the motor's current"
+            )
+    return ""
 
 
 def _ratios(drive: Drive, motion: Fit, gain: float) -> dict[str, Estimate]:
@@ -178,7 +215,7 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
             *parts,
             unit="N s2/m2",
         ),
-        "drivetrain_efficiency": propagated(lambda c: math.sqrt(max(c[0] / c[1], 0.0)), moved, unit="1"),
+        "drivetrain_efficiency": _efficiency(motion),
         "brake_drag_n": propagated(lambda c: force_n(c, 6), *parts, unit="N"),
     }
     missing = {}
@@ -191,6 +228,12 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
             value=moved_kg.value - known_kg, low=moved_kg.low - known_kg, high=moved_kg.high - known_kg
         )
     return Mined(estimates, missing)
+
+
+def _efficiency(motion: Fit) -> Estimate:
+    """By what an ampere does while the motor drives, and while it brakes."""
+    moved = (motion.coefficients, motion.covariance)
+    return propagated(lambda c: math.sqrt(max(c[0] / c[1], 0.0)), moved, unit="1")
 
 
 def _slipped(motion: Array) -> float:

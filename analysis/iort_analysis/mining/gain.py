@@ -1,17 +1,27 @@
-"""The motor's speed for each m/s of the car, where the car's position is measured too.
+"""The motor's speed for each m/s of the car, where a second source tells how fast the car is.
 
-The way between two positions is the chord, along the mean of both headings, and longer by the arc of the turn
-between them. Noise of a position adds nothing to it, unlike to the length of the path.
+The best source is a pose with a heading, then a receiver's speed over ground, positions alone, and last the
+speed that the motor's own driver calculates: it says with which gain, and no more.
+
+With a heading, the way between two positions is the chord, along the mean of both headings, and longer by the
+arc of the turn between them. Noise of a position adds nothing to it, unlike to the length of the path.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
+from iort_analysis.drives.transform import with_derived
+from iort_analysis.mining.laps.path import path_of
 from iort_analysis.statistics.fitting import Fit, fit
+from iort_analysis.statistics.intervals import sides
+from iort_contract.catalog.derived import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -22,16 +32,94 @@ _WINDOW_S, _LEAST_M, _LEAST_DRIVE_M = 1.0, 0.3, 20.0
 _BLOCKS = 10
 # A position that is this close to the motor's distance was calculated from it.
 _SAME_M = 5e-4
+# Speeds in m/s, by the last parts of their names: of a receiver, and calculated from the motor's, whose gain
+# somebody has entered: half the interval of what a wheel differs from it.
+_OVER_GROUND, _CALCULATED = ("gnss_gVel",), ("twist.twist.linear.x", "speed_meters_per_sec")
+_ENTERED = 0.03
+# Positions alone cut corners, by some share of the way.
+_CUT = 0.01
 
 
 def fit_gain(drive: Drive) -> Fit | str:
     """The fit whose only coefficient is the gain in erpm per m/s, over the drive; or the reason for none."""
     speed = drive.of(drive.vesc, "speed")
-    if drive.pose is None or speed is None:
-        return "needs the motor's speed and a second source of speed, such as a stream with the car's pose"
+    if speed is None:
+        return "needs the motor's speed"
+    ways: list[Callable[[], Fit | str | None]] = [
+        lambda: _by_pose(drive, speed),
+        lambda: _by_speed(drive, speed, _OVER_GROUND, 0.0),
+        lambda: _by_positions(drive, speed),
+        lambda: _by_speed(drive, speed, _CALCULATED, _ENTERED),
+    ]
+    reasons = []
+    for way in ways:
+        found = way()
+        if isinstance(found, Fit):
+            return found
+        if found is not None:
+            reasons.append(found)
+    if reasons:
+        return reasons[0]
+    return "needs a second source of speed, such as a stream with the car's pose or positions"
+
+
+def with_gain(drive: Drive) -> Drive:
+    """The drive; one of a car whose gain nobody has registered with the gain that the drive itself tells."""
+    found = None if drive.vehicle is not None else fit_gain(drive)
+    if not isinstance(found, Fit) or drive.vesc is None:
+        return drive
+    vehicle = Vehicle(float(found.coefficients[0]))
+    return replace(drive, vehicle=vehicle, samples=with_derived(drive.samples, drive.vesc, vehicle))
+
+
+def _by_speed(drive: Drive, speed: Array, names: tuple[str, ...], error: float) -> Fit | str | None:
+    """By the first of these fields of a speed, whose gain has an ``error`` of its own; None without one."""
+    columns = drive.samples.columns
+    for ending in names:
+        for name in sorted(columns):
+            if name.endswith(f".{ending}") and not bool(np.isnan(columns[name]).all()):
+                return _compared(drive, speed, columns[name], error)
+    return None
+
+
+def _compared(drive: Drive, speed: Array, mps: Array, error: float) -> Fit | str:
+    times_us = drive.samples.times_us
+    grid_us = np.arange(times_us[0], times_us[-1], round(_WINDOW_S * 1e6))
+    turned, way_m = (_integral(drive, values, grid_us) for values in (speed, mps))
+    way_m[np.abs(way_m) < _LEAST_M] = np.nan
+    return _of_way(turned, way_m, error)
+
+
+def _by_positions(drive: Drive, speed: Array) -> Fit | str | None:
+    """By the distance between positions that have no heading; None without them."""
+    path = (
+        None if drive.pose is not None and "heading" in drive.streams[drive.pose].columns else path_of(drive)
+    )
+    if path is None or isinstance(path, str):
+        return None
+    times_us = path.start_us + np.round(path.seconds * 1e6).astype(np.int64)
+    return _of_way(_integral(drive, np.abs(speed), times_us), np.diff(path.passed_m), _CUT)
+
+
+def _of_way(turned: Array, way_m: Array, error: float) -> Fit | str:
+    """The gain by the motor's way in erpm seconds and the car's in metres, with an ``error`` as a share."""
+    if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
+        return f"needs {_LEAST_DRIVE_M:g} m of driving with a second source of speed"
+    found = fit([turned], way_m, blocks=_BLOCKS)
+    if found is None or not found.coefficients[0]:
+        return "the drive is too short for the gain"
+    gain = 1 / found.coefficients
+    covariance = found.covariance * gain**4 + (error / sides() * gain) ** 2
+    return found._replace(coefficients=gain, covariance=covariance)
+
+
+def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
+    """By the way along the heading of a pose; None without one."""
+    if drive.pose is None:
+        return None
     pose = drive.streams[drive.pose]
     if "heading" not in pose.columns:
-        return f"needs the heading in the stream {drive.pose}"
+        return None
     known = np.isfinite(pose.columns["x"] + pose.columns["y"] + pose.columns["heading"])
     times_us = pose.times_us[known]
     if len(times_us) < 2:

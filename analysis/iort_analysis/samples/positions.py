@@ -20,6 +20,8 @@ _METRES = (
 # NavSatFix and geographic_msgs have latitude, VESC Tool's logs gnss_lat.
 _LATITUDE = re.compile(r"((?:.*[._])?)(?:lat(itude)?)")
 _DEGREES = re.compile(r"(?:.*[._])?(?:lat(itude)?|lon(gitude)?)(?:_(?:min|mean|max|last))?")
+# Beside a latitude: how far off it may be, in metres.
+_ACCURACIES = ("hAcc", "h_acc", "horizontal_accuracy", "accuracy")
 # The mean radius of the Earth, IUGG.
 _EARTH_M = 6_371_008.8
 
@@ -61,6 +63,26 @@ def fixes(columns: Mapping[str, Column], fields: PositionFields) -> tuple[Column
         if status is not None and status.dtype.kind == "f":
             known &= ~(status < 0)
     return np.where(known, latitude, np.nan), np.where(known, longitude, np.nan)
+
+
+def accuracy_m(columns: Mapping[str, Column], fields: PositionFields) -> Column | None:
+    """How sure the receiver is of each position, in metres; None if it does not say.
+
+    VESC Tool's logs have gnss_hAcc, NavSatFix has variances to the east and north.
+    """
+    prefix = fields.names[0].removesuffix("latitude").removesuffix("lat")
+    for name in (f"{prefix}{known}" for known in _ACCURACIES):
+        column = columns.get(name)
+        if column is not None and column.dtype.kind == "f":
+            return column
+    east, north = (columns.get(f"{prefix}position_covariance.{i}") for i in (0, 4))
+    kind = columns.get(f"{prefix}position_covariance_type")
+    if east is None or north is None or east.dtype.kind != "f" or north.dtype.kind != "f":
+        return None
+    with np.errstate(invalid="ignore"):
+        found = np.sqrt((east + north) / 2)
+    # Type 0 says that the covariance is not known.
+    return found if kind is None or kind.dtype.kind != "f" else np.where(kind > 0, found, np.nan)
 
 
 def local_metres(latitude: Column, longitude: Column, origin: tuple[float, float]) -> tuple[Column, Column]:

@@ -9,6 +9,7 @@ from typing import Any, Collection, Iterable, Iterator, Mapping, Sequence
 
 from iort_contract.catalog.entries import Derived
 from iort_contract.limits import Value
+from iort_contract.tables import GAIN_SET_MS
 
 _NUMBERS = {int, float}
 
@@ -23,6 +24,15 @@ class Vehicle:
 
 # The F1TENTH stack's vesc.yaml.
 F1TENTH = Vehicle(speed_to_erpm_gain=4614.0)
+
+
+def registered_vehicle(row: Mapping[str, Any]) -> Vehicle | None:
+    """A car's own parameters, by its row of the registry; the default that nobody has touched is none."""
+    gain = float(row.get("speed_to_erpm_gain") or 0.0)
+    vehicle = Vehicle(gain, float(row.get("speed_to_erpm_offset") or 0.0))
+    return vehicle if gain and (vehicle != F1TENTH or GAIN_SET_MS in row) else None
+
+
 _PARAMETERS = frozenset(parameter.name for parameter in fields(Vehicle))
 
 DERIVED = {

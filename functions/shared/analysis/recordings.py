@@ -13,7 +13,7 @@ from functions.shared import clients
 from functions.shared.analysis.expired import Expired
 from functions.shared.environment import variables
 from iort_contract.archive import ArchiveTable
-from iort_contract.catalog.derived import Vehicle
+from iort_contract.catalog.derived import Vehicle, registered_vehicle
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -63,10 +63,8 @@ class Recordings:
         answer = self._client.get_item(TableName=self._robots, Key={ROBOT: {"S": robot}}, ConsistentRead=True)
         row = plain(answer.get("Item", {}))
         known = {name: float(value) for name, value in row.items() if _is_number(value)}
-        gain = known.get("speed_to_erpm_gain", 0.0)
         streams = sorted({VESC_STREAM, *row.get(STREAMS, ())} - OWN_STREAMS)
-        vehicle = Vehicle(gain, known.get("speed_to_erpm_offset", 0.0)) if gain else None
-        return Registered(streams, vehicle, known)
+        return Registered(streams, registered_vehicle(known), known)
 
     def items(
         self, robot: str, stream: str, start_us: int, end_us: int, *, page_items: int | None = None

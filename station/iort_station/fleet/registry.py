@@ -21,6 +21,7 @@ from iort_contract.tables import (
     ADMITTED_MS,
     CONNECTED_MS,
     DISCONNECTED_MS,
+    GAIN_SET_MS,
     MOVED_FROM,
     ONLINE,
     ROBOT,
@@ -31,6 +32,13 @@ from iort_station.errors import StationError, UsageError, unknown
 
 # The vehicle parameters of a row whose owner gives none.
 F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
+
+
+def given(vehicle: Mapping[str, float]) -> dict[str, float]:
+    """Vehicle parameters as somebody gave them: beside a gain its time is noted, since the analysis trusts no
+    default."""
+    noted = {GAIN_SET_MS: time.time_ns() // 1_000_000} if "speed_to_erpm_gain" in vehicle else {}
+    return {**vehicle, **noted}
 
 
 def checked(robot: str) -> str:

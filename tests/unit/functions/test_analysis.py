@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from functions import analyse, evaluate, plan, present
+from functions.shared.analysis import recordings
 from functions.shared.analysis.kept import Kept
 from iort_analysis.archive.tables import read_table
 from iort_analysis.archive.writing import write_hour
@@ -21,6 +22,7 @@ from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.archive import ArchivedHour, hour_of
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, SERIOUS
+from iort_contract.catalog.derived import Vehicle
 from iort_contract.cloud import drive_prefix, plan_key
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
@@ -510,6 +512,23 @@ def test_a_robot_that_records_and_never_moves_is_a_finding(cloud: Deployed) -> N
     # As soon as a drive is recorded, it alone counts.
     cloud.record(later({"vesc": vesc}, 600), first_seq=120)
     assert [(one["start_us"] - START_US) // S for one in cloud.run()] == [600]
+
+
+def test_a_default_gain_that_nobody_has_touched_is_not_registered(cloud: Deployed) -> None:
+    """The skateboard's log has its own speed, which tells its gain."""
+    vesc = streams(120)["vesc"]
+    log = {**vesc.columns, "speed_meters_per_sec": vesc.columns["speed"] / 1062}
+    cloud.register("default", speed_to_erpm_gain=4614, speed_to_erpm_offset=0)
+    cloud.register("own", speed_to_erpm_gain=4614, speed_to_erpm_offset=0, speed_to_erpm_gain_set_ms=1)
+    cloud.register("other", speed_to_erpm_gain=1060)
+    known = {robot: recordings.deployed().registered(robot).vehicle for robot in ("default", "own", "other")}
+    cloud.record({"vesc": Block(vesc.times_us, log)}, robot="default")
+
+    cloud.run(robots=["default"])
+
+    assert known == {"default": None, "own": Vehicle(4614.0), "other": Vehicle(1060.0)}
+    (drive,) = cloud.table.drives("default")
+    assert drive.estimates["speed_to_erpm_gain"].value == pytest.approx(1062)
 
 
 def test_the_row_of_a_drive_with_thousands_of_null_fields_fits_in_an_item() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from iort_analysis.statistics.intervals import mean_of, sides
 from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PARAMETERS, PLACES_TABLE
 from iort_contract.messages.analysis.findings import Estimate
 
+# What is above zero in every lap; and how sure laps are whose interval says otherwise.
+_POSITIVE, _UNSURE = ("lap_best_s", "lap_mean_s", "lap_distance_m"), 0.5
 _NAMES = ("lap_best_s", "lap_mean_s", "lap_distance_m", "lap_energy_wh", "lap_energy_wh_per_km")
 
 
@@ -24,6 +27,11 @@ def mine(drive: Drive) -> Mined:
     if isinstance(found, str):
         return Mined(missing=dict.fromkeys(_NAMES, f"no laps: {found}"))
     estimates, speed = dict(_estimates(found)), speed_mps(drive, found)
+    spread = _spread(found)
+    # A mean that may as well be below zero is none: such laps differ as much as ways that are no laps.
+    unsure = [name for name in _POSITIVE if name in estimates and estimates[name].low <= 0]
+    if unsure:
+        found = replace(found, confidence=min(found.confidence, _UNSURE))
     missing = {
         name: "needs the car's parameters"
         if name == "lap_distance_m"
@@ -31,11 +39,17 @@ def mine(drive: Drive) -> Mined:
         for name in _NAMES
         if name not in estimates
     }
+    missing |= dict.fromkeys(unsure, f"the laps differ too much: {spread}")
     return Mined(
-        estimates,
+        {name: one for name, one in estimates.items() if name not in unsure},
         missing,
         tables={LAPS_TABLE: _laps_table(found, speed), PLACES_TABLE: _places_table(found, speed)},
     )
+
+
+def _spread(laps: Laps) -> str:
+    times = laps.time_s[laps.complete]
+    return f"{len(times)} of {times.min():.1f} s to {times.max():.1f} s"
 
 
 def _estimates(laps: Laps) -> Iterator[tuple[str, Estimate]]:

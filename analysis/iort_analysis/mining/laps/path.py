@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
-from iort_analysis.samples.positions import fixes, local_metres, position_fields
+from iort_analysis.samples.positions import accuracy_m, fixes, local_metres, position_fields
 
 Floats = NDArray[np.float64]
 _LEAST_POSITIONS = 30
@@ -20,6 +22,16 @@ _APART_NOISES = 20
 _THIRD_DIFFERENCE = math.sqrt(20)
 # A median of absolute values, as a standard deviation.
 _MAD = 1.4826
+# A receiver that is less sure of its position than this does not tell on which side of a street the car is.
+_WORST_M = 10.0
+# An area this many times as large as the positions' errors is one in which the car moved.
+_LEAST_EXTENT = 5.0
+# A car moves so much further than its motor turns at most, also with a gain that is somewhat off; and where
+# nobody knows the motor's speed, it is no faster than this. A position is as far off as the receiver says, a
+# few times; without a word of it, by this.
+_SLIDES, _FASTEST_MPS, _ERRORS, _SLACK_M = 1.5, 60.0, 3.0, 1.0
+# So many of the positions must be where the car can be.
+_LEAST_PLAUSIBLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,7 @@ def path_of(drive: Drive) -> Path | str:
     if stream is None:
         return "no stream has a position"
     block, fields = drive.streams[stream], placed[stream]
+    accuracy = accuracy_m(block.columns, fields)
     if fields.degrees:
         latitude, longitude = fixes(block.columns, fields)
         known = np.flatnonzero(~np.isnan(latitude))
@@ -67,20 +80,82 @@ def path_of(drive: Drive) -> Path | str:
         x, y = local_metres(latitude, longitude, (float(latitude[known[0]]), float(longitude[known[0]])))
     else:
         x, y = (block.columns[name].astype(np.float64) for name in fields.names)
-    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    there = np.isfinite(x) & np.isfinite(y)
+    if accuracy is not None:
+        with np.errstate(invalid="ignore"):
+            there &= ~(accuracy > _WORST_M)
+        if not there.any():
+            return f"{stream} is right to {_WORST_M:g} m at no time"
+    known = np.flatnonzero(there)
     times = block.times_us[known]
     later = np.append(True, times[1:] > times[:-1])[: len(known)]
     known, times = known[later], times[later]
     if len(known) < _LEAST_POSITIONS:
         return f"{stream} has {len(known)} positions, at least {_LEAST_POSITIONS} are needed"
     x, y = x[known], y[known]
+    errors_m = None if accuracy is None else accuracy[known]
+    error_m = 0.0 if errors_m is None else float(np.nan_to_num(np.nanmedian(errors_m)))
+    reach_m = _reach_m(drive, times)
+    plausible = _plausible(x, y, reach_m, max(_SLACK_M, _ERRORS * error_m))
+    if plausible.mean() < _LEAST_PLAUSIBLE:
+        return (
+            f"{1 - plausible.mean():.0%} of the positions of {stream} are further apart than the car can "
+            "move: they jump, or the gain is not the car's"
+        )
+    x, y, times = x[plausible], y[plausible], times[plausible]
     noise_m = float(np.hypot(_noise(x), _noise(y))) / math.sqrt(2)
     spans = [np.diff(np.percentile(each, [1, 99]))[0] for each in (x, y)]
     extent_m = float(np.hypot(*spans))
     kept = _apart(x, y, max(_APART_NOISES * noise_m, extent_m / 500))
     if len(kept) < _LEAST_POSITIONS:
         return "the car hardly moved"
-    return Path(int(times[0]), (times[kept] - times[0]) / 1e6, x[kept], y[kept], noise_m, extent_m)
+    if extent_m < _LEAST_EXTENT * error_m:
+        return f"the positions of {stream} are within {extent_m:.3g} m, and right to {error_m:.3g} m"
+    noise_m = max(noise_m, error_m)
+    path = Path(int(times[0]), (times[kept] - times[0]) / 1e6, x[kept], y[kept], noise_m, extent_m)
+    if path.passed_m[-1] > reach_m[-1] + extent_m:
+        way_m = path.passed_m[-1]
+        return f"the positions of {stream} move {way_m:.0f} m, and the motor {reach_m[-1]:.0f} m at most"
+    return path
+
+
+def _reach_m(drive: Drive, times: NDArray[np.int64]) -> Floats:
+    """How far the car can have moved since the first of some times, by the motor's speed."""
+    seconds = (times - times[0]) / 1e6
+    speed = drive.of(drive.vesc, "speed")
+    if drive.vehicle is None or speed is None:
+        return np.asarray(_FASTEST_MPS * seconds, dtype=np.float64)
+    mps = np.abs((speed - drive.vehicle.speed_to_erpm_offset) / drive.vehicle.speed_to_erpm_gain)
+    mps = np.where(np.isfinite(mps), _SLIDES * mps, _FASTEST_MPS)
+    samples_us = drive.samples.times_us
+    took = np.diff(samples_us) / 1e6
+    # In a pause of the motor's samples nobody knows.
+    steps = np.where(np.diff(samples_us) > pause_us(samples_us), _FASTEST_MPS, np.maximum(mps[1:], mps[:-1]))
+    moved = np.append(0.0, np.cumsum(steps * took))
+    first, last = samples_us[0], samples_us[-1]
+    outside = np.maximum(first - times, 0) - np.maximum(times - last, 0)
+    reached = np.interp(times - first, samples_us - first, moved) - _FASTEST_MPS * outside / 1e6
+    return np.asarray(reached - reached[0], dtype=np.float64)
+
+
+def _plausible(x: Floats, y: Floats, reach_m: Floats, slack_m: float) -> NDArray[np.bool_]:
+    """Which positions the car can have had: those of the longest stretch without a jump, and of each stretch
+    before and after it to which the car can have moved meanwhile."""
+    away = np.hypot(np.diff(x), np.diff(y)) > np.diff(reach_m) + slack_m
+    edges = np.concatenate([[0], np.flatnonzero(away) + 1, [len(x)]])
+    stretches = list(pairwise(edges.tolist()))
+    main = int(np.argmax(np.diff(edges)))
+    found = np.zeros(len(x), dtype=np.bool_)
+    for onwards, ordered in ((True, stretches[main:]), (False, stretches[main::-1])):
+        at: int | None = None
+        for first, last in ordered:
+            near, far = (first, last - 1) if onwards else (last - 1, first)
+            if at is None or math.hypot(x[near] - x[at], y[near] - y[at]) <= (
+                abs(reach_m[near] - reach_m[at]) + slack_m
+            ):
+                found[first:last] = True
+                at = far
+    return found
 
 
 def _noise(values: Floats) -> float:

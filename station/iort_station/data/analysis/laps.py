@@ -8,9 +8,11 @@ from typing import NamedTuple
 from iort_analysis.drives.building import build
 from iort_analysis.drives.motion import motion_of
 from iort_analysis.mining import laps
+from iort_analysis.mining.gain import with_gain
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
 from iort_analysis.samples.positions import position_fields
+from iort_contract.catalog.derived import registered_vehicle
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.analysis.findings import DriveKey
 from iort_station.cloud import Cloud
@@ -18,6 +20,7 @@ from iort_station.data import inventory
 from iort_station.data.queries import query
 from iort_station.data.runs import runs
 from iort_station.data.stored.batches import PageProgress
+from iort_station.fleet import registry
 
 
 class RunLaps(NamedTuple):
@@ -63,8 +66,9 @@ def laps_within(
             continue
         read = query(cloud, robot, name, start_us, end_us, progress=progress, most=most)
         streams[name] = Block(read.times_us, dict(read.columns))
-    drive = build(DriveKey(robot, start_us, ""), streams, inventory.vehicle_of(cloud, robot))
-    return laps.mine(drive)
+    vehicle = registered_vehicle(registry.find(cloud, robot) or {})
+    drive = build(DriveKey(robot, start_us, ""), streams, vehicle)
+    return laps.mine(with_gain(drive))
 
 
 def _tells_laps(stream: str, block: Block) -> bool:

@@ -13,6 +13,7 @@ from iort_analysis.errors import AnalysisError
 from iort_analysis.mining import laps
 from iort_analysis.mining.laps.compare import compare
 from iort_analysis.mining.laps.laps import Laps, find_laps
+from iort_analysis.mining.laps.path import path_of
 from iort_analysis.samples.blocks import Block
 from tests.unit.analysis.drives import START_US, Driven, crossed_s, driven, sampled
 
@@ -155,8 +156,82 @@ def test_a_lap_elsewhere_is_not_complete():
     drive = ride().drive
     pose = drive.streams["pose"]
     by = found(drive)
-    fourth = (pose.times_us > by.start_us[3] + 4_000_000) & (pose.times_us < by.start_us[3] + 7_000_000)
-    # Three seconds on another way, 8 m aside.
-    moved = Block(pose.times_us, {**pose.columns, "y": pose.columns["y"] + 8 * fourth})
+    # Three seconds on another way, up to 8 m aside.
+    since_s = np.clip((pose.times_us - by.start_us[3]) / 1e6 - 4, 0, 3)
+    moved = Block(
+        pose.times_us, {**pose.columns, "y": pose.columns["y"] + 8 * np.sin(np.pi * since_s / 3) ** 2}
+    )
     aside = found(replace(drive, streams={**drive.streams, "pose": moved}))
     assert np.flatnonzero(~aside.complete).tolist() == [3]
+
+
+def received(degrees_of: dict[str, np.ndarray], **given) -> dict[str, np.ndarray]:
+    """A receiver's fields of positions in metres."""
+    return {
+        "gnss_lat": 48.1 + np.degrees(degrees_of["y"] / _EARTH_M),
+        "gnss_lon": 11.6 + np.degrees(degrees_of["x"] / _EARTH_M / math.cos(math.radians(48.1))),
+        **given,
+    }
+
+
+def with_receiver(times_us, columns, **given):
+    drive = ride().drive
+    streams = {"vesc": drive.streams["vesc"], "gps": Block(times_us, columns)}
+    return replace(drive, pose=None, streams=streams, **given)
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_positions_that_jump_or_are_unsure_do_not_count(registered):
+    """Two spells of another place, 5 km away; and one that the receiver itself calls unsure."""
+    drive, chance = ride().drive, np.random.default_rng(1)
+    pose = drive.streams["pose"]
+    seconds, place = (pose.times_us - START_US) / 1e6, {name: pose.columns[name].copy() for name in "xy"}
+    place["x"][(seconds > 20) & (seconds < 24) | (seconds > 60) & (seconds < 61)] += 5000
+    unsure = (seconds > 90) & (seconds < 100)
+    place["y"] += np.where(unsure, 0.4 * np.cumsum(chance.normal(0, 1, len(seconds)) * unsure), 0)
+    columns = received(place, gnss_hAcc=np.where(unsure, 40.0, 0.02))
+    known = {} if registered else {"vehicle": None}
+
+    by = found(with_receiver(pose.times_us, columns, **known))
+
+    usual = found(drive)
+    assert np.median(by.time_s) == pytest.approx(np.median(usual.time_s), rel=0.02)
+    assert by.distance_m.max() < 2 * usual.distance_m.max()
+    assert by.complete.mean() >= 0.8
+
+
+def test_positions_that_wander_while_the_car_stands_are_no_way():
+    """A receiver that goes around in circles of 3 m, a metre a second, as the board is carried about."""
+    times = START_US + 100_000 * np.arange(1500)
+    turn = np.arange(1500) / 30
+    place = {"x": 3 * np.cos(turn), "y": 3 * np.sin(turn)}
+    drive = ride().drive
+    slow = drive.samples._replace(
+        columns={**drive.samples.columns, "vesc.speed": drive.samples.columns["vesc.speed"] / 100}
+    )
+    unsure = np.full(1500, 2.0)
+
+    moved = path_of(with_receiver(times, received(place), samples=slow))
+    wide = path_of(with_receiver(times, received(place, gnss_hAcc=unsure), vehicle=None))
+    never = path_of(with_receiver(times, received(place, gnss_hAcc=20 * unsure)))
+
+    assert "the positions of gps move 150 m, and the motor " in str(moved)
+    assert "the positions of gps are within 8.48 m, and right to 2 m" in str(wide)
+    assert "gps is right to 10 m at no time" in str(never)
+
+
+def test_a_mean_that_may_be_below_zero_is_none():
+    """Two laps of one track, of which the second has a long stop."""
+    drive = ride().drive
+    pose, by = drive.streams["pose"], found(drive)
+    first = int(np.searchsorted(pose.times_us, by.start_us[0] - 500_000))
+    last = int(np.searchsorted(pose.times_us, by.start_us[2] + 500_000))
+    stop = int(np.searchsorted(pose.times_us, by.start_us[1] + 4_000_000))
+    times = pose.times_us + np.where(np.arange(len(pose.times_us)) >= stop, 40_000_000, 0)
+    part = Block(times, pose.columns).take(slice(first, last))
+    mined = laps.mine(replace(drive, streams={"vesc": drive.streams["vesc"], "pose": part}, vehicle=None))
+
+    assert mined.tables["laps"]["time_s"] == pytest.approx([by.time_s[0], by.time_s[1] + 40], abs=0.1)
+    assert "lap_mean_s" not in mined.estimates
+    assert mined.missing["lap_mean_s"].startswith("the laps differ too much: 2 of ")
+    assert set(mined.tables["laps"]["confidence"]) == {0.5}

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from iort_analysis.mining import drivetrain, motor
+from iort_analysis.mining.gain import with_gain
+from iort_contract.catalog.derived import Vehicle
 from tests.unit.analysis.proven import proven
 
 
@@ -86,6 +88,70 @@ def test_a_position_that_comes_from_the_motors_speed_is_no_second_source() -> No
     mined = drivetrain.mine(replace(drive, streams={**drive.streams, "pose": odometry}))
 
     assert "calculated from the motor's speed" in mined.missing["speed_to_erpm_gain"]
+
+
+@pytest.mark.parametrize(
+    ("field", "noise_mps", "share"),
+    [
+        ("vesc.speed_meters_per_sec", 0.0, 0.03),
+        ("gps.gnss_gVel", 0.05, 0.005),
+        ("odom.twist.twist.linear.x", 0.0, 0.03),
+    ],
+)
+def test_a_speed_in_the_log_is_a_second_source_of_the_gain(
+    field: str, noise_mps: float, share: float
+) -> None:
+    """One that is calculated from the motor's own speed says what somebody has entered, and no more."""
+    drive = replace(proven(0).drive, pose=None, vehicle=None)
+    speed = drive.of("vesc", "speed")
+    assert speed is not None
+    mps = speed / 1062 + np.random.default_rng(1).normal(0, noise_mps, len(speed))
+    columns = {**drive.samples.columns, field: mps}
+    streams = {"vesc": drive.streams["vesc"]}
+    told = with_gain(replace(drive, streams=streams, samples=drive.samples._replace(columns=columns)))
+
+    gain = drivetrain.mine(told).estimates["speed_to_erpm_gain"]
+    assert gain.value == pytest.approx(1062, rel=1e-3)
+    assert (gain.high - gain.low) / 2 / 1062 == pytest.approx(share, abs=0.005)
+    assert told.vehicle is not None
+    assert told.of("vesc", "speed_mps") == pytest.approx(speed / told.vehicle.speed_to_erpm_gain)
+
+
+def test_positions_without_a_heading_are_a_second_source_of_the_gain() -> None:
+    drive, truth = proven(0)
+    pose, chance = drive.streams["pose"], np.random.default_rng(1)
+    # A receiver with half a metre's error that wanders slowly, on a track ten times as large.
+    wander = np.cumsum(chance.normal(0, 0.01, (2, len(pose.times_us))), axis=1)
+    degrees = {
+        "lat": 48.1 + np.degrees((10 * pose.columns["y"] + wander[1]) / 6_371_008.8),
+        "lon": 11.6
+        + np.degrees((10 * pose.columns["x"] + wander[0]) / 6_371_008.8 / np.cos(np.radians(48.1))),
+    }
+    streams = {"vesc": drive.streams["vesc"], "gps": pose._replace(columns=degrees)}
+    gain = drivetrain.mine(replace(drive, pose=None, streams=streams)).estimates["speed_to_erpm_gain"]
+
+    assert gain.low < truth["speed_to_erpm_gain"] / 10 < gain.high
+    assert gain.high - gain.low < 0.1 * gain.value
+
+
+def test_what_no_car_has_is_refused_with_the_reason() -> None:
+    drive, truth = proven(0)
+    bare = replace(drive, pose=None, streams={"vesc": drive.streams["vesc"]})
+    # Five times the gain is twenty-five times the mass.
+    light = replace(
+        bare, vehicle=Vehicle(truth["speed_to_erpm_gain"] * 5), known={"mass_kg": truth["mass_kg"]}
+    )
+    current = drive.samples.columns["vesc.current_motor"]
+    columns = {**drive.samples.columns, "vesc.current_motor": np.where(current < 0, 2.5 * current, current)}
+    strong = replace(drive, samples=drive.samples._replace(columns=columns))
+
+    for wrong, name in ((light, "effective_mass_kg"), (strong, "drivetrain_efficiency")):
+        mined = drivetrain.mine(wrong)
+        assert not mined.estimates.keys() - {"speed_to_erpm_gain"}
+        assert mined.missing["friction_n"].startswith(f"impossible: {name} would be ")
+    unregistered = drivetrain.mine(replace(bare, vehicle=None, known={"speed_to_erpm_gain": 4614.0}))
+    assert not unregistered.estimates
+    assert "also if it is 4614, the default" in unregistered.missing["effective_mass_kg"]
 
 
 def test_without_the_motors_flux_forces_are_known_for_each_kilogram() -> None:

@@ -7,6 +7,7 @@ from decimal import Decimal
 import pytest
 
 from iort_agent.config import load_config
+from iort_contract.catalog.derived import Vehicle, registered_vehicle
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -50,6 +51,20 @@ def test_a_robot_has_no_name_under_which_others_connect(dynamodb, name):
     with pytest.raises(StationError, match="must not begin with iort-claim-, iort-viewer-, iort-driver-"):
         registry.enter(cloud, name, {})
     registry.enter(cloud, "iort-viewer", {})
+
+
+def test_a_gain_that_somebody_gave_is_told_from_the_default(dynamodb):
+    cloud = FakeCloud(dynamodb)
+    for robot in ("default", "own"):
+        registry.enter(cloud, robot, registry.F1TENTH)
+    registry.set_vehicle(cloud, "own", registry.given({"speed_to_erpm_gain": 4614.0}))
+    registry.set_vehicle(cloud, "default", registry.given({"mass_kg": 3.5}))
+
+    own = {robot: registered_vehicle(registry.get(cloud, robot)) for robot in ("default", "own")}
+
+    assert own == {"default": None, "own": Vehicle(4614.0)}
+    # The page goes on to show speeds with either.
+    assert registry.vehicles(cloud).keys() == own.keys()
 
 
 def test_set_vehicle_changes_only_the_given_parameters(dynamodb):

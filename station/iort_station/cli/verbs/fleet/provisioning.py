@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,13 @@ _STOP = (
     "An emergency stop ends what downlink.cmd in car.yaml moves: the simulated car's command is there. Name "
     "your robot's own before you drive it (docs/how-to/drive.md)."
 )
-_Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
+_Gain = Annotated[
+    float | None,
+    typer.Option(
+        help=f"erpm per m/s (vesc.yaml). Default: {F1TENTH.speed_to_erpm_gain:g} for the page alone.",
+        show_default=False,
+    ),
+]
 _ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
 
 
@@ -31,7 +38,7 @@ def add(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The robot's name.")],
     folder: Annotated[Path, to_file("Where to write the robot's folder of configuration and keys.")] = Path(),
-    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+    speed_to_erpm_gain: _Gain = None,
     as_json: AsJson = False,
 ) -> None:
     """Register a robot and write its folder: car.yaml, certificate and key."""
@@ -52,7 +59,7 @@ def register(
         str | None, typer.Option(help="The serial number of the one machine that may claim the name.")
     ] = None,
     days: Annotated[float, typer.Option(help="How many days the name can be claimed.", min=0)] = claims.DAYS,
-    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+    speed_to_erpm_gain: _Gain = None,
     as_json: AsJson = False,
 ) -> None:
     """Pre-register names. Any robot with one of the fleet's lasting claims can claim each name once."""
@@ -133,5 +140,8 @@ def revoke_claims(context: typer.Context, yes: Yes = False, as_json: AsJson = Fa
     tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 
-def _vehicle(speed_to_erpm_gain: float) -> dict[str, float]:
-    return robots.checked_vehicle({**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain})
+def _vehicle(speed_to_erpm_gain: float | None) -> Mapping[str, float]:
+    if speed_to_erpm_gain is None:
+        return robots.F1TENTH
+    own = robots.checked_vehicle({"speed_to_erpm_gain": speed_to_erpm_gain})
+    return {**robots.F1TENTH, **registry.given(own)}

@@ -27,6 +27,7 @@ from iort_contract.tables import (
     DISCONNECTED_MS,
     FILES_BYTES,
     FILES_DAY,
+    GAIN_SET_MS,
     LAST_SEEN_MS,
     ONLINE,
     OVER_SHARE,
@@ -96,7 +97,7 @@ def set_(
     vehicle = robots.checked_vehicle(dict(_parameter(text) for text in parameters))
     from_us = When(start, last=last).range().start_us
     cloud = context.obj.cloud()
-    before = registry.set_vehicle(cloud, name, vehicle)
+    before = registry.set_vehicle(cloud, name, registry.given(vehicle))
     for key, value in vehicle.items():
         was = f"{before[key]:.12g}" if key in before else "not set"
         facts = {"robot": name, "parameter": key, "value": value, "was": before.get(key)}
@@ -275,7 +276,7 @@ def _connection(row: Mapping[str, Any]) -> str:
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {ROBOT, FILES_DAY, FILES_BYTES, STREAMS, *PRESENCE, *ADMISSION}
+    known = {ROBOT, GAIN_SET_MS, FILES_DAY, FILES_BYTES, STREAMS, *PRESENCE, *ADMISSION}
     return ", ".join(
         f"{key} {value}"
         for key, value in sorted(row.items())
