@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bench import ROOT
 from bench.report.result import Section
 from iort_agent.sources.recording.player import Message
-from iort_agent.sources.recording.rosbag import Recording
+from iort_agent.sources.recording.rosbag import Recording, Unread
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
@@ -60,7 +60,7 @@ def ride(folder: Path = FOLDER) -> dict[str, Block]:
 
 def f1tenth(folder: Path = FOLDER) -> dict[str, Block]:
     """An F1TENTH car's bag, 45 s."""
-    return streams_of(Recording(folder / F1TENTH_BAG, None, VESC_STREAM))
+    return streams_of(Recording(folder / F1TENTH_BAG, None, VESC_STREAM, Unread()))
 
 
 def step_ohm(drive: Drive) -> Estimate:

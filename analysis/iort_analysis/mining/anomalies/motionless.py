@@ -9,6 +9,8 @@ from iort_analysis.drives.motion import motion_among
 from iort_analysis.results import Event, Mined
 
 KIND = "never_moved"
+# A shorter recording may have ended before the car could move.
+_LEAST_US = 10_000_000
 
 
 def mine_motionless(drive: Drive) -> Mined:
@@ -21,6 +23,8 @@ def mine_motionless(drive: Drive) -> Mined:
     if moves is None or moves.any() or bool(np.isnan(speed).all()):
         return Mined()
     start_us, end_us = int(block.times_us[0]), int(block.times_us[-1])
+    if end_us - start_us < _LEAST_US:
+        return Mined()
     lasted_s, most, name = (
         (end_us - start_us) / 1e6,
         np.nanmax(np.abs(speed)),
