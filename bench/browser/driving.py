@@ -98,7 +98,8 @@ class Driver:
         for _ in range(_HOLDS):
             self.page.keyboard.up("ArrowUp")
             self.page.keyboard.up("Space")
-            self.page.locator(".drive[data-phase=free]").wait_for(timeout=_START_MS)
+            free = self.page.locator(".drive[data-phase=free], .drive[data-phase=holding]")
+            free.wait_for(timeout=_START_MS)
             self.page.keyboard.down("Space")
             done = self.page.locator(".drive[data-phase=driving], .drive[data-phase=over]")
             done.wait_for(timeout=_START_MS)

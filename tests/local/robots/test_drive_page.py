@@ -78,7 +78,7 @@ def hold(page: Page, *reasons: str) -> str:
 
     def tried() -> str:
         page.keyboard.up("Space")
-        page.locator(".drive[data-phase=free]").wait_for()
+        page.locator(".drive[data-phase=free], .drive[data-phase=holding]").wait_for()
         page.keyboard.down("Space")
         page.locator(".drive[data-phase=driving], .drive[data-phase=over]").wait_for()
         return page.locator(".drive-said").inner_text()

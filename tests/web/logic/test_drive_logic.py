@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from iort_contract.messages.control.commands import check_by, decode_command
 from iort_contract.messages.control.driving import DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS
+from local.deployment import ROOT
 from tests.web.logic.node import call, run
 
 LIMITS = {
@@ -22,6 +24,7 @@ LIMITS = {
 REACH = {"top_mps": 1.0, "max_speed_mps": 2.0, "max_steering_rad": 0.4}
 # A car 40 ms away in each direction, and a cloud whose clock is 3 s ahead of this computer's.
 # `turn` lets 50 ms pass: the car hears what was sent, and answers at 10 Hz with the outcome that is set.
+# `driven` in tests/unit/station/fleet/test_driving.py is the same for the terminal's driver.
 CAR = """
 const [limits, steps] = given;
 let now = 1e6, names = 0, seq = 0, due = 0;
@@ -52,6 +55,7 @@ function turn() {
 for (const [times, change = {}] of steps) {
   if ("hold" in change) driver.hold(change.hold, now);
   now += change.pause ?? 0;
+  if (change.leave) driver.leave();
   if (change.takeover) driver.askTakeover();
   if ("block" in change) driver.block(change.block);
   if (change.stick) driver.stick = change.stick;
@@ -66,6 +70,31 @@ AHEAD = {"stick": {"x": -1, "y": 1}}
 
 def drive(*steps: Any) -> dict[str, Any]:
     return run("drive/driver.ts", CAR, LIMITS, steps)
+
+
+VECTORS = json.loads((ROOT / "tests/unit/station/fleet/driving.json").read_text())
+EACH = f"const outer = given; return outer[1].map((steps) => ((given) => {{{CAR}}})([outer[0], steps]));"
+
+
+@pytest.fixture(scope="module")
+def driven() -> dict[str, Any]:
+    """What the page's driver has done after the steps of each vector."""
+    done = run("drive/driver.ts", EACH, VECTORS["limits"], [one["steps"] for one in VECTORS["vectors"]])
+    return dict(zip((one["name"] for one in VECTORS["vectors"]), done, strict=True))
+
+
+@pytest.mark.parametrize("vector", VECTORS["vectors"], ids=lambda vector: vector["name"])
+def test_the_pages_driver_does_what_the_vectors_say(driven: dict[str, Any], vector: Any) -> None:
+    told, expected = driven[vector["name"]], vector["expected"]
+    kinds = (
+        [one["session"], *one["message"]["drive"].values(), one["lease_ms"], "takeover" in one, "ends" in one]
+        for one in told["sent"]
+    )
+    assert [[len(list(same)), *kind] for kind, same in itertools.groupby(kinds)] == expected["commands"]
+    assert (told["phase"], told.get("rtt_ms")) == (expected["phase"], expected["rtt_ms"])
+    # Half a microsecond is rounded.
+    ahead_us = [one["sent_us"] - one["at"] * 1000 for one in told["sent"]][-1:]
+    assert ahead_us == pytest.approx(expected["ahead_us"], abs=1)
 
 
 def speeds(told: dict[str, Any]) -> list[float]:
@@ -130,12 +159,17 @@ def test_a_hold_begins_at_a_standstill_and_moves_once_the_car_has_answered() -> 
         assert abs(one["sent_us"] / 1e3 - (one["at"] + 3000)) <= 25
 
 
-def test_letting_go_stops_at_once_and_again_in_case_a_message_is_lost() -> None:
-    told = drive([4], [20, {"hold": True, **AHEAD}], [10, {"hold": False}])
-    assert speeds(told)[-4:] == [1, 0, 0, 0]
-    assert told["phase"] == "free"
+def test_letting_go_holds_the_car_and_leaving_gives_it_up_again_in_case_a_message_is_lost() -> None:
+    held = drive([4], [20, {"hold": True, **AHEAD}], [100, {"hold": False}])
+    assert (held["phase"], speeds(held)[-101:]) == ("holding", [1] + [0] * 100)
+    assert not any("ends" in one for one in held["sent"])
+    left = drive([4], [20, {"hold": True, **AHEAD}], [10, {"hold": False}], [10, {"leave": True}])
+    assert (left["phase"], [one.get("ends") for one in left["sent"]][-4:]) == (
+        "free",
+        [None, True, True, True],
+    )
     # The next hold is a session of its own.
-    again = drive([4], [20, {"hold": True, **AHEAD}], [10, {"hold": False}], [20, {"hold": True}])
+    again = drive([4], [20, {"hold": True, **AHEAD}], [10, {"leave": True}], [20, {"hold": True}])
     assert [one["session"] for one in again["sent"]][-1] == "00000002"
     assert again["phase"] == "driving"
 
@@ -163,14 +197,14 @@ def test_whatever_stands_against_driving_stops_the_car_until_the_viewer_begins_a
     sound = {"link": {"silent": False, "deaf": False, "way": 40, "outcome": "accepted"}, "block": ""}
     after = drive([4], [20, {"hold": True, **AHEAD}], [40, change], [40, sound])
     assert after["phase"] == "over"
-    assert len(after["sent"]) == len(told["sent"])
+    assert not any(speeds(after)[len(told["sent"]) :])
 
 
 def test_a_page_that_stood_still_drives_on_in_no_car_however_long_its_leases() -> None:
     steps = [4], [20, {"hold": True, **AHEAD}], [10, {"pause": 600}]
     told = run("drive/driver.ts", CAR, {**LIMITS, "lease_ms": 10_000}, steps)
     assert "stood still for 650 ms" in told["reason"]
-    assert speeds(told)[-4:] == [1, 0, 0, 0]
+    assert speeds(told)[-11:] == [1] + [0] * 10
 
 
 def test_the_limits_are_those_of_the_contract() -> None:

@@ -1,7 +1,10 @@
 """Driving a robot by hand: what the stick drives and how far, and what becomes of each command.
 
-A driver's session is one hold of the stick. It sends `DRIVE_RATE_HZ` commands a second with a lease of
-`DRIVE_LEASE_MS`, and ends when the round trip or the age of the newest sample is above its limit.
+A driver sends `DRIVE_RATE_HZ` commands a second with a lease of `DRIVE_LEASE_MS`, less a margin. A hold of
+the stick ends when the round trip or the age of the newest sample is above its limit. Then, and after the
+driver has let go, the commands say to stand: the car is held, and no planner drives off, until the driver
+leaves the wheel. tests/unit/station/fleet/driving.json says what each driver does, the page's and the
+terminal's.
 """
 
 from __future__ import annotations
@@ -20,6 +23,17 @@ DRIVE_LEASE_MS = 500
 # Above either, a driver sees too late what the car does. The round trip is from a command to its sample of
 # the stream `drive`.
 DRIVE_MAX_RTT_MS, DRIVE_MAX_AGE_MS = 500, 1_000
+# A command's lease ends this much before the longest: the sender knows the cloud's clock to half a round
+# trip, and the agent takes its time to stop.
+DRIVE_MARGIN_MS = 50
+# A car that has not answered by then does not hear the driver.
+DRIVE_ANSWER_MS = 2_000
+# The end of a session is sent this often: a message may be lost.
+DRIVE_ENDS = 3
+# A wrong clock is known after one answer, and corrected with a new session.
+DRIVE_CORRECTIONS = 2
+# What told the cloud's time is believed so long: clocks drift.
+DRIVE_CLOCK_KEPT_MS = 60_000
 
 # The outcomes of a motion, beside `ACCEPTED`: why it was refused.
 STALE, LEASE_OVER, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED, NO_ROS = (
@@ -70,6 +84,10 @@ REFUSALS: Mapping[str, str] = {
     NO_ROS: "the agent is not in the ROS graph",
     CLOSED: "the agent is ending",
 }
+# What ends a driver's session for good. After any other refusal the car is told on to stand.
+LOST = (DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SUPERSEDED, CLOSED)
+# What a wrong clock of the driver's looks like.
+UNTIMELY = (STALE, LEASE_OVER, EARLY)
 
 
 def stick_downlink(lease_ms: int = DRIVE_LEASE_MS) -> dict[str, Any]:

@@ -3,8 +3,15 @@ and why it is over.
 
 A hold begins at a standstill. It may move the car once the car has answered a command, within the limits of
 the round trip and of the newest sample's age. Whatever ends it, the driver must let go before the next one: a
-car must not move because an obstacle to driving has gone away. The page does the same in
-station/web/src/drive/driver.ts.
+car must not move because an obstacle to driving has gone away. A driver who has let go still has the wheel:
+the car is told to stand, so that no planner on board drives off, until the driver leaves the wheel or loses
+it.
+
+    free -- hold --> starting -- the car answers --> driving -- let go --> holding -- hold --> starting
+                         |                              |                     |
+                         +--- something is against it --+--> over             +-- leave, lost --> free
+
+The page does the same in station/web/src/drive/driver.ts; tests/unit/station/fleet/driving.json tests both.
 
 Times are microseconds of this computer's monotonic clock. The cloud's time is learned from the car's
 messages, so this computer's own clock may be wrong.
@@ -13,8 +20,7 @@ messages, so this computer's own clock may be wrong.
 from __future__ import annotations
 
 import secrets
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -23,41 +29,37 @@ from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.driving import (
     CLOCK_UNKNOWN,
+    DRIVE_ANSWER_MS,
+    DRIVE_CLOCK_KEPT_MS,
+    DRIVE_CORRECTIONS,
+    DRIVE_ENDS,
     DRIVE_LEASE_MS,
+    DRIVE_MARGIN_MS,
     DRIVE_MAX_AGE_MS,
     DRIVE_MAX_RTT_MS,
     DRIVEN_BY_ANOTHER,
-    EARLY,
-    LEASE_OVER,
+    LOST,
     REFUSALS,
-    STALE,
     STOPPED,
+    UNTIMELY,
     DriveLimits,
 )
 from iort_contract.messages.live import LiveSample
 from iort_contract.topics import ACCEPTED
 
-# A car that has not answered by then does not hear us.
-_ANSWER_US = 2_000_000
-# After a pause of this program as long as this, the car has stopped.
-_STILL_US = DRIVE_LEASE_MS * 1000
-# A stop is sent this often: a message may be lost.
-_STOPS = 3
-# A wrong time is known after one answer, and corrected with a new session.
-_CORRECTIONS = 2
-_TOO_LATE = (STALE, LEASE_OVER, EARLY)
+_ANSWER_US = DRIVE_ANSWER_MS * 1000
 # Between two samples of the stream `drive`, at most.
 _SAMPLE_US = round(1e6 / LIVE_MAX_RATE_HZ)
-# Messages that tell the cloud's time.
-_KEPT = 100
 
 
 class Phase(Enum):
-    """Nobody holds; the car has not answered yet; the stick drives; over until the driver lets go."""
+    """Nobody holds; the car has not answered yet; the stick drives; the driver has let go, and the car is
+    held at a standstill; over until the driver lets go."""
 
     FREE = "free"
     STARTING = "starting"
     DRIVING = "driving"
+    HOLDING = "holding"
     OVER = "over"
 
 
@@ -73,30 +75,47 @@ class CloudClock:
     which was later heard here, and one that was sent here, which the car later took."""
 
     def __init__(self) -> None:
-        self._least: deque[int] = deque(maxlen=_KEPT)
-        self._most: deque[int] = deque(maxlen=_KEPT)
+        self._least: list[tuple[int, int]] = []
+        self._most: list[tuple[int, int]] = []
 
     def heard(self, sent_us: int, now_us: int) -> None:
         """Take the cloud's time at which a message was sent that is heard now."""
-        self._least.append(sent_us - now_us)
+        self._least = _bounds(self._least, now_us, sent_us - now_us, max)
 
     def answered(self, left_us: int, taken_us: int) -> None:
         """Take the cloud's time at which the car took a command that left here."""
-        self._most.append(taken_us - left_us)
+        self._most = _bounds(self._most, left_us, taken_us - left_us, min)
 
     def offset_us(self) -> int | None:
-        """The cloud's time minus this clock's; None before the first message."""
+        """The cloud's time minus this clock's; None before the first message. Without an answer it is the
+        least that it can be: a command seems older than it is, and its lease ends too early."""
         if not self._least:
             return None
-        least = max(self._least)
-        most = min(self._most, default=least)
+        least = self._least[0][1]
+        most = self._most[0][1] if self._most else least
+        # They contradict each other once a clock was set, or this computer slept.
         return (least + most) // 2 if most > least else least
 
 
-class Driver:
-    """One driver at one stick. ``top_mps`` is the driver's own top speed, within the car's limit."""
+def _bounds(
+    bounds: list[tuple[int, int]], at_us: int, offset_us: int, better: Callable[[int, int], int]
+) -> list[tuple[int, int]]:
+    """The bounds that are believed, the tightest first: a newer one replaces those that it betters."""
+    young = [one for one in bounds if at_us - one[0] < DRIVE_CLOCK_KEPT_MS * 1000]
+    return [*(one for one in young if better(one[1], offset_us) != offset_us), (at_us, offset_us)]
 
-    def __init__(self, limits: DriveLimits, by: str, top_mps: float) -> None:
+
+class Driver:
+    """One driver at one stick. ``top_mps`` is the driver's own top speed, within the car's limit;
+    ``new_name`` names each session."""
+
+    def __init__(
+        self,
+        limits: DriveLimits,
+        by: str,
+        top_mps: float,
+        new_name: Callable[[], str] = lambda: secrets.token_hex(8),
+    ) -> None:
         self.limits, self.top_mps = limits, top_mps
         self.phase, self.reason, self.stick = Phase.FREE, "", Stick()
         self.rtt_us: int | None = None
@@ -105,6 +124,9 @@ class Driver:
         self.mine = False
         self.takeover = False
         self.by = by
+        self._new_name = new_name
+        # Whether the car is told to stand while nobody holds the stick.
+        self._standing = False
         self._clock = CloudClock()
         self._clockless = False
         self._held = False
@@ -129,16 +151,27 @@ class Driver:
             return
         self._held = held
         if not held:
-            self._finish()
-            self.phase, self.reason = Phase.FREE, ""
+            if not self._standing:
+                self._finish()
+            self.phase, self.reason = Phase.HOLDING if self._standing else Phase.FREE, ""
             return
         self._corrections = 0
         against = self._against(now_us)
         if against:
             self.phase, self.reason = Phase.OVER, against
+            return
+        self._began_us = now_us
+        if self._standing:
+            # The session has the car already.
+            self.phase, self.reason = Phase.STARTING, ""
         else:
-            self._began_us = now_us
             self._begin(now_us)
+
+    def leave(self) -> None:
+        """Leave the wheel: others may drive."""
+        self._held = False
+        self._finish()
+        self.phase, self.reason = Phase.FREE, ""
 
     def hear(self, stream: str, live: LiveSample, now_us: int) -> None:
         """Take a live message of the car."""
@@ -157,13 +190,14 @@ class Driver:
             self.driver, self.mine = "", False
         if self.phase in (Phase.STARTING, Phase.DRIVING):
             # The keys of that time may have been let go since.
-            frozen = f"this program stood still for {still_us // 1000} ms" if still_us > _STILL_US else ""
+            lease_us = _lease_ms(self.limits) * 1000
+            frozen = f"this program stood still for {still_us // 1000} ms" if still_us > lease_us else ""
             against = frozen or self._against(now_us) or self._unanswered(now_us)
             if against:
                 self._end(against)
         if self.phase is Phase.DRIVING:
             return self._command(self.stick, now_us)
-        if self.phase is Phase.STARTING:
+        if self.phase is Phase.STARTING or self._standing:
             return self._command(Stick(), now_us)
         if not self._stops:
             return None
@@ -171,21 +205,24 @@ class Driver:
         return self._command(Stick(), now_us, ends=True)
 
     def _begin(self, now_us: int) -> None:
-        self._session, self._started_us = secrets.token_hex(8), self._cloud_us(now_us)
+        self._session, self._started_us = self._new_name(), self._cloud_us(now_us)
         self._seq, self._waiting, self._stops, self.rtt_us = 0, {}, 0, None
         self.phase, self.reason = Phase.STARTING, ""
 
-    def _end(self, reason: str) -> None:
-        """End the hold; the driver must let go."""
-        if self.phase in (Phase.STARTING, Phase.DRIVING):
+    def _end(self, reason: str, *, lost: bool = False) -> None:
+        """End the hold; the driver must let go. A car that is ``lost`` to another or a stop is not held."""
+        moves = self.phase in (Phase.STARTING, Phase.DRIVING)
+        if lost or not self._standing:
             self._finish()
-            self.phase, self.reason = Phase.OVER, reason
+        if moves or (lost and self.phase is not Phase.FREE):
+            self.phase, self.reason = Phase.OVER if self._held else Phase.FREE, reason
+        self.takeover = False
 
     def _finish(self) -> None:
-        """Have the car stop, if this hold may have moved it."""
-        if self.phase in (Phase.STARTING, Phase.DRIVING):
-            self._stops = _STOPS
-        self.takeover = False
+        """Give the car up, if this driver may have it."""
+        if self._standing or self.phase in (Phase.STARTING, Phase.DRIVING):
+            self._stops = DRIVE_ENDS
+        self._standing = self.takeover = False
 
     def _against(self, now_us: int) -> str:
         """Why the car must not be driven now."""
@@ -211,31 +248,44 @@ class Driver:
         self._driver_until_us = now_us + _whole(told.get("lease_left_ms")) * 1000
         if told.get("session") != self._session:
             # Another's command has passed, so ours no longer do.
-            if self.phase is Phase.DRIVING and driver and not self.mine:
-                self._end(f"{self.driver} has taken over")
+            if self._standing and driver and not self.mine:
+                self._end(f"{self.driver} has taken over", lost=True)
             return
         seq, outcome = _whole(told.get("seq")), told.get("outcome")
         left_us = self._waiting.get(seq)
         self._waiting = {one: at_us for one, at_us in self._waiting.items() if one > seq}
         if left_us is not None:
-            self.rtt_us = now_us - left_us
+            self.rtt_us = max(0, now_us - left_us - max(0, live.sent_us - live.t_us))
             if live.offset_us is not None:
                 self._clock.answered(left_us, live.t_us + live.offset_us)
-        if self.phase not in (Phase.STARTING, Phase.DRIVING):
-            return
+        moves = self.phase in (Phase.STARTING, Phase.DRIVING)
         if outcome == STOPPED:
-            self._end("the car was stopped")
+            if moves:
+                self._end("the car was stopped")
         elif outcome != ACCEPTED:
-            self._refused(str(outcome), now_us)
+            if self._standing or moves:
+                self._refused(str(outcome), now_us)
+        elif not moves:
+            return
         elif self.rtt_us is not None and self.rtt_us > DRIVE_MAX_RTT_MS * 1000:
             self._end(_slow(self.rtt_us))
         elif self.phase is Phase.STARTING:
-            self.phase, self.takeover = Phase.DRIVING, False
+            self.phase, self.takeover, self._standing = Phase.DRIVING, False, True
 
     def _refused(self, outcome: str, now_us: int) -> None:
         if outcome == DRIVEN_BY_ANOTHER:
-            self._end(f"{self.driver or 'somebody'} drives this car")
-        elif self.phase is Phase.STARTING and outcome in _TOO_LATE and self._corrections < _CORRECTIONS:
+            has = "has taken over" if self._standing else "drives this car"
+            self._end(f"{self.driver or 'somebody'} {has}", lost=True)
+        elif outcome in LOST:
+            self._end(REFUSALS.get(outcome, outcome), lost=True)
+        elif self.phase is Phase.HOLDING:
+            return  # the next command may pass
+        elif (
+            self.phase is Phase.STARTING
+            and not self._standing
+            and outcome in UNTIMELY
+            and self._corrections < DRIVE_CORRECTIONS
+        ):
             self._corrections += 1
             self._begin(now_us)
         else:
@@ -245,15 +295,18 @@ class Driver:
         seq, limits = self._seq, self.limits
         self._seq += 1
         self._waiting[seq] = now_us
+        kept_us = _ANSWER_US + DRIVE_LEASE_MS * 1000
+        self._waiting = {one: at_us for one, at_us in self._waiting.items() if now_us - at_us < kept_us}
         top_mps = min(self.top_mps, limits.max_speed_mps)
+        lease_ms = max(1, _lease_ms(limits) - DRIVE_MARGIN_MS)
         return Command(
             session=self._session,
             started_us=self._started_us,
             seq=seq,
             sent_us=max(self._started_us, self._cloud_us(now_us)),
-            valid_ms=DRIVE_LEASE_MS,
+            valid_ms=lease_ms,
             message=limits.message(stick.speed * top_mps, stick.steering * limits.max_steering_rad),
-            lease_ms=DRIVE_LEASE_MS,
+            lease_ms=lease_ms,
             by=self.by,
             takeover=self.takeover,
             ends=ends,
@@ -261,6 +314,11 @@ class Driver:
 
     def _cloud_us(self, now_us: int) -> int:
         return now_us + (self._clock.offset_us() or 0)
+
+
+def _lease_ms(limits: DriveLimits) -> int:
+    """How long a command holds the car at most."""
+    return min(DRIVE_LEASE_MS, limits.lease_ms)
 
 
 def _slow(rtt_us: int) -> str:

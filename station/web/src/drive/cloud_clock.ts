@@ -2,7 +2,7 @@
 // may be wrong. Each message from the car says that the cloud's clock was not behind its time when it arrived here;
 // each answered command, that it was not ahead of the answer's when the command left. The truth lies in between.
 
-const KEPT_MS = 60_000;
+import { DRIVE_CLOCK_KEPT_MS } from "../base/contract";
 
 interface Bound {
   readonly at_ms: number;
@@ -36,6 +36,6 @@ export class CloudClock {
 
 /** The bounds of the last minute, the tightest first: a newer one replaces those that it betters. */
 function kept(bounds: readonly Bound[], bound: Bound, betters: (one: number, other: number) => boolean): Bound[] {
-  const young = bounds.filter(({ at_ms }) => bound.at_ms - at_ms < KEPT_MS);
+  const young = bounds.filter(({ at_ms }) => bound.at_ms - at_ms < DRIVE_CLOCK_KEPT_MS);
   return [...young.filter(({ offset_ms }) => !betters(bound.offset_ms, offset_ms)), bound];
 }

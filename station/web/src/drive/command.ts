@@ -1,6 +1,6 @@
 // The commands of one hold of the stick, as `iort_contract.messages.control.commands` writes them.
 
-import { DRIVE_LEASE_MS, DRIVE_RATE_HZ, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
+import { DRIVE_LEASE_MS, DRIVE_MARGIN_MS, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
 import type { Motion } from "./stick";
 
 export interface Command {
@@ -17,9 +17,6 @@ export interface Command {
   /** It ends the lease at once, so that others may drive. */
   readonly ends?: true;
 }
-
-// A lease ends this much earlier: the cloud's clock is known to half a round trip, and the agent takes its time to stop.
-const MARGIN_MS = 1000 / DRIVE_RATE_HZ;
 
 /** One hold of the stick. */
 export interface Session {
@@ -38,7 +35,7 @@ export function driverName(...names: readonly string[]): string {
 export const leaseOf = ({ lease_ms }: DriveLimitsEntry): number => Math.min(DRIVE_LEASE_MS, lease_ms);
 
 export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
-  const lease_ms = Math.max(1, leaseOf(limits) - MARGIN_MS);
+  const lease_ms = Math.max(1, leaseOf(limits) - DRIVE_MARGIN_MS);
   return {
     v: SCHEMA_VERSION,
     session: session.name,

@@ -2,23 +2,20 @@
 //
 // A hold begins at a standstill. It may move once the car has answered a command, within the limits of the round trip
 // and of the newest sample's age. Whatever ends it, the viewer must let go before the next one: a car must not
-// move because an obstacle to driving has gone away.
+// move because an obstacle to driving has gone away. Who has let go still has the wheel: the car is told to stand, so
+// that no planner on board drives off, until the viewer leaves the wheel or loses it.
+//
+// iort_station.fleet.control.driving does the same and draws the phases; tests/unit/station/fleet/driving.json tests both.
 
-import { DRIVE_LEASE_MS, DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, LIVE_MAX_RATE_HZ, type DriveLimitsEntry } from "../base/contract";
+import { DRIVE_ANSWER_MS, DRIVE_CORRECTIONS, DRIVE_ENDS, DRIVE_LEASE_MS, DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, LIVE_MAX_RATE_HZ, type DriveLimitsEntry } from "../base/contract";
 import { CloudClock } from "./cloud_clock";
 import { commandOf, leaseOf, type Command, type Session } from "./command";
 import type { Driven, LiveMessage } from "./live_message";
 import { CENTRE, meant, type Motion, type Stick } from "./stick";
-import { inWords, TOO_LATE } from "./outcomes";
+import { inWords, lost, untimely } from "./outcomes";
 
-export type Phase = "free" | "starting" | "driving" | "over";
+export type Phase = "free" | "starting" | "driving" | "holding" | "over";
 
-// A car that has not answered by then does not hear us.
-const ANSWER_MS = 2_000;
-// A stop is sent this often: a message may be lost.
-const STOPS = 3;
-// A wrong clock is known after one answer, and corrected with a new session.
-const CORRECTIONS = 2;
 // Between two samples of the stream `drive`, at most, however slow the other streams are.
 const SAMPLE_MS = 1000 / LIVE_MAX_RATE_HZ;
 const STANDING: Motion = { speed_mps: 0, steering_rad: 0 };
@@ -35,6 +32,8 @@ export class Driver {
   stick: Stick = CENTRE;
   private readonly clock = new CloudClock();
   private held = false;
+  /** Whether the car is told to stand while nobody holds the stick. */
+  private standing = false;
   private session: Session | undefined;
   private seq = 0;
   private began_ms = 0;
@@ -80,7 +79,7 @@ export class Driver {
   /** Whether an emergency stop is asked for. */
   halt(stopped: boolean): void {
     this.halted = stopped;
-    if (stopped) this.end(inWords("emergency_stop"));
+    if (stopped) this.end(inWords("emergency_stop"), true);
   }
 
   /** The viewer holds the dead-man button, or not. */
@@ -88,14 +87,23 @@ export class Driver {
     if (held === this.held) return;
     this.held = held;
     if (!held) {
-      this.finish();
-      [this.phase, this.reason] = ["free", ""];
+      if (!this.standing) this.finish();
+      [this.phase, this.reason] = [this.standing ? "holding" : "free", ""];
       return;
     }
     [this.other, this.corrections] = ["", 0];
     const against = this.against(now_ms);
-    if (against === "") this.begin(now_ms);
-    else [this.phase, this.reason] = ["over", against];
+    if (against !== "") [this.phase, this.reason] = ["over", against];
+    // The session has the car already.
+    else if (this.standing) [this.phase, this.reason, this.began_ms] = ["starting", "", now_ms];
+    else this.begin(now_ms);
+  }
+
+  /** The viewer leaves the wheel: others may drive. */
+  leave(): void {
+    this.held = false;
+    this.finish();
+    [this.phase, this.reason] = ["free", ""];
   }
 
   /** The next hold takes over from whoever drives. */
@@ -122,7 +130,7 @@ export class Driver {
       const against = frozen || this.against(now_ms) || this.unanswered(now_ms);
       if (against !== "") this.end(against);
     }
-    if (this.phase === "starting") return this.command(STANDING, now_ms);
+    if (this.phase !== "driving" && (this.phase === "starting" || this.standing)) return this.command(STANDING, now_ms);
     if (this.phase === "driving") return this.command(meant(this.stick, { top_mps: this.top_mps, ...this.limits }), now_ms);
     if (this.stops === 0) return undefined;
     this.stops -= 1;
@@ -135,17 +143,18 @@ export class Driver {
     [this.phase, this.reason, this.began_ms] = ["starting", "", now_ms];
   }
 
-  /** End the hold with a reason; the viewer must let go. */
-  private end(reason: string): void {
-    if (this.phase === "over" || this.phase === "free") return;
-    this.finish();
-    [this.phase, this.reason] = ["over", reason];
+  /** End the hold with a reason; the viewer must let go. A car that is lost to another or a stop is not held. */
+  private end(reason: string, lost = false): void {
+    const holds = this.phase === "starting" || this.phase === "driving";
+    if (lost || !this.standing) this.finish();
+    if (holds || (lost && this.phase !== "free")) [this.phase, this.reason] = [this.held ? "over" : "free", reason];
+    this.takeover = false;
   }
 
-  /** Have the car stop, if this hold may have moved it. */
+  /** Give the car up, if the viewer may have it. */
   private finish(): void {
-    if (this.phase === "starting" || this.phase === "driving") this.stops = STOPS;
-    this.takeover = false;
+    if (this.standing || this.phase === "starting" || this.phase === "driving") this.stops = DRIVE_ENDS;
+    [this.standing, this.takeover] = [false, false];
   }
 
   /** Why the car must not be driven now; an empty text if nothing is against it. */
@@ -159,7 +168,7 @@ export class Driver {
   }
 
   private unanswered(now_ms: number): string {
-    if (this.phase === "starting") return now_ms - this.began_ms > ANSWER_MS ? "The car does not answer" : "";
+    if (this.phase === "starting") return now_ms - this.began_ms > DRIVE_ANSWER_MS ? "The car does not answer" : "";
     const oldest = this.waiting[0]?.left_ms ?? now_ms;
     return now_ms - oldest > DRIVE_MAX_RTT_MS + SAMPLE_MS ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
   }
@@ -168,7 +177,7 @@ export class Driver {
     this.newest = { driven, until_ms: now_ms + driven.leaseLeft_ms };
     if (driven.session !== this.session?.name) {
       // Another's command has passed, so ours no longer do.
-      if (this.phase === "driving" && driven.driver !== "" && driven.driver !== this.session?.name) this.lose(driven);
+      if (this.standing && driven.driver !== "" && driven.driver !== this.session?.name) this.lose(driven);
       return;
     }
     const sent = this.waiting.find(({ seq }) => seq === driven.seq);
@@ -177,16 +186,21 @@ export class Driver {
       this.rtt_ms = Math.max(0, now_ms - sent.left_ms - message.lay_ms);
       if (message.taken_ms !== undefined) this.clock.answered(sent.left_ms, message.taken_ms);
     }
-    if (this.phase !== "starting" && this.phase !== "driving") return;
+    const holds = this.phase === "starting" || this.phase === "driving";
+    if (!holds && (!this.standing || driven.outcome === "stopped" || driven.outcome === "accepted")) return;
     if (driven.outcome !== "accepted") this.refused(driven, now_ms);
     else if (this.rtt_ms !== undefined && this.rtt_ms > DRIVE_MAX_RTT_MS) this.end(slow(this.rtt_ms));
-    else if (this.phase === "starting") [this.phase, this.takeover] = ["driving", false];
+    else if (this.phase === "starting") [this.phase, this.takeover, this.standing] = ["driving", false, true];
   }
 
   private refused(driven: Driven, now_ms: number): void {
     if (driven.outcome === "driven_by_another") {
       this.lose(driven);
-    } else if (this.phase === "starting" && TOO_LATE.has(driven.outcome) && this.corrections < CORRECTIONS) {
+    } else if (lost.has(driven.outcome)) {
+      this.end(inWords(driven.outcome), true);
+    } else if (this.phase === "holding") {
+      // The next command may pass.
+    } else if (this.phase === "starting" && !this.standing && untimely.has(driven.outcome) && this.corrections < DRIVE_CORRECTIONS) {
       this.corrections += 1;
       const { began_ms } = this;
       this.begin(now_ms);
@@ -198,7 +212,7 @@ export class Driver {
 
   private lose(driven: Driven): void {
     this.other = driven.driverBy || "Somebody";
-    this.end(`${this.other} ${this.phase === "driving" ? "has taken over" : "drives this car"}`);
+    this.end(`${this.other} ${this.standing ? "has taken over" : "drives this car"}`, true);
   }
 
   private command(motion: Motion, now_ms: number, ends = false): Command | undefined {
@@ -206,7 +220,7 @@ export class Driver {
     const { seq } = this;
     this.seq += 1;
     this.waiting.push({ seq, left_ms: now_ms });
-    this.waiting = this.waiting.filter(({ left_ms }) => now_ms - left_ms < ANSWER_MS + DRIVE_LEASE_MS);
+    this.waiting = this.waiting.filter(({ left_ms }) => now_ms - left_ms < DRIVE_ANSWER_MS + DRIVE_LEASE_MS);
     return commandOf(this.session, this.limits, { seq, sent_us: this.cloud_us(now_ms), motion, takeover: this.takeover, ends });
   }
 

@@ -1,10 +1,13 @@
 // What the car's outcomes of a command mean for a driver.
 
-import { REFUSALS } from "../base/contract";
+import { LOST, REFUSALS, UNTIMELY } from "../base/contract";
 import { capital } from "../base/format";
 
 /** Outcomes that a wrong clock causes. */
-export const TOO_LATE: ReadonlySet<string> = new Set<keyof typeof REFUSALS>(["stale", "lease_over", "from_the_future"]);
+export const untimely: ReadonlySet<string> = new Set(UNTIMELY);
+
+/** Outcomes that end a session for good. */
+export const lost: ReadonlySet<string> = new Set(LOST);
 
 const WORDS: Readonly<Record<string, string>> = { ...REFUSALS, stopped: "the car was stopped: no command came in time" };
 

@@ -16,7 +16,13 @@ import type { Stops } from "./stops";
 
 const FIRST_TOP_MPS = 0.5;
 const TICK_S = 1 / DRIVE_RATE_HZ;
-const WORDS = { free: "Hold the dead-man's switch to drive.", starting: "Waiting for the car's answer …", driving: "Driving." } as const;
+const WORDS = {
+  free: "You have the wheel, and do not drive: whoever drives the car goes on. Hold the dead-man's switch to drive.",
+  starting: "Waiting for the car's answer …",
+  driving: "Driving.",
+  holding: "You hold the car: it stands until you drive on, or leave the wheel. Then others may drive it, also a planner on board.",
+} as const;
+const UNHEARD = "The car does not hear you: others may drive it, also a planner on board.";
 
 /** What a viewer has while at the wheel. */
 interface Wheel {
@@ -59,7 +65,7 @@ export class DrivePanel {
     this.over.addEventListener("blur", () => (this.sure = false));
     this.top.addEventListener("input", () => this.topped());
     const limits = el("div", { class: "drive-limits" }, el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top), ...Object.values(this.figures).map(({ node }) => node));
-    const help = el("p", { class: "note drive-help" }, "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car.");
+    const help = el("p", { class: "note drive-help" }, "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.");
     this.body = el("div", { class: "drive-body", hidden: "" }, this.pad, this.hold, limits, help);
     this.node = el("section", { class: "panel drive", "aria-label": "Drive", hidden: "" }, el("header", {}, el("h3", {}, "Drive"), this.who.node, el("label", { class: "drive-name" }, "as ", this.name), this.take, this.leave), this.said, this.over, this.body);
     this.leave.hidden = true;
@@ -115,7 +121,8 @@ export class DrivePanel {
     if (!wheel) return;
     wheel.inputs.end();
     window.clearInterval(wheel.timer);
-    // The stops of a hold that was under way.
+    wheel.driver.leave();
+    // That others may drive.
     for (let command = wheel.driver.tick(now() * 1000); command; command = wheel.driver.tick(now() * 1000)) wheel.socket.send(wheel.limits.command, command);
     wheel.socket.close();
     this.wheel = undefined;
@@ -173,7 +180,9 @@ export class DrivePanel {
     const who = driver.driving(at_ms);
     this.who.set(who ? (who.mine ? "you drive" : `${who.by} drives`) : "nobody drives");
     const against = phase === "free" ? driver.against(at_ms) : "";
-    this.say(phase === "over" ? `${driver.reason}. Let go to begin again.` : against || WORDS[phase]);
+    const free = against || (phase === "free" && driver.reason ? `${driver.reason}.` : WORDS[phase === "over" ? "free" : phase]);
+    const unheard = phase === "holding" && !who?.mine;
+    this.say(phase === "over" ? `${driver.reason}. Let go to begin again.` : unheard ? UNHEARD : free);
     this.over.hidden = driver.other === "";
     if (!this.sure) this.over.textContent = `Take over from ${driver.other}`;
   }

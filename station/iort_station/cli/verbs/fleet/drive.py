@@ -129,7 +129,7 @@ class _Seat:
     def leave(self) -> None:
         """Have the car stop."""
         self._keys.let_go()
-        self._driver.hold(held=False, now_us=_now_us())
+        self._driver.leave()
         while (command := self._driver.tick(_now_us())) is not None:
             self.broker.publish(self._topic, encode_command(command))
             time.sleep(_TICK_US / 1e6)
@@ -221,6 +221,10 @@ def _state(driver: Driver) -> Text:
         return Text(f"let go: {driver.reason}", style="red")
     if driver.phase is Phase.DRIVING:
         return Text("you drive", style="bold green")
+    if driver.phase is Phase.HOLDING:
+        if driver.mine:
+            return Text("you hold the car: it stands until you drive or quit", style="bold green")
+        return Text("the car does not hear you: others, or a planner on board, may drive it", style="red")
     if driver.phase is Phase.STARTING:
         return Text("waiting for the car", style="yellow")
     text = f"{driver.driver} drives" if driver.driver and not driver.mine else "hold a key to drive"
