@@ -17,7 +17,7 @@ from yarl import URL
 
 from iort_contract.messages.requests.files import PART_BYTES, UPLOAD_URL_S
 from iort_station.page.background import BackgroundServer
-from local.network.addresses import client_of
+from iort_station.page.places import client_of
 from local.network.certificates import ServerCertificate
 
 # "Authenticating Requests: Using Query Parameters (AWS Signature Version 4)", with a role's credentials.

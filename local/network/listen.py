@@ -8,11 +8,15 @@ import socket
 from dataclasses import dataclass
 
 from local.errors import LocalError
-from local.network.addresses import is_ipv6
 from local.network.certificates import is_address, spelled
 
 HTTPS_PORT = 443
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
+
+
+def is_ipv6(host: str) -> bool:
+    """Whether a host is an IPv6 address."""
+    return ":" in host
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 from argon2 import PasswordHasher, extract_parameters
 from argon2.exceptions import InvalidHashError, VerificationError
 
+from iort_station.page.places import client_of
 from local.errors import LocalError
-from local.network.addresses import client_of
 from local.network.certificates import write_private
 
 LEAST_CHARACTERS = 10

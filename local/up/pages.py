@@ -17,7 +17,7 @@ from iort_station.fleet import registry
 from iort_station.page.answers import control
 from iort_station.page.answers.downloads import downloads
 from iort_station.page.answers.index import actions, answers
-from iort_station.page.answers.socket import reaching
+from iort_station.page.answers.socket import prompt, reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.listen import Listen
@@ -72,7 +72,7 @@ def shown(cloud: Cloud) -> dict[str, Any]:
         "namespace": cloud.namespace,
         **reaching(cloud, IOT),
         # Robots come while it runs.
-        "vehicles": lambda: registry.vehicles(cloud),
+        "vehicles": lambda: registry.vehicles(prompt(cloud)),
         "answers": answers(cloud),
         "downloads": downloads(cloud),
         "open_actions": actions(cloud),

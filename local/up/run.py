@@ -27,9 +27,8 @@ from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
 from local.cloud import EmbeddedCloud
 from local.errors import EmulatorError, LocalError
-from local.network.addresses import is_ipv6
 from local.network.certificates import write_private
-from local.network.listen import Listen
+from local.network.listen import Listen, is_ipv6
 from local.settings import FILE, NO, Settings
 from local.state import VERSION, StateFolder
 from local.up import notify, options

@@ -16,10 +16,8 @@ import logging
 import re
 import secrets
 import ssl
-import threading
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from concurrent.futures import Future
+from collections.abc import AsyncIterator, Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -47,9 +45,12 @@ from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.bodies import Body, as_json, packed, takes_gzip
 from iort_station.page.invitations import COMMAND, answer, listening
-from iort_station.page.page import BUILT, TYPES, built_files, config
+from iort_station.page.page import BUILT, DRIVE, TYPES, built_files, config
+from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of, off_the_loop
 
-Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
+# What waits yields whenever it does, and holds no place meanwhile.
+Waiting = Generator[None, None, Mapping[str, Any]]
+Answer = Callable[[Mapping[str, str]], Mapping[str, Any] | Waiting]
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
 Vehicles = Mapping[str, Mapping[str, float]]
@@ -60,13 +61,17 @@ _log = logging.getLogger("iort")
 IDLE_S = 30.0
 # Where a browser gets the key.
 ADMISSION = "/key.json"
+CONFIG, DRIVEN = "/config.json", f"/{DRIVE}.json"
 _CHUNK_BYTES = 256 * 1024
-# The most answers that are worked on at a time; further requests wait.
-MOST_ANSWERS = 16
+# A body must be here within this time, and who downloads must take a part within the other.
+BODY_S, PART_S = 10.0, 60.0
+# They stop and drive robots, or a page cannot begin without them. Each has a lane of its own, so that it
+# waits for nothing but its like.
+FIRST = frozenset({"/stop.json", DRIVEN, "/view.json", "/motion.json", "/socket.json", CONFIG, ADMISSION})
+# A page that begins has the vehicles as they were, if the cloud does not tell them in this time.
+_FRESH_S = 1.0
 # Invitations that nobody has used yet; a further one ends the oldest.
 _MOST_TOKENS = 64
-# A file of a long range takes a gigabyte of memory while it is written.
-MOST_DOWNLOADS = 2
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
 
 
@@ -79,10 +84,10 @@ class PageServer(BackgroundServer):
     gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``vehicles`` may be
     a function, for a server during which robots come. ``downloads`` maps a name to the function that writes
     the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server
-    accepts a Host that is localhost, an address or one of ``names``, and no other. In the
-    folder ``invitations`` it gives its own user an `invitation` when asked. With a ``context`` it speaks
-    HTTPS. Raises `StationError` if the page is not built, if the port is in use, and for a
-    configuration that it must not serve.
+    accepts a Host that is localhost, an address or one of ``names``, and no other. In the folder
+    ``invitations`` it gives its own user an `invitation` when asked. A body must come within ``body_s``.
+    With a ``context`` it speaks HTTPS. Raises `StationError` if the page is not built, if the port is in use,
+    and for a configuration that it must not serve.
     """
 
     def __init__(
@@ -108,6 +113,7 @@ class PageServer(BackgroundServer):
         names: Iterable[str] = (),
         built: Path = BUILT,
         invitations: Path | None = None,
+        body_s: float = BODY_S,
         context: ssl.SSLContext | None = None,
     ) -> None:
         super().__init__(host, port, tls=context, idle_s=IDLE_S)
@@ -120,9 +126,8 @@ class PageServer(BackgroundServer):
         self._key = secrets.token_urlsafe(32)
         self._tokens: deque[str] = deque(maxlen=_MOST_TOKENS)
         self._invitations = invitations if keyed else None
+        self._body_s = body_s
         self._admitted = admitted or (lambda _: None)
-        self._free = asyncio.Semaphore(MOST_ANSWERS)
-        self._free_to_write = asyncio.Semaphore(MOST_DOWNLOADS)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = partial(
             config,
@@ -149,10 +154,14 @@ class PageServer(BackgroundServer):
             for name, content in built_files(built).items()
         }
         self._files["/"] = self._files["/index.html"]
+        self._work: Work
+        self._fresh: asyncio.Future[tuple[int, Body]] | None
+        self._known: Body | None = None
+        self._read_config: Callable[[], Body]
         if callable(vehicles):
-            self._answers["/config.json"] = lambda _: told(vehicles=vehicles())
+            self._read_config = lambda: as_json(told(vehicles=vehicles()))
         else:
-            self._files["/config.json"] = as_json(told(vehicles=vehicles))
+            self._files[CONFIG] = as_json(told(vehicles=vehicles))
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
@@ -191,6 +200,8 @@ class PageServer(BackgroundServer):
     @asynccontextmanager
     async def beside(self) -> AsyncIterator[None]:
         """Give invitations to who serves the page."""
+        # A loop that begins again leaves the places of the last one to its threads.
+        self._work, self._fresh = Work(FIRST), None
         if self._invitations is None:
             yield
             return
@@ -214,18 +225,18 @@ class PageServer(BackgroundServer):
             return self._response(request, as_json({"error": refused}), 403)
         path = request.raw_path.partition("?")[0]
         if request.method == "POST" and path == ADMISSION and self._keyed:
-            return await self._act(request, self._admit)
+            return await self._act(request, path, self._admit)
         if request.method == "POST" and path in self._actions:
-            return await self._act(request, self._actions[path], keyed=path in self._keyed)
+            return await self._act(request, path, self._actions[path], keyed=path in self._keyed)
         if request.method not in {"GET", "HEAD"}:
             return self._response(request, packed(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
+        if path == CONFIG and path not in self._files:
+            return await self._config(request)
         answer = self._answers.get(path)
         if answer is not None:
-            parameters = dict(request.query)
-            status, body = await self._off_the_loop(lambda: _answered(answer, parameters), self._free)
-            return self._response(request, body, status)
+            return await self._answer(request, path, answer, dict(request.query), READING)
         if path in self._downloads:
-            return await self._download(request, self._downloads[path])
+            return await self._download(request, path)
         file = self._files.get(path)
         if file is None:
             return self._response(request, packed(TYPES[".txt"], b"404 Not Found\n"), 404)
@@ -237,12 +248,53 @@ class PageServer(BackgroundServer):
             response.body = None
         return response
 
-    async def _download(self, request: web.BaseRequest, download: Download) -> web.StreamResponse:
-        parameters = dict(request.query)
-        with TemporaryDirectory(prefix="iort-download-") as folder:
-            found = await self._off_the_loop(
-                lambda: _tried(lambda: download(parameters, Path(folder))), self._free_to_write
+    async def _config(self, request: web.BaseRequest) -> web.Response:
+        """One reading for all who ask meanwhile; who has waited long enough gets the last one's."""
+        if self._fresh is None or self._fresh.done():
+            read = self._read_config
+            self._fresh = asyncio.ensure_future(off_the_loop(lambda: _tried(lambda: (200, read()))))
+        with suppress(asyncio.TimeoutError):
+            status, body = await asyncio.wait_for(
+                asyncio.shield(self._fresh), None if self._known is None else _FRESH_S
             )
+            if status != 200 and self._known is None:
+                return self._response(request, body, status)
+            if status == 200:
+                self._known = body
+        assert self._known is not None
+        return self._response(request, self._known, 200)
+
+    async def _answer(
+        self,
+        request: web.BaseRequest,
+        path: str,
+        answer: Answer,
+        parameters: Mapping[str, str],
+        lane: str,
+    ) -> web.Response:
+        """The answer, in a place of its lane; what yields waits without one."""
+        client = client_of(request.remote or "")
+        try:
+            result = await self._work.do(lambda: _answered(answer, parameters), lane, client, path)
+            if not isinstance(result, tuple):
+                waiting = result
+                result = await self._work.until(lambda: _stepped(waiting), lane, client, path)
+        except Busy as busy:
+            return self._busy(request, busy)
+        return self._response(request, result[1], result[0])
+
+    async def _download(self, request: web.BaseRequest, path: str) -> web.StreamResponse:
+        parameters, download = dict(request.query), self._downloads[path]
+        with TemporaryDirectory(prefix="iort-download-") as folder:
+            try:
+                found = await self._work.do(
+                    lambda: _tried(lambda: download(parameters, Path(folder))),
+                    WRITING,
+                    client_of(request.remote or ""),
+                    path,
+                )
+            except Busy as busy:
+                return self._busy(request, busy)
             if isinstance(found, tuple):
                 return self._response(request, found[1], found[0])
             response = web.StreamResponse(
@@ -257,28 +309,14 @@ class PageServer(BackgroundServer):
                 response.content_length = found.stat().st_size
                 await response.prepare(request)
                 while request.method == "GET" and (part := await asyncio.to_thread(file.read, _CHUNK_BYTES)):
-                    await response.write(part)
+                    await asyncio.wait_for(response.write(part), PART_S)
             await response.write_eof()
             return response
 
-    async def _off_the_loop(self, work: Callable[[], _T], free: asyncio.Semaphore) -> _T:
-        """Run ``work`` in a daemon thread, so that a slow answer delays neither a file nor the exit."""
-        await free.acquire()
-        loop = asyncio.get_running_loop()
-        done: Future[_T] = Future()
-        done.set_running_or_notify_cancel()
-
-        def run() -> None:
-            try:
-                done.set_result(work())
-            except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
-                done.set_exception(error)
-            # Not where the answer is awaited: a viewer who leaves does not end the thread.
-            with suppress(RuntimeError):  # the server has ended
-                loop.call_soon_threadsafe(free.release)
-
-        threading.Thread(target=run, name="page answer", daemon=True).start()
-        return await asyncio.wrap_future(done)
+    def _busy(self, request: web.BaseRequest, busy: Busy) -> web.Response:
+        response = self._response(request, as_json({"error": f"{busy}: try again"}), 429 if busy.own else 503)
+        response.headers["Retry-After"] = "1"
+        return response
 
     def _admit(self, asked: Mapping[str, str]) -> Admitted:
         """The key, for a token that was not used before; or whether a kept key is still the server's."""
@@ -301,7 +339,7 @@ class PageServer(BackgroundServer):
         return secrets.compare_digest(told.encode(errors="surrogateescape"), self._key.encode())
 
     async def _act(
-        self, request: web.BaseRequest, action: Answer, *, keyed: bool = False
+        self, request: web.BaseRequest, path: str, action: Answer, *, keyed: bool = False
     ) -> web.StreamResponse:
         """Answer with the result of an action; its parameters are texts in a JSON object."""
         # Every browser sends the origin with a POST, and no script can change it.
@@ -318,13 +356,16 @@ class PageServer(BackgroundServer):
                 request, as_json({"error": "an action needs a body of application/json"}), 415
             )
         try:
-            asked = json.loads(await request.text())
+            asked = json.loads(await asyncio.wait_for(request.text(), self._body_s))
+        except asyncio.TimeoutError:
+            late = self._response(request, as_json({"error": "the body must be here sooner"}), 408)
+            late.force_close()
+            return late
         except (ValueError, LookupError, RecursionError):  # also of an unknown charset
             asked = None
         if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
             return self._response(request, as_json({"error": "the body must be an object of texts"}), 400)
-        status, body = await self._off_the_loop(lambda: _answered(action, asked), self._free)
-        return self._response(request, body, status)
+        return await self._answer(request, path, action, asked, ACTING)
 
     def _accepts(self, host: str) -> bool:
         """Whether a request's Host is ours.
@@ -358,8 +399,25 @@ def on_loopback(host: str) -> bool:
         return False
 
 
-def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, Body]:
-    return _tried(lambda: (200, as_json(answer(parameters), level=1)))
+def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
+    def begun() -> tuple[int, Body] | Waiting:
+        result = answer(parameters)
+        return result if isinstance(result, Generator) else (200, as_json(result, level=1))
+
+    return _tried(begun)
+
+
+def _stepped(waiting: Waiting) -> tuple[int, Body] | None:
+    """The answer; None if it has yet to come."""
+
+    def step() -> tuple[int, Body] | None:
+        try:
+            next(waiting)
+        except StopIteration as end:
+            return 200, as_json(end.value, level=1)
+        return None
+
+    return _tried(step)
 
 
 def _tried(work: Callable[[], _T]) -> _T | tuple[int, Body]:

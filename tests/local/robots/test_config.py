@@ -12,6 +12,7 @@ from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
+from iort_station.fleet.control.shadow import slept
 from iort_station.operations.delivery import counts
 from iort_station.page.answers import control
 from tests.local.conftest import until
@@ -117,8 +118,8 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
         # The page's server does what both commands do.
         again = {"robot": car.robot, "command": "drive", "message": '{"drive": {"speed": -1.0}}'}
         # On a slow machine it is too late, and what is changed is not confirmed in time.
-        until(lambda: control.send(embedded.cloud, again)["reason"].startswith("without lease, sent "))
-        until(lambda: control.send(embedded.cloud, {**again, "lease_ms": "3000"})["accepted"])
+        until(lambda: slept(control.send(embedded.cloud, again))["reason"].startswith("without lease, sent "))
+        until(lambda: slept(control.send(embedded.cloud, {**again, "lease_ms": "3000"}))["accepted"])
         rate = {"robot": car.robot, "name": "live.rate_hz", "value": "4"}
 
         def changed() -> bool:

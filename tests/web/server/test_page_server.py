@@ -11,7 +11,7 @@ import socket
 import stat
 import threading
 from collections.abc import AsyncIterator, Mapping
-from contextlib import ExitStack, asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from iort_station.errors import StationError, UsageError
 from iort_station.page import invitations
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
-from iort_station.page.server import MOST_ANSWERS, MOST_DOWNLOADS, PageServer, on_loopback
+from iort_station.page.server import PageServer, on_loopback
 from tests.ports import free_port
 
 TOLD: dict[str, Any] = {
@@ -151,62 +151,6 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> No
             assert waiting.recv(1) == b""
     finally:
         done.set()
-
-
-def test_answers_in_progress_are_bounded_even_if_viewers_leave(built: Path) -> None:
-    working, done = threading.Semaphore(0), threading.Event()
-
-    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
-        working.release()
-        done.wait()
-        return {}
-
-    def threads() -> int:
-        return sum(thread.name == "page answer" for thread in threading.enumerate())
-
-    answers = {"slow": slow}
-    with PageServer(**TOLD, built=built, answers=answers) as page, ExitStack() as viewers:
-        try:
-            for _ in range(2):
-                for _ in range(MOST_ANSWERS):
-                    viewer = socket.create_connection((page.host, page.port))
-                    viewers.enter_context(viewer).sendall(
-                        b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n"
-                    )
-                for _ in range(MOST_ANSWERS - threads()):
-                    assert working.acquire(timeout=60)
-                assert ask(page, "/page.js")[0].status == 200
-                assert threads() == MOST_ANSWERS
-                viewers.close()
-        finally:
-            done.set()
-        assert ask(page, "/slow.json")[0].status == 200
-
-
-def test_few_downloads_are_written_at_a_time_even_if_viewers_leave(built: Path) -> None:
-    begun, done = threading.Semaphore(0), threading.Event()
-    written = 0
-
-    def slow(_asked: Mapping[str, str], _folder: Path) -> Path:
-        nonlocal written
-        written += 1
-        begun.release()
-        done.wait()
-        raise StationError("nothing is stored")
-
-    with PageServer(**TOLD, built=built, downloads={"a.csv": slow}) as page, ExitStack() as viewers:
-        try:
-            for _ in range(MOST_DOWNLOADS + 2):
-                viewer = socket.create_connection((page.host, page.port))
-                viewers.enter_context(viewer).sendall(b"GET /a.csv HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            for _ in range(MOST_DOWNLOADS):
-                assert begun.acquire(timeout=60)
-            viewers.close()
-            assert ask(page, "/page.js")[0].status == 200
-            assert written == MOST_DOWNLOADS
-        finally:
-            done.set()
-        assert ask(page, "/a.csv")[0].status == 400
 
 
 def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import getpass
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
@@ -16,7 +16,7 @@ from iort_contract.topics import CMD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
-from iort_station.fleet.control.shadow import Shadow, outcome
+from iort_station.fleet.control.shadow import Shadow, outcome, slept
 from iort_station.times import iso_s
 
 VALID_MS, ANSWER_S = 2_000, 10.0
@@ -56,7 +56,12 @@ def operator() -> str:
     return "".join(filter(str.isprintable, name))[:MAX_BY_CHARACTERS] or "unknown"
 
 
-def send(
+def send(cloud: Cloud, robot: str, name: str, message: Mapping[str, Any], **given: Any) -> Sent:
+    """As `sending`, which has the arguments, in one call."""
+    return slept(sending(cloud, robot, name, message, **given))
+
+
+def sending(
     cloud: Cloud,
     robot: str,
     name: str,
@@ -67,8 +72,8 @@ def send(
     seconds: float = ANSWER_S,
     takeover: bool = False,
     on_offline: Callable[[str], None] = lambda _text: None,
-) -> Sent:
-    """Send a command and wait for the robot's answer, at most ``seconds``.
+) -> Generator[None, None, Sent]:
+    """Send a command and wait for the robot's answer, at most ``seconds``: it yields between two looks.
 
     Every call is an operator's session of its own. While another one drives, its motion is refused, unless it
     says ``takeover``. ``lease_ms`` is how long the robot may move. A robot that is not connected is hardly
@@ -98,7 +103,9 @@ def send(
     if offline := _offline(cloud, robot):
         on_offline(offline)
         seconds = min(seconds, _OFFLINE_S)
-    said = shadow.wait(lambda state: outcome(state, name, command.session, command.seq), seconds)
+    said = yield from shadow.waiting(
+        lambda state: outcome(state, name, command.session, command.seq), seconds
+    )
     return Sent(command, said, offline if said is None else "")
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -95,11 +95,28 @@ class Shadow:
 
     def wait(self, found: Callable[[State], _Found | None], seconds: float) -> _Found | None:
         """Wait until ``found`` returns a value for the state; None after ``seconds``."""
+        return slept(self.waiting(found, seconds))
+
+    def waiting(
+        self, found: Callable[[State], _Found | None], seconds: float
+    ) -> Generator[None, None, _Found | None]:
+        """As `wait`; it yields where that sleeps."""
         deadline = time.monotonic() + seconds
         while (value := found(self.read())) is None and time.monotonic() < deadline:
-            # A shadow sends no events to this API.
-            time.sleep(_POLL_S)
+            yield
         return value
+
+
+def slept(waiting: Generator[None, None, _Found]) -> _Found:
+    """The result of what waits for a robot."""
+    while True:
+        try:
+            next(waiting)
+        except StopIteration as end:
+            result: _Found = end.value
+            return result
+        # A shadow sends no events to this API.
+        time.sleep(_POLL_S)
 
 
 def over_share(cloud: Cloud, robot: str) -> OverShare | None:

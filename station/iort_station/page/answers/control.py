@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from typing import Any
 
 from iort_contract.messages.control.commands import MAX_LEASE_MS
@@ -39,9 +39,9 @@ def actions(cloud: Cloud) -> dict[str, Answer]:
     }
 
 
-def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
+def send(cloud: Cloud, asked: Mapping[str, str]) -> Generator[None, None, SendAnswer]:
     """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves;
-    ``takeover`` takes the wheel from whoever drives."""
+    ``takeover`` takes the wheel from whoever drives. It yields while it waits for the robot."""
     try:
         message = json.loads(text(asked, "message"))
     except (ValueError, RecursionError) as error:
@@ -50,15 +50,8 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> SendAnswer:
         raise StationError("the message must be a JSON object with the fields of the ROS message")
     lease_ms = whole(asked, "lease_ms", 1, MAX_LEASE_MS) if asked.get("lease_ms") else None
     began = time.monotonic()
-    takeover = asked.get("takeover") == "true"
-    sent = commands.send(
-        cloud,
-        text(asked, "robot"),
-        text(asked, "command"),
-        message,
-        lease_ms=lease_ms,
-        takeover=takeover,
-    )
+    robot, name, takeover = text(asked, "robot"), text(asked, "command"), asked.get("takeover") == "true"
+    sent = yield from commands.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
         return {"accepted": None, "reason": sent.offline, "after_ms": after_ms}

@@ -51,7 +51,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
     """What everybody who reaches the page may do, by its name."""
     return {
-        "view": lambda asked: viewing.view(cloud, asked),
+        "view": lambda asked: viewing.view(socket.prompt(cloud), asked),
         "acknowledge": lambda asked: alarms.acknowledge(
             cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
         ),

@@ -18,6 +18,7 @@ from iort_station.fleet import registry
 from iort_station.fleet.control import stopping
 from iort_station.operations.monitoring.alarms import user
 from iort_station.page.answers.parameters import text, whole
+from iort_station.page.answers.socket import prompt
 
 # Every open page asks for the fleet, and each robot costs a read of its shadow. For a while after a stop or a
 # release somebody waits for the robots' word.
@@ -28,7 +29,7 @@ class _Fleet:
     """The motion of every robot, read at most every few seconds however many pages ask."""
 
     def __init__(self, cloud: Cloud) -> None:
-        self._cloud = cloud
+        self.cloud = prompt(cloud)
         self._lock = threading.Lock()
         self._read_s = self._changed_s = float("-inf")
         self._found: dict[str, stopping.Motion] = {}
@@ -37,8 +38,9 @@ class _Fleet:
         with self._lock:
             began_s = time.monotonic()
             kept_s = _KEPT_WAITING_S if began_s - self._changed_s < _WAITING_S else _KEPT_S
-            if began_s - self._read_s >= kept_s:
-                self._found = stopping.motion(self._cloud, registry.presence(self._cloud))
+            # What was read while somebody changed it may be from before.
+            if began_s - self._read_s >= kept_s or self._read_s <= self._changed_s:
+                self._found = stopping.motion(self.cloud, registry.presence(self.cloud))
                 self._read_s = began_s
             return self._found
 
@@ -48,7 +50,7 @@ class _Fleet:
 
     def changed(self) -> None:
         """A stop or a release was asked for: read again when asked next, and often. Waits for no reading."""
-        self._changed_s, self._read_s = time.monotonic(), float("-inf")
+        self._changed_s = time.monotonic()
 
 
 @functools.cache
@@ -63,7 +65,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
 
     def listed(asked: Mapping[str, str]) -> MotionAnswer:
         robot = asked.get("robot")
-        return _told(stopping.motion(cloud, [check_robot(robot)]) if robot else fleet.motion(), {})
+        return _told(stopping.motion(fleet.cloud, [check_robot(robot)]) if robot else fleet.motion(), {})
 
     return {"motion": listed}
 
@@ -72,13 +74,13 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """The action ``stop``. It shares no connection with what is read."""
     fleet, urgent = _fleet(cloud), cloud.urgent()
 
-    def everyone() -> list[str]:
+    def everyone(known: list[str]) -> list[str]:
         try:
             return list(registry.presence(urgent))
         except (BotoCoreError, ClientError):
-            if not fleet.names():
+            if not known:
                 raise
-            return fleet.names()
+            return known
 
     def stop(asked: Mapping[str, str]) -> MotionAnswer:
         """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
@@ -87,11 +89,15 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         if wanted is None:
             raise StationError("stopped must be true or false")
         one = [check_robot(asked["robot"])] if asked.get("robot") else None
-        robots = one or everyone()
+        known = fleet.names()
         if wanted:
-            failed = stopping.stop(urgent, robots, by=user(), fleet=one is None)
-            failed |= stopping.take_back(urgent, set(one or ()) - set(fleet.names()))
+            # Nothing is looked up before it.
+            failed = stopping.stop(urgent, one or known, by=user(), fleet=one is None)
+            robots = one or everyone(known)
+            failed |= stopping.stop(urgent, set(robots) - set(one or known), by=user(), fleet=one is None)
+            failed |= stopping.take_back(urgent, set(one) - set(known) if one else set(known) - set(robots))
         else:
+            robots = one or everyone(known)
             seen_ms = whole(asked, "seen_ms", 0, 10**15)
             failed = stopping.release(urgent, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
         fleet.changed()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -73,13 +74,20 @@ def identity(cloud: Cloud) -> Identity:
     }
 
 
+@functools.cache
+def prompt(cloud: Cloud) -> Cloud:
+    """The cloud of addresses, leases and motion: their clients wait for no other reading, and a stop has its
+    own."""
+    return cloud.urgent()
+
+
 def _origin(cloud: Cloud) -> str:
     address = urlsplit(cloud.websocket_url)
     return f"{address.scheme}://{address.netloc}"
 
 
 def _addresses(cloud: Cloud, name: str) -> Callable[[Mapping[str, str]], SocketAnswer]:
-    role = Role(cloud, name)
+    role = Role(prompt(cloud), name)
 
     def answer(_asked: Mapping[str, str]) -> SocketAnswer:
         signed = role.signed()

@@ -46,6 +46,9 @@ class FakeCloud:
         tables = {"TelemetryTable": TELEMETRY, "SummaryTable": SUMMARY, "RobotsTable": ROBOTS}
         return (tables | {"ArchiveTable": ARCHIVE, "FilesBucket": "files"})[name]
 
+    def urgent(self):
+        return self
+
 
 def cloud_of(*batches, page_items=2, robot="car", gain=None):
     client = FakeDynamoDB(page_items=page_items)
