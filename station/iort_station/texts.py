@@ -13,3 +13,8 @@ def visible(text: str) -> str:
     """Replace each character that a terminal would obey by its code, as JSON spells it."""
     # JSON's spelling, so that JSON stays JSON.
     return _OBEYED.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def one_line(text: str) -> str:
+    """The same, with the codes of line breaks and tabs, for a text among others: it must not begin a line."""
+    return visible(text).replace("\n", "\\n").replace("\t", "\\t")

@@ -16,7 +16,7 @@ from rich import console
 from rich.segment import Segment
 from rich.text import Text
 
-from iort_station.texts import visible
+from iort_station.texts import one_line, visible
 
 
 class Console(console.Console):
@@ -24,6 +24,11 @@ class Console(console.Console):
 
     def __init__(self, **given: Any) -> None:
         super().__init__(**{"highlight": False, "markup": False, "emoji": False, **given})
+
+    def print(self, *objects: Any, lines: bool = False, **given: Any) -> None:
+        """As rich does. A text is one line unless it has ``lines`` of our own: a robot's must begin none."""
+        shown = [one_line(one) if isinstance(one, str) and not lines else one for one in objects]
+        super().print(*shown, **given)
 
     def render_str(self, text: str, **given: Any) -> Text:
         """As rich does; before the layout, which counts characters."""
@@ -47,7 +52,7 @@ def print_json(value: Any) -> None:
 
 def tell(facts: Mapping[str, Any], text: str, *, as_json: bool) -> None:
     """Print what a verb has done: a line of JSON for a script, or a text."""
-    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
+    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True, lines=True)
 
 
 def _number(value: Any) -> int | float:

@@ -50,6 +50,17 @@ def test_the_console_prints_no_control_characters(terminal, text):
     assert not [one for one in said if not one.isprintable() and one != "\n"]
 
 
+def test_a_text_among_others_begins_no_line_of_its_own():
+    file = io.StringIO()
+    console = Console(file=file, width=200)
+    # A setting's value as a robot may report it.
+    console.print("fields.vesc=speed\ncar1 is stopped\r\n\tall is well", soft_wrap=True)
+    console.print("two\nlines", lines=True)
+    assert file.getvalue().splitlines() == [
+        r"fields.vesc=speed\ncar1 is stopped\u000d\n\tall is well", "two", "lines",
+    ]  # fmt: skip
+
+
 def test_markup_and_emoji_codes_are_printed_literally():
     file = io.StringIO()
     console, table = Console(file=file, width=200), Table("[link=https://example.org]here[/link]")

@@ -56,7 +56,7 @@ def calibrate(
     _print(found)
     if not lines:
         return
-    out.print(f"\nvesc.yaml:\n{lines}", end="", highlight=False)
+    out.print(f"\nvesc.yaml:\n{lines}", end="", highlight=False, lines=True)
     gain = found.found[calibration.GAIN].estimate
     if vehicle is not None and not gain.low <= vehicle.speed_to_erpm_gain <= gain.high:
         say(

@@ -14,6 +14,7 @@ from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.control import commands as fleet_commands
+from iort_station.texts import one_line
 
 commands = typer.Typer()
 
@@ -74,7 +75,7 @@ def send(
         )
     if said != ACCEPTED:
         advice = fleet_commands.advice(said)
-        raise StationError(f"{robot} has rejected {name}: {said}{advice and f': {advice}'}")
+        raise StationError(f"{robot} has rejected {name}: {one_line(said)}{advice and f': {advice}'}")
 
 
 def _message(text: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from iort_station.cli.words import examples, say
 from iort_station.data.stored.archive import Archive
 from iort_station.errors import StationError
 from iort_station.operations import archive
+from iort_station.texts import one_line
 
 commands = typer.Typer(
     name="archive", no_args_is_help=True, help="Telemetry that is kept for good, as Parquet in the bucket."
@@ -111,7 +112,7 @@ def verify(
         lines = [f"{name.robot} {name.name}: {found.hours:,} hours, {found.samples:,} samples"]
         lines += [f"    {hour}: {problem}" for hour, problem in found.problems.items()]
         if not as_json:
-            console.out.print("\n".join(lines), soft_wrap=True)
+            console.out.print("\n".join(map(one_line, lines)), soft_wrap=True, lines=True)
     if as_json:
         console.print_json(streams)
     elif not streams:

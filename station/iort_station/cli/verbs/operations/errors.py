@@ -17,6 +17,7 @@ from iort_station.cloud import Cloud
 from iort_station.fleet import registry
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
+from iort_station.texts import one_line
 from iort_station.times import iso_s, stamped
 
 commands = typer.Typer()
@@ -70,12 +71,7 @@ def _print(entry: DeadLetter) -> None:
         Text.assemble((entry.id, "bold"), f"  {_utc(entry.last_ms)}  {entry.robot}  {times}"), soft_wrap=True
     )
     where = " ".join(filter(None, (entry.source, entry.topic)))
-    out.print(f"    {where}: {one_line(entry.reason)}", soft_wrap=True)
-
-
-def one_line(text: str) -> str:
-    """The text without line ends and control characters."""
-    return "".join(character if character.isprintable() else " " for character in text)
+    out.print(f"    {where}: {entry.reason}", soft_wrap=True)
 
 
 def _show(entry: DeadLetter, *, as_json: bool) -> None:
@@ -93,9 +89,9 @@ def _show(entry: DeadLetter, *, as_json: bool) -> None:
         ("last", f"{_utc(entry.last_ms)}, {entry.seen} times, {entry.replays} replays"),
         ("bytes", str(len(payload))),
     ):
-        out.print(Text.assemble((f"{name:<11}", "bold"), value), soft_wrap=True)
+        out.print(Text.assemble((f"{name:<11}", "bold"), one_line(value)), soft_wrap=True)
     out.print()
-    out.print(as_text(payload), soft_wrap=True)
+    out.print(as_text(payload), soft_wrap=True, lines=True)
 
 
 def as_text(payload: bytes) -> str:

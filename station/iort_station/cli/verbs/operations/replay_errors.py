@@ -10,7 +10,7 @@ import typer
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot, When, ranged
 from iort_station.cli.progress import bar
-from iort_station.cli.verbs.operations.errors import as_fields, entries, one_line
+from iort_station.cli.verbs.operations.errors import as_fields, entries
 from iort_station.cli.words import examples
 from iort_station.operations import quarantine, replay
 from iort_station.operations.replay import Fate
@@ -51,7 +51,7 @@ def replay_errors(
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
                 line = f"{outcome.letter.id}  {outcome.letter.robot}  {outcome.fate.value}{detail}"
-                out.print(one_line(line), soft_wrap=True)
+                out.print(line, soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
         out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
     if any(outcome.fate is Fate.FAILED for outcome in outcomes):
