@@ -9,6 +9,8 @@ from iort_contract.ros1.message import RosType, type_id
 
 # A definition is one text, cut into pieces that a field may hold.
 _PIECE, _MAX_PIECES = 4000, 64
+# The form that a message had before a source made ROS 1's of it.
+ROS2 = "ros2"
 
 
 class MessageType(NamedTuple):
@@ -16,7 +18,8 @@ class MessageType(NamedTuple):
 
     A source sends it once a run, as a sample of the stream `TYPES_STREAM`; readers need it to rebuild the
     messages. ``kind`` is in ROS 1's form, ``package/Type``; ``definition`` is the text that a publisher sends
-    and a bag keeps, with all nested types.
+    and a bag keeps, with all nested types. ``converted_from`` is `ROS2` for messages of ROS 2 that the source
+    has converted to this type, and empty for those that are as they were published.
     """
 
     stream: str
@@ -24,6 +27,7 @@ class MessageType(NamedTuple):
     kind: str
     md5sum: str
     definition: str
+    converted_from: str = ""
 
     @property
     def id(self) -> str:
@@ -44,6 +48,8 @@ class MessageType(NamedTuple):
             )
         sample: dict[str, Value] = dict(self._asdict())
         del sample["definition"]
+        if not self.converted_from:
+            del sample["converted_from"]
         sample.update({f"definition.{i}": piece for i, piece in enumerate(pieces)})
         return sample
 
@@ -56,4 +62,4 @@ def message_type(sample: Mapping[str, Value]) -> MessageType:
         pieces = [texts[f"definition.{i}"] for i in range(sum("definition." in name for name in texts))]
     except KeyError as error:
         raise ContractError(f"message type must have {error}") from error
-    return MessageType(stream, topic, kind, md5sum, "".join(pieces))
+    return MessageType(stream, topic, kind, md5sum, "".join(pieces), texts.get("converted_from", ""))

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping
 
 from iort_analysis.samples.batches import RefusedItems
-from iort_contract.messages.message_type import MessageType
+from iort_contract.messages.message_type import ROS2, MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
@@ -33,8 +33,8 @@ def write(
     """Write the messages of a selection and return their number; ``say`` takes lines about the result, and
     ``origin`` grows by what comes from the archive.
 
-    ROS messages are written as they were published. Other samples become messages of the type that their
-    source gave, or of their fields.
+    ROS messages are written as they were published, and those of ROS 2 in its form if ``file`` can hold it.
+    Other samples become messages of the type that their source gave, or of their fields.
     """
     robot, stream = selection.robot, selection.stream
     known = {name: kind for name, (_, kind) in messages.types(cloud, robot, stream).items()}
@@ -44,12 +44,17 @@ def write(
     for t_us, name, raw in export.messages(progress):
         if name not in writers:
             kind = export.types[name]
-            writers[name] = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum)
+            ros2 = kind.converted_from == ROS2
+            writers[name] = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum, ros2=ros2)
         writers[name](t_us * 1000, raw)
         counts[name] = counts.get(name, 0) + 1
     for name, count in counts.items():
         kind = export.types[name]
-        say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, as they were published")
+        form = "as they were published"
+        if kind.converted_from == ROS2:
+            form = "of ROS 2, converted to ROS 1 when they were recorded"
+            form += " and back for this file" if file.ros2 else ""
+        say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, {form}")
         if name not in known:
             say("  its definition is not stored, so topic, comments and constants are not the publisher's")
     if export.refused.count:

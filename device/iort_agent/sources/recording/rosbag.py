@@ -20,7 +20,7 @@ from iort_agent.sources.recording.reader import INDEX, Reader
 from iort_agent.sources.recording.unreadable import wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.messages.message_type import MessageType
+from iort_contract.messages.message_type import ROS2, MessageType
 from iort_contract.ros1.decode import Decoder, Large, stamp_ns
 from iort_contract.ros1.definition import md5sum, parse
 from iort_contract.ros1.message import RosMessage, RosType
@@ -182,7 +182,9 @@ class Recording:
             definition = parse(kind, text)
         sample = None
         try:
-            sample = MessageType(stream, connection.topic, kind, md5, text).sample()
+            sample = MessageType(
+                stream, connection.topic, kind, md5, text, converted_from=ROS2 if self._reader.is2 else ""
+            ).sample()
         except ContractError as error:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         large = Decoder(definition, large=True) if self._large else None

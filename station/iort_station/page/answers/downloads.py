@@ -76,9 +76,10 @@ class _Bounded:
 
     def __init__(self, file: Recording) -> None:
         self._file, self._left = file, MOST_BYTES
+        self.ros2 = file.ros2
 
-    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
-        write = self._file.topic(topic, kind, definition, md5sum)
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str, *, ros2: bool = False) -> Write:
+        write = self._file.topic(topic, kind, definition, md5sum, ros2=ros2)
 
         def bounded(t_ns: int, message: bytes) -> None:
             self._left -= len(message)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import struct
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from iort_agent.lanes.batch_encoder import BatchEncoder
+from iort_agent.sources import Emit
 from iort_agent.sources.intake import Intake, TopicConfig
+from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data.selection import select
@@ -25,14 +30,15 @@ from tests.fakes import TELEMETRY, item_of_message
 from tests.ros.mixed.robot import MESSAGES
 from tests.ros1_strategies import definitions, messages
 from tests.ros1_types import HEADER, Message, fields, header
+from tests.unit.agent.sources.test_bag import write_mcap, write_ros2
 from tests.unit.station.data.test_data import cloud_of
 
 T0_US = 1_700_000_000_000_000
 STEP_S = 0.01
 
 
-def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
-    """The messages after the source, batches, queue, table and export; all but the network."""
+def stored(play: Callable[[Emit, ManualClock], None]) -> Any:
+    """The cloud after a source, batches and queue; all but the network."""
     clock, spool = ManualClock(now_us=T0_US), MemorySpool(max_bytes=2**30)
     encoders: dict[str, BatchEncoder] = {}
 
@@ -42,16 +48,7 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
             encoders[stream] = BatchEncoder(stream, boot=boot, batch_s=1, spool=spool, clock=clock)
         encoders[stream].add(t_us, values)
 
-    intake = Intake("/made", TopicConfig(stream="made", time="arrival"), emit=emit, clock=clock)
-    connection = {
-        "callerid": "/maker",
-        "type": definition.kind,
-        "md5sum": definition.md5sum,
-        "message_definition": definition.definition,
-    }
-    for message in sent:
-        intake.take(connection, message)
-        clock.advance(STEP_S)
+    play(emit, clock)
     for encoder in encoders.values():
         encoder.flush()
     cloud, at = cloud_of(), 0
@@ -59,6 +56,25 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
         at = entry.id
         topic = build_topic(RECORD, "car", entry.stream)
         cloud.table.put(TELEMETRY, item_of_message(entry.payload, topic))
+    return cloud
+
+
+def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
+    """The messages after the source, batches, queue, table and export; all but the network."""
+
+    def play(emit: Emit, clock: ManualClock) -> None:
+        intake = Intake("/made", TopicConfig(stream="made", time="arrival"), emit=emit, clock=clock)
+        connection = {
+            "callerid": "/maker",
+            "type": definition.kind,
+            "md5sum": definition.md5sum,
+            "message_definition": definition.definition,
+        }
+        for message in sent:
+            intake.take(connection, message)
+            clock.advance(STEP_S)
+
+    cloud = stored(play)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.bag"
         with recordings.bag(path) as file:
@@ -123,3 +139,47 @@ def test_the_types_written_by_hand_have_ross_checksums() -> None:
             known += 1
             assert store.generate_msgdef(name, ros_version=1)[1] == message.md5sum, message.kind
     assert known >= 10
+
+
+# A type of ROS 2 has a byte if it has no field.
+PAIR = (
+    "/pair",
+    "lab_msgs/msg/Pair",
+    (
+        f"std_msgs/Empty e\nfloat64 x\n{'=' * 80}\n"
+        "MSG: std_msgs/Empty\nuint8 structure_needs_at_least_one_member\n"
+    ),
+    b"\0\1\0\0" + bytes(8) + struct.pack("<d", 1.5),
+)
+
+
+@pytest.mark.parametrize("topic", ["/sensors/core", "/odd", "/pair"])
+def test_what_ros_2_recorded_is_exported_in_its_form(tmp_path: Path, topic: str) -> None:
+    if topic == "/pair":
+        source = write_mcap(tmp_path / "drive.mcap", PAIR)
+    else:
+        source = next(write_ros2(tmp_path / "drive", "mcap").glob("*.mcap"))
+
+    def play(emit: Emit, clock: ManualClock) -> None:
+        BagConfig(path=source, topics=((topic, "made"),)).build(clock).run(emit, Event())
+
+    cloud, path = stored(play), tmp_path / "made.mcap"
+    lines: list[str] = []
+    with recordings.mcap(path) as file:
+        write(cloud, select("car", "made"), file, say=lines.append)
+    assert "of ROS 2, converted to ROS 1 when they were recorded and back for this file" in lines[0]
+    assert read_ros2(path, topic) == read_ros2(source, topic)
+    with recordings.bag(tmp_path / "made.bag") as bag:
+        write(cloud, select("car", "made"), bag, say=lines.append)
+    assert lines[-1].endswith("of ROS 2, converted to ROS 1 when they were recorded")
+
+
+def read_ros2(path: Path, topic: str) -> list[tuple[str, str, str, bytes]]:
+    """Type, encodings and bytes of a topic's messages in an MCAP file of ROS 2."""
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        return [
+            (schema.name, schema.encoding, channel.message_encoding, message.data)
+            for schema, channel, message in reader.iter_messages(topics=[topic])
+        ]
