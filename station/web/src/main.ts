@@ -2,7 +2,7 @@
 
 import { FIELD_TABLE, LIVE_MAX_RATE_HZ, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
-import { invited } from "./server/admission";
+import { invited, readOnly } from "./server/admission";
 import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
 import { Alarms } from "./live/alarms";
@@ -11,7 +11,7 @@ import { Fleet } from "./live/fleet";
 import { Registry } from "./live/registry";
 import { observer } from "./live/observer";
 import { GLANCE_HZ, NONE, Viewing, type Looks } from "./link/viewing";
-import { readRoute, route, type Route } from "./base/route";
+import { readRoute, route, unread, type Route } from "./base/route";
 import { StatusBar } from "./widgets/status_bar";
 import { Waiting } from "./widgets/waiting";
 import { startTheme } from "./base/theme";
@@ -50,6 +50,7 @@ class Page {
   private readonly drive: DrivePanel;
   private readonly stage = byId("stage");
   private readonly tools = el("p", { class: "tools" });
+  private readonly ignored = el("p", { class: "ignored", role: "status", hidden: "" });
   private route: Route = { view: "fleet" };
   private shape = -1;
   private clockAt = -Infinity;
@@ -67,7 +68,7 @@ class Page {
     });
     this.registry = new Registry(config);
     this.viewing = new Viewing(config, (lease) => this.feed.lease(lease));
-    this.waiting = new Waiting(config, this.registry);
+    this.waiting = new Waiting(config, this.registry, this.fleet);
     this.stops = new StopControl(config, (robot) => this.registry.presence(robot)?.online, () => this.drive?.show());
     this.drive = new DrivePanel(config, this.stops.stops);
     const alarms = new Alarms(config, this.fleet, table);
@@ -79,6 +80,9 @@ class Page {
     this.compareView = new CompareView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
     this.alarmsView = new AlarmsView(config, alarms);
+    byId("over").after(this.ignored);
+    const why = readOnly(config);
+    if (why) byId("over").after(el("p", { class: "read-only", role: "status" }, el("b", {}, "Read-only"), `: ${why.replace(/\.$/, "")}. The command `, el("code", {}, "iort invite"), " prints a link that gives one more browser the stop, the wheel and every other action."));
     for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
     window.addEventListener("hashchange", () => (invited(location.hash) ? location.reload() : this.go()));
     window.addEventListener("keydown", (event) => this.key(event));
@@ -90,6 +94,9 @@ class Page {
 
   private go(): void {
     this.route = readRoute(location.hash);
+    const ignored = unread(location.hash);
+    this.ignored.hidden = ignored.length === 0;
+    this.ignored.textContent = ignored.length > 0 ? `Ignored in the address: ${ignored.join("; ")}.` : "";
     const { view } = this.route;
     const robot = "robot" in this.route ? this.route.robot : undefined;
     const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, insights: this.insightsView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];

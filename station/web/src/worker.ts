@@ -2,20 +2,22 @@
 // does not have to.
 
 import { now } from "./base/clock";
+import { NAME } from "./base/contract";
 import { IotLink } from "./link/iot_link";
 import { PubNubLink } from "./link/pubnub_link";
 import { parseLive, parseUpdate, type Update } from "./link/update";
-import type { Arrival, FromWorker, LinkState, Listening, ToWorker } from "./link/worker_messages";
+import type { Arrival, FromWorker, LinkState, Listening, Refused, ToWorker } from "./link/worker_messages";
 
 // Messages of this time are handed over together, because each handover wakes the page.
 const TOGETHER_MS = 25;
 // The most messages that wait for a busy page; beyond that the oldest is dropped.
 const MOST_WAITING = 2_000;
+// Names come from the network; beyond this many, rejected messages are counted together.
+const MOST_NAMED = 200;
 
 let link: IotLink | PubNubLink | undefined;
 let arrivals: Arrival[] = [];
-let refused = 0;
-let lastRefusal = "";
+const refused = new Map<string, Refused>();
 let handing: number | undefined;
 let taking = false;
 
@@ -25,22 +27,25 @@ function hand(): void {
   handing = undefined;
   if (taking) return;
   taking = true;
-  tell({ kind: "arrivals", arrivals, refused, lastRefusal });
+  tell({ kind: "arrivals", arrivals, refused: [...refused.values()] });
   arrivals = [];
-  refused = 0;
+  refused.clear();
 }
 
-function take(update: Update | string, pubnub_us?: number): void {
+function refuse(robot: string, reason: string): void {
+  refused.set(robot, { robot, messages: (refused.get(robot)?.messages ?? 0) + 1, reason });
+}
+
+/** `from` is the robot that the message's channel or topic names. */
+function take(update: Update | string, from: string, pubnub_us?: number): void {
   if (typeof update === "string") {
-    refused += 1;
-    lastRefusal = update;
+    refuse(NAME.test(from) && (refused.has(from) || refused.size < MOST_NAMED) ? from : "", update);
   } else {
     arrivals.push({ update, at: now(), wall_us: Date.now() * 1000, pubnub_us });
   }
   if (arrivals.length > MOST_WAITING) {
-    arrivals.shift();
-    refused += 1;
-    lastRefusal = "more than this device can show";
+    const dropped = arrivals.shift();
+    refuse(dropped?.update.robot ?? "", "more than this device can show");
   }
   handing ??= self.setTimeout(hand, TOGETHER_MS);
 }
@@ -50,9 +55,9 @@ function start(listening: Listening): void {
   const onState = (state: LinkState): void => tell({ kind: "state", state });
   link =
     listening.live === "iot"
-      ? new IotLink(listening, now, (topic, payload) => take(parseLive(namespace, version, topic, payload)), onState)
+      ? new IotLink(listening, now, (topic, payload) => take(parseLive(namespace, version, topic, payload), topic.split("/")[2] ?? ""), onState)
       : // A timetoken counts 100 ns.
-        new PubNubLink(listening, now, (channel, message, timetoken) => take(parseUpdate(namespace, version, channel, message), Number(timetoken) / 10), onState);
+        new PubNubLink(listening, now, (channel, message, timetoken) => take(parseUpdate(namespace, version, channel, message), channel.slice(namespace.length + 1), Number(timetoken) / 10), onState);
   link.connect();
 }
 
@@ -65,6 +70,6 @@ self.addEventListener("message", (event: MessageEvent<ToWorker>) => {
   }
   else {
     taking = false;
-    if (arrivals.length > 0 || refused > 0) handing ??= self.setTimeout(hand, TOGETHER_MS);
+    if (arrivals.length > 0 || refused.size > 0) handing ??= self.setTimeout(hand, TOGETHER_MS);
   }
 });

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
 
-from tests.web.logic.node import call
+from tests.web.logic.node import call, run
 
 
 def test_the_noise_of_positions_is_no_way() -> None:
@@ -59,3 +60,8 @@ def test_an_axis_has_room_above_and_below_its_values(
     least: float, most: float, zero: bool, expected: list[float]
 ) -> None:
     assert call("charts/axes.ts", "roundRange", least, most, 0.1, zero) == pytest.approx(expected)
+
+
+def test_every_range_of_time_has_several_labels() -> None:
+    steps = run("charts/axes.ts", "return page.TIME_STEPS_S")
+    assert max(after / before for before, after in itertools.pairwise(steps)) <= 2.5

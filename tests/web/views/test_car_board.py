@@ -12,6 +12,7 @@ from iort_contract.catalog.streams import LOG_STREAM, POSE_STREAM
 from iort_station.page.server import PageServer
 from tests.browser import drawn, plain, show, until
 from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
+from tests.web.lab import Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -100,7 +101,8 @@ def test_the_viewers_charts_are_kept_and_shared(
     open_page: Callable[..., Page], page: Page, car: Car, url: str
 ) -> None:
     show(page, car.send())
-    first = ["Speed", "Battery voltage", "Current", "Duty cycle", "Speed and motor current", "Delay"]
+    titles = "Speed, Battery voltage, Current, Duty cycle, Speed and motor current, Delay of each message"
+    first = titles.split(", ")
     assert page.evaluate(TITLES) == first
     page.get_by_label("Close Duty cycle").click()
     page.get_by_label("Move Delay").focus()
@@ -110,7 +112,7 @@ def test_the_viewers_charts_are_kept_and_shared(
     page.locator("[name=chart]").focus()
     page.select_option("[name=chart]", "vesc/temperature_pcb")
     show(page, car.send())
-    mine = ["Delay", *first[:3], first[4], "Board temperature"]
+    mine = ["Delay of each message", *first[:3], first[4], "Board temperature"]
     assert page.evaluate(TITLES) == mine
     charts = ["delay", *DEFAULT[:3], *DEFAULT[4:-1], "vesc/temperature_pcb"]
     assert page.url == f"{url}#/car/car-1?window=60&charts={','.join(charts)}"
@@ -171,3 +173,22 @@ def test_a_chart_is_dragged_to_another_place(page: Page, car: Car) -> None:
     page.mouse.up()
     assert page.evaluate(TITLES)[:2] == ["Battery voltage", "Speed"]
     assert "charts=battery,speed,currents" in page.url
+
+
+def test_the_charts_keep_their_height_when_something_opens_beside_them(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(server.invitation("#/car/car-1"))
+        show(page, Car(pubnub).send())
+        height = "() => document.querySelector('.board .charts').offsetHeight"
+        before = page.evaluate(height)
+        page.get_by_role("heading", name="Settings").click()
+        page.locator(".setting").first.wait_for()
+        assert page.evaluate(height) == before
+
+
+def test_each_latency_says_which_it_is(page: Page, car: Car) -> None:
+    show(page, car.send())
+    named = ("Delay of the newest message", "Delay of each message", "median of 10 s, car to page")
+    assert [page.get_by_text(text, exact=True).count() for text in named] == [1, 1, 1]

@@ -249,7 +249,9 @@ def test_only_a_browser_that_was_invited_may_act(
     page = open_page(address.partition("?")[0])
     show(page, car.send())
     commands = page.get_by_role("heading", name="Commands")
-    assert "open the address in the server's terminal" in page.inner_text(".aside")
+    banner = page.locator(".read-only")
+    assert "Read-only: this page was opened without a link" in banner.inner_text()
+    assert "iort invite" in banner.inner_text()
     assert not commands.is_visible()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     # In the same tab, only what follows the # is another.
@@ -258,6 +260,7 @@ def test_only_a_browser_that_was_invited_may_act(
     until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
     show(page, car.send())
     assert commands.is_visible()
+    assert not banner.is_visible()
     assert page.url == address.partition("?")[0]
     # The address was used, and this browser keeps the key.
     again = page.context.new_page()
@@ -265,3 +268,6 @@ def test_only_a_browser_that_was_invited_may_act(
     until(lambda: again.evaluate("window.iort?.link") == "live", "another tab to connect")
     show(again, car.send())
     assert again.get_by_role("heading", name="Commands").is_visible()
+    # Another browser cannot use it again, and is told so.
+    other = open_page(address)
+    assert "Read-only: this address was used before" in other.inner_text(".read-only")

@@ -23,6 +23,7 @@ from tests.browser import plain, until
 from tests.fakes import TELEMETRY, item_of
 from tests.unit.station.data.test_data import START, cloud_of
 from tests.web.cars import GAIN, SUBSCRIBE_KEY
+from tests.web.lab import VIEWS, Lab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
@@ -345,3 +346,48 @@ def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer
     assert middle(page, 10, "m") == pytest.approx([math.sqrt(2), math.sqrt(3)], abs=0.02)
     page.locator("#compare-stream").select_option("agent")
     until(lambda: "car has no distance in agent" in note.inner_text(), "the reason")
+
+
+def test_times_are_typed_with_24_hours(open_page: Callable[..., Page], pubnub: PubNubStandIn) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(f"{server.url}{VIEWS['history'].address}", timezone_id="UTC", locale="en-US")
+        page.locator(VIEWS["history"].filled).first.wait_for()
+        page.fill("#from", "2026-05-04 14:00:00")
+        page.fill("#to", "3 PM")
+        page.get_by_role("button", name="Load").click()
+        wrong = 'to must be a date and a time like 2026-05-04 14:03:27, got "3 PM".'
+        page.get_by_text(wrong).wait_for()
+        page.fill("#to", "2026-05-04 15:00:00")
+        page.get_by_role("button", name="Load").click()
+        until(lambda: "from=2026-05-04T14:00:00.000Z&to=2026-05-04T15:00:00.000Z" in page.url, "the range")
+
+
+def test_the_lines_of_a_comparison_have_names(open_page: Callable[..., Page], pubnub: PubNubStandIn) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(f"{server.url}{VIEWS['compare'].address}", timezone_id="UTC")
+        page.locator(VIEWS["compare"].filled).first.wait_for()
+        legend = page.locator(".compare-view .charts .panel").first.locator(".reading .label")
+        assert legend.all_inner_texts() == ["10:00:00 UTC", "11:00:00 UTC"]
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("#/history/car-1?from=yesterday&foo=1", "from must be a time like 2026-05-04T10:00:00.000Z, got"),
+        ("#/history/car-1?from=yesterday&foo=1", "history has no parameter foo"),
+        (
+            "#/history/car-1?from=2026-05-04T10:00:00Z&to=2026-05-04T09:00:00Z",
+            "from and to must be two times in their order",
+        ),
+        ("#/compare?runs=car1/now", "runs must be at most 6 ranges like car1/"),
+        ("#/hstory/car-1", 'there is no view "hstory/car-1"'),
+    ],
+)
+def test_what_an_address_says_in_vain_is_told(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn, address: str, told: str
+) -> None:
+    with Lab().server(pubnub) as server:
+        page = open_page(f"{server.url}{address}")
+        page.get_by_text(told).wait_for()
+        page.goto(f"{server.url}#/alarms")
+        until(lambda: not page.get_by_text("Ignored in the address").is_visible(), "a good address")

@@ -217,7 +217,11 @@ def test_malformed_messages_are_counted_and_ignored(page: Page, car: Car) -> Non
     car.publish(good, "iort.not.a.robot")
     until(lambda: page.evaluate("iort.malformed") == len(bad) + 1, "the malformed messages")
     assert page.evaluate("Object.keys(iort.robots).length") == 0
+    told = f"{len(bad)} live messages came and could not be read; the last: too many fields."
+    until(lambda: page.inner_text("#empty-text") == told, "the word of a car that is only garbled")
     show(page, car.send())
+    told = f"{len(bad)} live messages of this car could not be read; the last: too many fields."
+    page.get_by_text(told).wait_for()
     until(lambda: page.inner_text("#malformed") == str(len(bad) + 1), "the footer")
     assert shown(page, "voltage_input") == "11.65"
 

@@ -2,7 +2,7 @@
 // static site serves them all, and a link shows what its sender saw.
 
 import { NAME } from "./contract";
-import { readRange, writeTime, type Range } from "./range";
+import { readRange, readTime, writeTime, type Range } from "./range";
 
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
@@ -55,6 +55,32 @@ export function readRoute(hash: string): Route {
   if (name === "alarms") return { view: name, query: read(name) };
   if (name === "compare") return { view: name, query: read(name) };
   return { view: "fleet", query: read("fleet") };
+}
+
+const WORDS: Readonly<Record<string, readonly [reads: (value: string) => boolean, must: string]>> = {
+  ...Object.fromEntries(["from", "to", "at"].map((name) => [name, [(value: string) => !Number.isNaN(readTime(value)), "be a time like 2026-05-04T10:00:00.000Z"]])),
+  stream: [(value) => NAME.test(value), "be a stream's name"],
+  runs: [(value) => value === "" || (readParts(value).length === value.split(",").length && readParts(value).length <= MOST_PARTS), `be at most ${MOST_PARTS} ranges like car1/2026-05-04T10:00:00.000Z/2026-05-04T10:05:00.000Z`],
+  x: [(value) => value === "time" || value === "distance", "be time or distance"],
+  zoom: [(value) => /^[-\d.]+,[-\d.]+$/.test(value), "be two numbers"],
+  window: [(value) => /^\d+$/.test(value), "be a number of seconds"],
+};
+
+/** What of an address is not shown because it cannot be read, for the viewer. */
+export function unread(hash: string): string[] {
+  const { view, query = {} } = readRoute(hash);
+  const [path = "", given = ""] = hash.replace(/^#\/?/, "").split(/\?(.*)/);
+  const robot = path.split("/")[1];
+  if (path !== "" && (path.split("/")[0] !== view || (robot !== undefined && !NAME.test(robot)))) return [`there is no view "${path}"`];
+  const names: readonly string[] = PARAMETERS[view];
+  const values = [...new URLSearchParams(given)].map(([name, value]) => {
+    if (!names.includes(name)) return `${view} has no parameter ${name}`;
+    const [reads, must] = WORDS[name] ?? [];
+    return reads && !reads(value) ? `${name} must ${must}, got "${value}"` : "";
+  });
+  const { from, to } = query as Query<"history">;
+  const order = view === "history" && (from ?? to) !== undefined && values.every((text) => text === "") && !readRange(from, to) ? ["from and to must be two times in their order"] : [];
+  return [...values.filter((text) => text !== ""), ...order];
 }
 
 /** Put what the view shows into the address, as a step of the browser's history if `step`. The view is not called. */

@@ -87,7 +87,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   },
   { kind: "gauge", name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
   {
-    kind: "gauge", name: "delay", label: "Delay, car to page", unit: "ms", digits: 0, from: 0, to: 100,
+    kind: "gauge", name: "delay", label: "Delay of the newest message", unit: "ms", digits: 0, from: 0, to: 100,
     fields: [],
     show: (_, robot) => ({ value: robot.newestDelay()?.total ?? NaN }),
   },
@@ -174,7 +174,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
 const DELAY: DelaySpec = {
   kind: "delay",
   key: "delay",
-  title: "Delay",
+  title: "Delay of each message",
   readings: [{ name: "delay", unit: "ms", digits: 0, from: first }],
   chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
 };

@@ -11,6 +11,15 @@ export interface Paint {
 // The part of a range that is left free above and below.
 const ROOM = 0.04;
 
+export const DAY_S = 86_400;
+/** The steps of an axis of time. Each is at most two and a half times the one before, so that every range has several
+ *  labels. */
+export const TIME_STEPS_S = [
+  ...[1e-3, 1e-2, 0.1].flatMap((power) => [power, 2 * power, 5 * power]),
+  ...[1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14_400, 21_600, 43_200],
+  ...[1, 2, 5, 10, 15, 28, 56, 84, 168, 365, 730, 1825, 3650].map((days) => days * DAY_S),
+];
+
 export const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
 
 export function paint(): Paint {

@@ -1,7 +1,7 @@
 // A chart of a range by uPlot: of a past time, with the time of day below it, or of any other quantity.
 
 import uPlot from "uplot";
-import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { axis, DAY_S, faint, fit, holes, labels, paint, PLAIN, rem, roundRange, TIME_STEPS_S } from "./axes";
 import { gestures } from "./gestures";
 import type { Range } from "../base/range";
 import { dayTime, number, when } from "../base/format";
@@ -108,7 +108,7 @@ export class RangeChart {
         },
         scales: { x: { time: options.unit === undefined, auto: false, range: () => [...this.range] }, y: { range: rounded }, right: { range: rounded } },
         axes: [
-          axis(colours, 1.5, 0.3, { space: rem(5), values: (_, splits) => (options.unit === undefined ? timeLabels(splits) : labels(splits).map((text) => `${text} ${options.unit}`)) }),
+          axis(colours, 1.5, 0.3, { space: rem(4.6), ...(options.unit === undefined ? { incrs: TIME_STEPS_S } : {}), values: (_, splits) => (options.unit === undefined ? timeLabels(splits) : labels(splits).map((text) => `${text} ${options.unit}`)) }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
           ...(right ? [axis(colours, 3.1, 0.4, { side: 1, scale: "right", space: rem(2.2), grid: { show: false }, values: (_, splits) => labels(splits) })] : []),
         ],
@@ -221,8 +221,6 @@ export class RangeChart {
     hands?.zoom([plot.posToVal(left, "x"), plot.posToVal(left + width, "x")]);
   }
 }
-
-const DAY_S = 86_400;
 
 /** Times as precise as their steps. */
 function timeLabels(splits: readonly number[]): string[] {

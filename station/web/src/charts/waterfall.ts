@@ -47,7 +47,7 @@ export class Waterfall {
         "header",
         {},
         el("h3", {}, "Delay by hop"),
-        el("p", { class: "reading" }, el("span", { class: "label", title: "from the car to the page, which then has to draw it" }, "to page"), this.median.node, el("span", { class: "unit" }, "ms")),
+        el("p", { class: "reading" }, el("span", { class: "label", title: "from leaving the car to arriving at the page, which then has to draw it" }, `median of ${MEDIAN_S} s, car to page`), this.median.node, el("span", { class: "unit" }, "ms")),
       ),
       list,
       this.warning.node,
@@ -72,7 +72,7 @@ export class Waterfall {
     const known = [...robot.streams.values()].some(({ hops }) => hops.offset_known);
     const clocks = known ? "The car's clock is corrected by the offset that it measured." : "The car has not measured its clock's offset: its clock is taken as it is.";
     const told = backwards(delay) ? "A hop takes less than no time: the clocks of car, cloud and this device disagree." : clocks;
-    this.warning.set(`Medians of ${MEDIAN_S} s. ${told}`);
+    this.warning.set(`Medians of ${MEDIAN_S} s, so they are not the newest message's. ${told}`);
     setAttribute(this.warning.node, "data-bad", String(backwards(delay)));
   }
 }

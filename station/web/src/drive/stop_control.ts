@@ -34,7 +34,7 @@ export class StopControl {
     const header = byId("top");
     header.after(strip);
     // It is read before it is needed, and takes no room later.
-    header.parentElement!.after(this.unable.node);
+    byId("over").after(this.unable.node);
     // What stays in sight while the page scrolls covers what is below it.
     const measured = [[header, "--header"], [strip, "--strip"]] as const;
     const observer = new ResizeObserver(() => measured.forEach(([node, name]) => document.documentElement.style.setProperty(name, `${node.offsetHeight}px`)));

@@ -87,7 +87,7 @@ export class CompareCharts {
     const { label, unit, digits } = this.spec(field);
     const readings = names.map((name) => new Text("num", "span", { "aria-label": name }));
     const plot = el("div", { class: "plot" });
-    const values = readings.map(({ node }, i) => el("p", { class: "reading" }, el("span", { class: `key ${hue(i)}` }), node));
+    const values = readings.map(({ node }, i) => el("p", { class: "reading" }, el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }), el("span", { class: "label" }, names[i]!), node));
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values), plot);
     this.node.append(node);
     const curves = names.map((name, i) => ({ label: name, colour: `--${hue(i)}`, dash: dash(i) }));

@@ -5,11 +5,15 @@ import { zone } from "../base/format";
 import type { Range } from "../base/range";
 
 const LAST = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
+const FORM = "2026-05-04 14:03:27";
+const TYPED = { size: String(FORM.length + 1), placeholder: FORM, title: `Date and time, like ${FORM}`, autocomplete: "off", spellcheck: "false" };
 // Shorter ranges show milliseconds.
 const FINE_S = 20;
 
 export interface RangeFormEvents {
   readonly range: (range: Range) => void;
+  /** A text that is no time, for the viewer. */
+  readonly wrong: (text: string) => void;
   readonly last: (seconds: number) => void;
   readonly stream: () => void;
   readonly out: () => void;
@@ -17,8 +21,9 @@ export interface RangeFormEvents {
 
 export class RangeForm {
   readonly node: HTMLFormElement;
-  private readonly from = el("input", { type: "datetime-local", step: "1", id: "from", name: "from" });
-  private readonly to = el("input", { type: "datetime-local", step: "1", id: "to", name: "to" });
+  // Not of the type for times: some browsers write those with AM and PM, whatever the page says.
+  private readonly from = el("input", { type: "text", id: "from", name: "from", ...TYPED });
+  private readonly to = el("input", { type: "text", id: "to", name: "to", ...TYPED });
   private readonly zone = new Text("zone");
   private readonly select = el("select", { id: "stream", name: "stream" });
   /** Goes back to the range before the zoom. */
@@ -40,7 +45,9 @@ export class RangeForm {
     );
     this.node.addEventListener("submit", (event) => {
       event.preventDefault();
-      events.range([seconds(this.from), seconds(this.to)]);
+      const wrong = [this.from, this.to].find((input) => Number.isNaN(seconds(input)));
+      if (wrong) events.wrong(`${wrong.name} must be a date and a time like ${FORM}, got "${wrong.value}".`);
+      else events.range([seconds(this.from), seconds(this.to)]);
     });
     this.select.addEventListener("change", events.stream);
     this.out.addEventListener("click", events.out);
@@ -77,9 +84,10 @@ export class RangeForm {
 
 /** A time in the input's format, in this device's time zone. */
 function local(at: number): string {
-  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 23);
+  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 23).replace("T", " ");
 }
 
-function seconds(input: HTMLInputElement): number {
-  return new Date(input.value).getTime() / 1000;
+/** NaN for a text that is no date with a time. */
+function seconds({ value }: HTMLInputElement): number {
+  return /^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?$/.test(value.trim()) ? new Date(value.trim().replace(" ", "T")).getTime() / 1000 : NaN;
 }

@@ -39,6 +39,13 @@ export interface Arrival {
   readonly pubnub_us: number | undefined;
 }
 
+/** Messages that were rejected, and why the last one was; of no robot if its name cannot be told. */
+export interface Refused {
+  readonly robot: string;
+  readonly messages: number;
+  readonly reason: string;
+}
+
 export type FromWorker =
   | { readonly kind: "state"; readonly state: LinkState }
-  | { readonly kind: "arrivals"; readonly arrivals: readonly Arrival[]; readonly refused: number; readonly lastRefusal: string };
+  | { readonly kind: "arrivals"; readonly arrivals: readonly Arrival[]; readonly refused: readonly Refused[] };

@@ -13,7 +13,7 @@ export class Feed {
   constructor(config: Config, table: FieldTable, fleet: Fleet, onState: (state: LinkState) => void) {
     this.worker.addEventListener("message", ({ data }: MessageEvent<FromWorker>) => {
       if (data.kind === "arrivals") {
-        fleet.take(data.arrivals, data.refused, data.lastRefusal);
+        fleet.take(data.arrivals, data.refused);
         this.tell({ kind: "taken" });
       } else {
         this.state = data.state;

@@ -6,7 +6,7 @@ import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
 import { BOUNDS } from "./bounds";
 import { Robot } from "./robot";
 import { Stream, type Used } from "./stream";
-import type { Arrival } from "../link/worker_messages";
+import type { Arrival, Refused } from "../link/worker_messages";
 
 export class Fleet {
   readonly robots = new Map<string, Robot>();
@@ -17,6 +17,8 @@ export class Fleet {
   lastRefusal = "";
   /** Grows when a car or a stream is new or forgotten. */
   shape = 0;
+  /** The rejected messages of each robot, also of one that has sent nothing else. */
+  readonly refused = new Map<string, Refused>();
   private readonly used: Used = { columns: 0 };
   private watched: Robot | undefined;
   private vehicles: VehiclesAnswer["vehicles"];
@@ -29,11 +31,13 @@ export class Fleet {
     this.vehicles = config.vehicles;
   }
 
-  /** Take arrivals, and the number of messages rejected meanwhile. */
-  take(arrivals: readonly Arrival[], refused: number, lastRefusal: string): void {
-    this.received += arrivals.length + refused;
-    this.malformed += refused;
-    if (refused > 0) this.lastRefusal = lastRefusal;
+  /** Take arrivals, and the messages rejected meanwhile. */
+  take(arrivals: readonly Arrival[], refused: readonly Refused[]): void {
+    this.received += arrivals.length;
+    for (const each of refused) {
+      this.received += each.messages;
+      this.refuse(each);
+    }
     for (const arrival of arrivals) this.takeOne(arrival);
   }
 
@@ -42,8 +46,7 @@ export class Fleet {
     let stream = robot.streams.get(update.stream);
     if (!stream) {
       if (robot.streams.size >= BOUNDS.streams) {
-        this.malformed += 1;
-        this.lastRefusal = "too many streams";
+        this.refuse({ robot: robot.name, messages: 1, reason: "too many streams" });
         return;
       }
       stream = new Stream(update.stream, this.table, this.used, robot === this.watched);
@@ -63,6 +66,14 @@ export class Fleet {
     const last_us = wall_us - (pubnub_us ?? sent_us);
     const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, (pubnub_us ?? NaN) - lambda_us, last_us];
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
+  }
+
+  private refuse({ robot, messages, reason }: Refused): void {
+    this.malformed += messages;
+    this.lastRefusal = robot ? `${robot}: ${reason}` : reason;
+    if (robot && (this.refused.has(robot) || this.refused.size < BOUNDS.robots)) {
+      this.refused.set(robot, { robot, messages: (this.refused.get(robot)?.messages ?? 0) + messages, reason });
+    }
   }
 
   /** The conversion from erpm to m/s; undefined if the car's parameters are unknown. */

@@ -7,6 +7,8 @@ import { act, AnswerError, KEPT_KEY } from "./answers";
 
 const IN_ADDRESS = new RegExp(`[?&]${INVITATION}=([\\w-]+)`);
 let admitted = false;
+// Why the server gave this browser no key.
+let refusal = "this page was opened without a link that lets it act";
 
 /** Whether an address has a token. */
 export const invited = (hash: string): boolean => IN_ADDRESS.test(hash);
@@ -23,8 +25,9 @@ export async function enter(config: Config): Promise<void> {
       keep(KEPT_KEY, key);
       admitted = true;
     } catch (error) {
-      // The page is for looking, then, and says where the address is.
       if (!(error instanceof AnswerError)) throw error;
+      // The page is for looking, then, and says why.
+      refusal = error.message;
     }
   }
 }
@@ -32,5 +35,5 @@ export async function enter(config: Config): Promise<void> {
 /** Whether the server takes an action, and takes it from this browser. */
 export const may = (config: Config, action: string): boolean => config.actions.includes(action) && (admitted || !config.keyed.includes(action));
 
-/** Whether the server takes an action, but only from a browser that has its key. */
-export const barred = (config: Config, action: string): boolean => config.keyed.includes(action) && !admitted;
+/** Why this browser may only look; empty if it may act, or if nobody may. */
+export const readOnly = (config: Config): string => (admitted || config.keyed.length === 0 ? "" : refusal);

@@ -21,13 +21,11 @@ import { Settings } from "../car/settings";
 import { BoardTools } from "../car/board_tools";
 import { FaultLog } from "../car/fault_log";
 import { asks } from "../link/viewing";
-import { barred, may } from "../server/admission";
+import { may } from "../server/admission";
 import { StreamSection } from "../car/field_tiles";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
-
-const ONLY_LOOK = "This browser may only look. To send commands, open the address in the server's terminal.";
 
 export class CarView {
   readonly node: HTMLElement;
@@ -35,6 +33,7 @@ export class CarView {
   private readonly state = new Text("car-state");
   private readonly asks: boolean;
   private readonly fault = el("p", { class: "fault", role: "alert", hidden: "" });
+  private readonly malformed = new Text("garbled", "p");
   private readonly gauges: readonly Gauge[];
   private readonly gaugeRow = el("div", { class: "gauges" });
   private readonly board: Board;
@@ -80,10 +79,11 @@ export class CarView {
       "article",
       { class: "car", id: "car" },
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
+      this.malformed.node,
       this.gaugeRow,
       drive,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : barred(config, "send") ? [el("p", { class: "note only-look" }, ONLY_LOOK)] : []))),
+      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : []))),
       this.streams,
     );
   }
@@ -180,6 +180,9 @@ export class CarView {
     const screens = this.screens.column(1, now - MEDIAN_S);
     this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);
     this.faults.refresh(robot);
+    const { messages, reason } = this.fleet.refused.get(robot.name) ?? { messages: 0, reason: "" };
+    this.malformed.set(messages > 0 ? `${messages} live ${messages === 1 ? "message" : "messages"} of this car could not be read; the last: ${reason}.` : "");
+    this.malformed.node.hidden = messages === 0;
     this.log.refresh(robot);
     const fresh = robot.freshness(now);
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");

@@ -2,7 +2,7 @@
 
 import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
-import { age, number, when } from "../base/format";
+import { age, clockTime, number, when, zone } from "../base/format";
 import { same, writeTime, type Range } from "../base/range";
 import { MOST_PARTS, readParts, route, setAddress, writeParts, type Part, type Query } from "../base/route";
 import { AddPart } from "../history/add_part";
@@ -160,7 +160,7 @@ export class CompareView {
       if (loading.signal.aborted) return;
       this.extent = extent;
       [this.grid, this.unit] = [compared.grid, compared.unit];
-      this.charts.set(compared, parts.map(named), zoom ?? extent, this.wanted);
+      this.charts.set(compared, shortly(parts), zoom ?? extent, this.wanted);
       if (parts.length >= 2) this.note.set(samples === 0 ? "Nothing was stored in these ranges." : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`);
       this.read(0);
     } catch (error) {
@@ -198,4 +198,12 @@ export class CompareView {
 
 function named({ robot, range: [from] }: Part): string {
   return `${robot}, ${when(from)}`;
+}
+
+/** The shortest names that tell the parts apart: the robots, the times of day, or both. */
+function shortly(parts: readonly Part[]): string[] {
+  const robots = parts.map(({ robot }) => robot);
+  const times = parts.map(({ range: [from] }) => `${clockTime(from)} ${zone(from)}`);
+  const names = new Set(robots).size === parts.length ? robots : new Set(robots).size === 1 ? times : robots.map((robot, i) => `${robot} ${times[i]!}`);
+  return new Set(names).size === parts.length ? names : parts.map(named);
 }

@@ -45,6 +45,7 @@ export class HistoryView {
   ) {
     this.form = new RangeForm({
       range: (range) => this.open(range),
+      wrong: (text) => this.note.set(text),
       last: (seconds) => this.open(recent(seconds)),
       stream: () => this.choose(this.form.stream),
       out: () => this.zoomOut(),

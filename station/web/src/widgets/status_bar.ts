@@ -46,7 +46,8 @@ export class StatusBar {
     this.badge(at);
     write("received", number(fleet.received));
     write("malformed", number(fleet.malformed));
-    byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";
+    write("malformed-last", fleet.lastRefusal ? ` (the last: ${fleet.lastRefusal})` : "");
+    setAttribute(byId("malformed"), "data-bad", String(fleet.malformed > 0));
     write("late", number(fleet.outOfOrder));
     const { able, awake, error } = this.viewing;
     write("awake", able ? `${awake} ${awake === 1 ? "car" : "cars"} held awake` : "cannot wake cars");

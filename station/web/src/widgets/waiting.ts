@@ -4,6 +4,7 @@ import type { Config } from "../base/contract";
 import { byId, byName } from "../base/dom";
 import { capital } from "../base/format";
 import { route } from "../base/route";
+import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
 import { presence } from "./offline_cars";
 
@@ -13,6 +14,7 @@ export class Waiting {
   constructor(
     private readonly config: Config,
     private readonly registry: Registry,
+    private readonly fleet: Fleet,
   ) {}
 
   /** Say what is known of the car, or of no car yet. */
@@ -23,7 +25,9 @@ export class Waiting {
     const off = known && !known.online ? known : undefined;
     const comes = "It appears here with its first live message.";
     write("empty-title", unknown ? `There is no car ${robot}` : off ? `${robot} is offline` : `Waiting for ${robot ?? "a car"}`);
-    write("empty-text", unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes);
+    const refused = robot === undefined ? undefined : this.fleet.refused.get(robot);
+    if (refused) write("empty-text", `${refused.messages} live messages came and could not be read; the last: ${refused.reason}.`);
+    else write("empty-text", unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes);
     byId("empty-listening").hidden = unknown || off !== undefined;
     const past = byId("empty-past");
     past.hidden = robot === undefined || unknown || !this.config.answers;
