@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -76,6 +76,9 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 
 bench-drive: setup ## measure driving by hand from the page, with ROS 1: TRIES=50 ONLY="tab hidden" REPORT=figures.json
 	@$(BIN)/python -m bench.browser.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")
+
+bench-stop: setup ## measure the emergency stop under full overload: TRIES=20 REPORT=figures.json
+	@$(BIN)/python -m bench.browser.stopping $(if $(TRIES),--tries $(TRIES)) $(if $(REPORT),--json "$(REPORT)")
 
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
 	@$(BIN)/python -m bench.browser.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
