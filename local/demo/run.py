@@ -187,6 +187,7 @@ class _Demo:
         delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
         return (
             f"driving {seconds:3.0f} s, stored {stored:,} samples, live {len(heard):,} updates, delay {delay}"
+            + (f", {listener.malformed} malformed" if listener.malformed else "")
         )
 
     def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:

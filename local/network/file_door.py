@@ -10,6 +10,7 @@ import asyncio
 import re
 import ssl
 from collections import Counter
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 from aiohttp import ClientError, ClientSession, TCPConnector, web
@@ -39,6 +40,8 @@ _ANSWERED = re.compile(r"content-(length|type|range)|etag|last-modified|x-amz-[a
 _CHUNK_BYTES = 256 * 1024
 # A connection without a request is closed after this time.
 _IDLE_S = 30.0
+# So is one whose body pauses for as long.
+_PART_S = 30.0
 # Requests that pass at once, and those of one address. A share of the places is for addresses that have none.
 _MOST, _MOST_OF_ONE, _FIRST = 32, 8, 16
 
@@ -70,6 +73,8 @@ class FileDoor(BackgroundServer):
         if request.method == "PUT" and (length is None or length > PART_BYTES):
             # The gateway holds a body in memory before it judges the signature.
             return web.Response(status=413, text=f"a part of a file must have up to {PART_BYTES} bytes\n")
+        if request.method == "GET" and request.body_exists:
+            return web.Response(status=400, text="who gets a file sends no body\n")
         own, places = self._passing[client], _MOST - self._passing.total()
         if own >= _MOST_OF_ONE or places <= (_FIRST if own else 0):
             return web.Response(status=503, text="too many files pass at once: try again\n")
@@ -77,7 +82,8 @@ class FileDoor(BackgroundServer):
         try:
             return await asyncio.wait_for(self._pass(request), UPLOAD_URL_S)
         except asyncio.TimeoutError:
-            return web.Response(status=408, text=f"a part must be here within {UPLOAD_URL_S} s\n")
+            late = f"a part must be here within {UPLOAD_URL_S} s, without a pause\n"
+            return web.Response(status=408, text=late)
         finally:
             self._passing -= Counter([client])
 
@@ -85,7 +91,21 @@ class FileDoor(BackgroundServer):
         # The signature covers the Host that the robot sent, and path and query as they are.
         address = URL(f"{self._gateway}{request.raw_path}", encoded=True)
         headers = [(name, value) for name, value in request.headers.items() if _PASSED.fullmatch(name)]
-        body = request.content.iter_chunked(_CHUNK_BYTES) if request.method == "PUT" else None
+        late = False
+
+        async def parts() -> AsyncIterator[bytes]:
+            nonlocal late
+            while True:
+                try:
+                    part = await asyncio.wait_for(request.content.read(_CHUNK_BYTES), _PART_S)
+                except asyncio.TimeoutError:
+                    late = True
+                    raise
+                if not part:
+                    return
+                yield part
+
+        body = parts() if request.method == "PUT" else None
         async with ClientSession(connector=TCPConnector(ssl=self._trusts), auto_decompress=False) as session:
             try:
                 async with session.request(
@@ -101,6 +121,8 @@ class FileDoor(BackgroundServer):
                     await response.write_eof()
                     return response
             except ClientError as error:
+                if late:
+                    raise asyncio.TimeoutError from error
                 return web.Response(status=502, text=f"the files do not answer: {error}\n")
 
     def _passes(self, request: web.BaseRequest) -> bool:

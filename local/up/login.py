@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TextIO
 
 from argon2 import PasswordHasher, extract_parameters
 from argon2.exceptions import InvalidHashError, VerificationError
@@ -75,6 +76,14 @@ class Password:
     def version(self) -> int:
         """Changes with the password."""
         return self._path.stat().st_mtime_ns
+
+
+def first_password(new: str, command: str, output: TextIO) -> str:
+    """What is told of a password that was just made: a terminal alone is told which. Others can read what
+    goes into a file or a journal."""
+    if output.isatty():
+        return f"password {new} (shown once; `{command}` sets another)"
+    return f"password is not shown here: `{command}` sets one"
 
 
 class Sessions:

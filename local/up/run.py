@@ -32,6 +32,7 @@ from local.network.listen import Listen, is_ipv6
 from local.settings import FILE, NO, Settings
 from local.state import VERSION, StateFolder
 from local.up import notify, options
+from local.up.login import first_password
 from local.up.pages import Pages
 
 _LISTEN, _PAGE = "LISTEN", "PAGE"
@@ -199,7 +200,7 @@ class _Kept:
         if pages.network is not None:
             how = f"the password of `make up-password{state}`"
             if pages.new_password:
-                how = f"password {pages.new_password} (shown once; `make up-password{state}` sets another)"
+                how = first_password(pages.new_password, f"make up-password{state}", sys.stdout)
             told.append(("page, network", f"{pages.network.url}, {how}"))
         if embedded.listen:
             where = embedded.listen.at(embedded.ports["mqtt"])

@@ -14,7 +14,7 @@ from local.errors import LocalError
 from local.settings import NO
 from local.state import StateFolder
 from local.up import options
-from local.up.login import Password
+from local.up.login import Password, first_password
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -96,7 +96,7 @@ def _make_password(folder: Path, page: str | None) -> None:
     state = StateFolder(folder, kept=True)
     state.prepare()
     if (page or state.settings().page) != NO and (made := Password(folder).make()):
-        _say(f"the page's password is {made} (shown once; `make up-password` sets another)")
+        _say(f"the page's {first_password(made, 'make up-password', sys.stdout)}")
 
 
 def _install(text: str, *, of_machine: bool) -> None:

@@ -70,8 +70,8 @@ class Config(TypedDict):
 
 
 class SocketAnswer(TypedDict):
-    """Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection
-    to the broker, to be opened within 5 minutes, and the client id for it."""
+    """Answers ``socket``, for a viewer, and the action ``drive``, for a driver: an address of the
+    broker, to be opened within 5 minutes, and the client id for the connection."""
 
     url: str
     client_id: str

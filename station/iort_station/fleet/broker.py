@@ -3,6 +3,7 @@ client."""
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -17,6 +18,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet.roles import Role
 
+_log = logging.getLogger("iort")
 _CONNECT_S = 15.0
 _STOPS_S = 5.0
 _KEEP_ALIVE_S = 30
@@ -135,4 +137,8 @@ class Broker:
 
     def _heard(self, event: mqtt5.PublishReceivedData) -> None:
         packet = event.publish_packet
-        self._on_message(packet.topic, bytes(packet.payload or b""))
+        try:
+            self._on_message(packet.topic, bytes(packet.payload or b""))
+        except Exception:  # noqa: BLE001 - logged
+            # The client's thread must go on.
+            _log.exception("a message on %s could not be taken", packet.topic)

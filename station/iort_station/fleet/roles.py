@@ -28,7 +28,7 @@ _LASTS_S, _EARLY_S = 3600, 600
 
 
 class Signed(NamedTuple):
-    """An address that opens one connection to the broker, as this client, within 5 minutes."""
+    """An address that opens connections to the broker within 5 minutes, and the client id for one."""
 
     url: str
     client_id: str

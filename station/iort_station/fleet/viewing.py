@@ -16,6 +16,7 @@ from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, e
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+from iort_station.supervision import keep
 
 _AT_ONCE = 8
 # Without a network a request takes a minute to fail. The robots forget the viewer in less.
@@ -65,7 +66,9 @@ class Viewer:
         self._every_s = every_s
         self._held: set[str] = set()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: keep("viewer", self._run, self._end), name="viewer", daemon=True
+        )
         self.problem = ""
 
     def __enter__(self) -> Self:

@@ -137,8 +137,9 @@ def test_a_header_that_no_signature_covers_copies_nothing(send, presigned, embed
     assert s3.get_object(Bucket=bucket, Key="robots/copy")["Body"].read() == BODY
 
 
-def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, monkeypatch):
-    monkeypatch.setattr(file_door, "UPLOAD_URL_S", 0.3)
+@pytest.mark.parametrize("bound", ["UPLOAD_URL_S", "_PART_S"])
+def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, monkeypatch, bound):
+    monkeypatch.setattr(file_door, bound, 0.3)
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
     connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
     connection.putrequest("PUT", presigned())
@@ -147,6 +148,17 @@ def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, 
     assert connection.getresponse().status == 408
     connection.close()
     until(lambda: door._passing.total() == 0)
+
+
+@pytest.mark.parametrize("told", [("Content-Length", "9"), ("Transfer-Encoding", "chunked")])
+def test_a_get_with_a_body_takes_no_place(door, presigned, embedded, told):
+    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
+    connection.putrequest("GET", presigned())
+    connection.putheader(*told)
+    connection.endheaders()
+    assert connection.getresponse().status == 400
+    connection.close()
 
 
 @pytest.mark.parametrize("length", ["none", str(PART_BYTES + 1)])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+
 import pytest
 from argon2 import PasswordHasher
 
 from local.errors import LocalError
 from local.up import login
-from local.up.login import Password, Sessions, Tries
+from local.up.login import Password, Sessions, Tries, first_password
 
 # A real hash takes 64 MB and a tenth of a second.
 QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
@@ -19,6 +21,21 @@ class Now:
 
     def __call__(self):
         return self.s
+
+
+class Output(io.StringIO):
+    def __init__(self, *, terminal: bool) -> None:
+        super().__init__()
+        self._terminal = terminal
+
+    def isatty(self) -> bool:
+        return self._terminal
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_first_password_is_shown_to_a_terminal_alone(terminal):
+    words = first_password("s3cret", "make up-password", Output(terminal=terminal))
+    assert ("s3cret" in words, "`make up-password`" in words) == (terminal, True)
 
 
 def test_a_password_is_made_once_and_kept_as_a_hash(tmp_path):

@@ -61,6 +61,11 @@ class Listener:
         """The updates so far, in the order of arrival."""
         return self._callback.heard
 
+    @property
+    def malformed(self) -> int:
+        """How many messages were none."""
+        return self._callback.malformed
+
     def __enter__(self) -> Self:
         self._client.subscribe().channels(self._channel).execute()
         if not self._callback.connected.wait(_CONNECT_S):
@@ -97,6 +102,7 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
         self._on_update = on_update
         self.connected = threading.Event()
         self.heard: list[Heard] = []
+        self.malformed = 0
 
     def status(self, _pubnub: Any, status: Any) -> None:
         if status.category == PNStatusCategory.PNConnectedCategory:
@@ -111,4 +117,8 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
         if self._on_update is not None:
             self._on_update(update, int(message.timetoken) // 10, now_us)
             return
-        self.heard.append(heard_of(update, now_us))
+        try:
+            self.heard.append(heard_of(update, now_us))
+        except (KeyError, TypeError):
+            # The SDK's thread must go on.
+            self.malformed += 1

@@ -14,6 +14,7 @@ from iort_contract.catalog.vesc import absent
 from iort_contract.cloud import PUBNUB
 from iort_contract.limits import ContractError
 from iort_contract.messages.live import decode_live, live_update
+from iort_contract.tables import ROBOT
 from iort_contract.topics import LIVE, check_robot, parse_topic
 from iort_station.cloud import Cloud
 from iort_station.fleet.broker import Broker
@@ -27,6 +28,11 @@ class Listening(Protocol):
     @property
     def heard(self) -> list[Heard]:
         """The updates so far, in the order of arrival; none if ``on_update`` takes them."""
+        ...
+
+    @property
+    def malformed(self) -> int:
+        """How many messages were none."""
         ...
 
 
@@ -61,12 +67,13 @@ class BrokerListener:
     """Subscribes as a viewer within a ``with`` block, and appends to `heard` or calls ``on_update``.
 
     An update has the form of Lambda 1's without its times, and with all fields. A malformed message becomes
-    an empty update, which `decode_live_update` refuses.
+    an update that `decode_live_update` refuses, and that has its robot and the ``error``.
     """
 
     def __init__(self, cloud: Cloud, *, robot: str | None = None, on_update: OnUpdate | None = None) -> None:
         name = "+" if robot is None else check_robot(robot)
         self.heard: list[Heard] = []
+        self.malformed = 0
         self._on_update = on_update
         self._broker = Broker(
             cloud, Role(cloud), filters=[f"{LIVE}/{cloud.namespace}/{name}/+"], on_message=self._take
@@ -84,18 +91,22 @@ class BrokerListener:
     def _take(self, topic: str, message: bytes) -> None:
         now_us = time.time_ns() // 1000
         update = update_of(topic, message)
+        self.malformed += "error" in update
         if self._on_update is not None:
             self._on_update(update, 0, now_us)
-        elif update:
+        elif "error" not in update:
             self.heard.append(heard_of(update, now_us))
 
 
 def update_of(topic: str, message: bytes) -> dict[str, Any]:
-    """The update of a car's own live message; empty for one that is malformed."""
+    """The update of a car's own live message; of one that is malformed, what is known of it."""
+    robot = {}
     try:
-        named, live = parse_topic(topic), decode_live(message)
-    except ContractError:
-        return {}
+        named = parse_topic(topic)
+        robot = {ROBOT: named.robot}
+        live = decode_live(message)
+    except ContractError as error:
+        return {**robot, "error": str(error)}
     # As Lambda 1 does: a sensor that is not there has no value.
     sample = {name: None if absent(name, value) else value for name, value in live.sample.items()}
     return live_update(named.robot, named.name, replace(live, sample=sample))

@@ -15,6 +15,7 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import FAULTS, hottest_degc
 from iort_contract.limits import GONE_S, STALE_S, ContractError
 from iort_contract.messages.live import decode_live_update, silent_s
+from iort_contract.tables import ROBOT
 
 MAX_ROBOTS = 256
 _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
@@ -52,6 +53,13 @@ class Car:
         return f"{FAULTS.get(int(code), 'unknown fault')} ({code:.0f})" if code else ""
 
 
+def problem(update: Any, error: ContractError) -> str:
+    """Whose update is malformed, if that is known, and why."""
+    told = update if isinstance(update, dict) else {}
+    robot, why = told.get(ROBOT), told.get("error", str(error))
+    return f"of {robot}: {why}" if isinstance(robot, str) else str(why)
+
+
 class FleetWatch:
     """Takes updates in one thread, and shows them in another."""
 
@@ -59,14 +67,16 @@ class FleetWatch:
         self._vehicles = vehicles
         self._lock = threading.Lock()
         self._cars: dict[str, Car] = {}
-        self.refused = 0
+        self.refused, self.newest_refused = 0, ""
 
     def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
-        """Take an update from PubNub; an invalid one is counted in `refused`."""
+        """Take an update from PubNub; an invalid one is counted in `refused`, and `newest_refused`
+        says whose it was."""
         try:
             heard = decode_live_update(update)
-        except ContractError:
+        except ContractError as error:
             self.refused += 1
+            self.newest_refused = problem(update, error)
             return
         robot, live = heard.robot, heard.live
         with self._lock:

@@ -557,7 +557,7 @@ export interface Config {
   readonly track: TrackMap | null;
 }
 
-/** Answers ``socket``, for a viewer, and the action ``drive``, for a driver: the address of one connection to the broker, to be opened within 5 minutes, and the client id for it. */
+/** Answers ``socket``, for a viewer, and the action ``drive``, for a driver: an address of the broker, to be opened within 5 minutes, and the client id for the connection. */
 export interface SocketAnswer {
   readonly url: string;
   readonly client_id: string;

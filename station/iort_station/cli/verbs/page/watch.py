@@ -25,7 +25,7 @@ from iort_station.cli.words import examples, say
 from iort_station.fleet import registry, viewing
 from iort_station.fleet.roles import transport
 from iort_station.page.live.listening import listening
-from iort_station.page.live.watch import FleetWatch
+from iort_station.page.live.watch import FleetWatch, problem
 from iort_station.times import iso
 
 commands = typer.Typer()
@@ -80,7 +80,7 @@ def _print_line(update: Any, now_us: int, done: threading.Event) -> None:
     try:
         heard = decode_live_update(update)
     except ContractError as error:
-        say(f"an invalid update: {error}")
+        say(f"a malformed update {problem(update, error)}")
         return
     live = heard.live
     delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
@@ -108,7 +108,7 @@ def _show(fleet: FleetWatch, viewer: viewing.Viewer, seconds: float | None, name
             cars = f"{count} {'car' if count == 1 else 'cars'}. Ctrl-C stops."
             words = cars if count else f"waiting for a car on {namespace}.* (Ctrl-C stops)"
             if fleet.refused:
-                words += f" {fleet.refused} malformed updates."
+                words += f" {fleet.refused} malformed updates, the newest {fleet.newest_refused}."
             if viewer.problem:
                 words += f" {viewer.problem}"
             table = fleet.table(time.time_ns() // 1000, out.width)
