@@ -31,7 +31,7 @@ from iort_agent.sources.sim.source import SimSource
 from iort_agent.spool.interface import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
-from iort_contract.catalog.streams import DRIVE_STREAM
+from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.cloud import IOT
 from iort_contract.limits import Value
 
@@ -118,6 +118,7 @@ class Agent:
             spool=spool,
             streams=self.streams,
             expected=[stream for source in self.sources for stream in source.streams],
+            replayed=self._replayed,
             reports=[
                 # With a number, because two sources may have the same description.
                 *((f"{i}: {source.description}", source.report) for i, source in enumerate(self.sources)),
@@ -142,6 +143,11 @@ class Agent:
         self.viewers.apply(settings)
         self.pings.set_rate(settings.ping_rate_hz)
         self.streams.apply(settings)
+
+    def _replayed(self, stream: str) -> bool:
+        """Whether a stream comes from a source whose times are not now's; a recording may name no streams."""
+        timed = [name for source in self.sources if not source.replayed for name in source.streams]
+        return stream not in OWN_STREAMS and stream not in timed and any(s.replayed for s in self.sources)
 
     def _drove(self, config: Config) -> Callable[[Mapping[str, Value]], None]:
         """Takes the samples of who drove; a source with a stream of this name goes first."""

@@ -26,7 +26,7 @@ from iort_agent.files.config import FilesConfig
 from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
-from iort_agent.spool.config import QueueConfig
+from iort_agent.spool.config import QueueConfig, default_path
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
@@ -72,6 +72,8 @@ def load_config(file: Path) -> Config:
     if content is None:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, place)
+    if (content.get("queue") or {}).get("path") is None:
+        config = replace(config, queue=replace(config.queue, path=default_path(file, config.robot)))
     try:
         config.downlink.check_topics()
     except ContractError as error:

@@ -21,6 +21,7 @@ from iort_agent.common.state import (
     StreamReport,
     StreamState,
 )
+from iort_agent.common.threads import WATCH
 
 
 def make_status(agent: Agent) -> Status:
@@ -49,7 +50,12 @@ def make_status(agent: Agent) -> Status:
         ),
         sources=_sources(agent),
         streams=_streams(agent),
-        spool=Queue(*backlog, dropped_batches=dropped.batches, dropped_samples=dropped.samples),
+        spool=Queue(
+            *backlog,
+            durable=agent.spool.durable,
+            dropped_batches=dropped.batches,
+            dropped_samples=dropped.samples,
+        ),
         files=_files(agent),
         clock=agent.offset.estimate(),
         pings=agent.pings.report(),
@@ -106,7 +112,7 @@ def _files(agent: Agent) -> Files | None:
 
 
 def _alarms(agent: Agent) -> list[str]:
-    alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm]
+    alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm] + WATCH.alarms()
     alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
     waits = [source.waits() for source in agent.sources]
     if agent.downlink is not None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import Callable, Sequence
+from typing import Callable
 
 from iort_agent.agent import Agent
+from iort_agent.common.threads import WATCH, Supervised
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
@@ -35,7 +36,9 @@ class Runtime:
         self.agent = agent
         self._stopped_s, self._progress_s = stopped_s, progress_s
         self._stop = threading.Event()
-        self._asked = False
+        self._asked = self._broken = False
+        self._lock = threading.Lock()
+        self._running = len(agent.sources)
 
     def stop(self) -> None:
         """End the run in good order; may be called from any thread and from a signal handler."""
@@ -47,31 +50,36 @@ class Runtime:
 
         None means: however long it takes if the sources ended by themselves, and ``stopped_s`` once `stop` is
         called. Returns the exit status: 1 if a source failed or ended without a stored sample, if a batch
-        was dropped, or if not all was delivered; else 0. A run that was stopped may leave batches to the
-        next one, in a queue on disk. Raises `UplinkError` if the uplink cannot start.
+        was dropped, if not all was delivered, or if a thread failed for good; else 0. A run that was stopped
+        may leave batches to the next one, in a queue on disk. Raises `UplinkError` if the uplink cannot
+        start.
         """
         agent = self.agent
         problem = too_many(agent.config.sources, agent.config.record)
         if problem is not None:
             _log.warning("record: %s; %s", problem, TODO)
+        WATCH.on_end(self._end)
         agent.uplink.start()
         if agent.downlink is not None:
             agent.downlink.start()
         record_stop, uploads_stop = threading.Event(), threading.Event()
-        record = _start("record", lambda: agent.record.run(record_stop))
-        ticker = _start("ticker", self._tick_until_stop)
-        sources = [self._start_source(i, source) for i, source in enumerate(agent.sources)]
-        watcher = _start("watcher", lambda: self._stop_after(sources))
-        pinger = _start("pings", lambda: agent.pings.run(self._stop))
+        record = Supervised("record", lambda: agent.record.run(record_stop))
+        ticker = Supervised("ticker", self._tick_until_stop)
+        pinger = Supervised("pings", lambda: agent.pings.run(self._stop))
+        sources = [self._thread_of(i, source) for i, source in enumerate(agent.sources)]
         uploads = agent.uploads
-        uploader = None if uploads is None else _start("uploads", lambda: uploads.run(uploads_stop))
-        self._stop.wait()
-        stopped = self._asked
+        uploader = None if uploads is None else Supervised("uploads", lambda: uploads.run(uploads_stop))
+        for thread in (record, ticker, *sources, pinger, *([uploader] if uploader is not None else [])):
+            thread.start()
+        if sources:
+            self._stop.wait()
+        self._stop.set()
+        stopped = self._asked or self._broken
         if agent.downlink is not None:
             # An agent that ends by itself must not end an emergency stop.
             agent.downlink.halt(keep_stop=not self._asked)
         agent.pings.wake()
-        for thread in (*sources, watcher, ticker, pinger):
+        for thread in (*sources, ticker, pinger):
             thread.join()
         agent.pings.close(_LAST_PONGS_S if drain_s is None else min(_LAST_PONGS_S, drain_s))
         agent.streams.flush()
@@ -85,7 +93,8 @@ class Runtime:
         agent.record.wake()
         record.join()
         agent.uplink.stop(_CLOSE_S)
-        return 0 if delivered and not any(source.failed for source in agent.sources) else 1
+        failed = self._broken or any(source.failed for source in agent.sources)
+        return 0 if delivered and not failed else 1
 
     def tick(self) -> None:
         """Let streams and lanes do what is due; `run` calls it several times a second."""
@@ -129,16 +138,23 @@ class Runtime:
         sample = self.agent.metrics.sample(samples)
         streams.record(AGENT_STREAM, self.agent.clock.now_us(), sample)
 
-    def _start_source(self, i: int, source: SourceRun) -> threading.Thread:
+    def _end(self) -> None:
+        """End the run in good order, and with status 1: a thread has failed for good."""
+        self._broken = True
+        self._stop.set()
+
+    def _thread_of(self, i: int, source: SourceRun) -> Supervised:
         emit: Emit = self.agent.streams.emit
         if self.agent.attachments is not None:
             emit = self.agent.attachments.around(emit)
-        return _start(f"source {i}", lambda: source.run(emit, self._stop))
+        return Supervised("source", lambda: self._run_source(source, emit), title=str(i))
 
-    def _stop_after(self, sources: Sequence[threading.Thread]) -> None:
-        for thread in sources:
-            thread.join()
-        self._stop.set()
+    def _run_source(self, source: SourceRun, emit: Emit) -> None:
+        source.run(emit, self._stop)
+        with self._lock:
+            self._running -= 1
+            if not self._running:
+                self._stop.set()
 
     def _check_sources(self) -> None:
         found = self.agent.streams.counts()
@@ -176,7 +192,7 @@ class Runtime:
         """Wait until ``empty``, as `run` says of ``drain_s``; whether it is. ``tell`` logs the progress."""
         waited = told = 0.0
         while True:
-            if drain_s is None and self._asked:
+            if drain_s is None and (self._asked or self._broken):
                 drain_s = waited + self._stopped_s
             look_s = _LOOK_S if drain_s is None else max(0.0, min(_LOOK_S, drain_s - waited))
             if empty(look_s):
@@ -195,7 +211,7 @@ class Runtime:
 
     def _end_uploads(
         self,
-        thread: threading.Thread | None,
+        thread: Supervised | None,
         stop: threading.Event,
         drain_s: float | None,
         *,
@@ -217,9 +233,3 @@ class Runtime:
 
 def _tell_uploading() -> None:
     _log.info("attachments are still to be uploaded")
-
-
-def _start(name: str, target: Callable[[], object]) -> threading.Thread:
-    thread = threading.Thread(target=target, name=name, daemon=True)
-    thread.start()
-    return thread

@@ -148,6 +148,18 @@ METRICS = {
         Metric("SamplesSummarized", "summarize", BATCHES_CHART),
         Metric("BatchesSummarized", "summarize", BATCHES_CHART),
         Metric("AgentReports", "health", REPORTS_CHART),
+        Metric(
+            "ThreadErrors",
+            "health",
+            REPORTS_CHART,
+            right=True,
+            alarm=Alarm(
+                "a part of a car's agent failed by a mistake in its code, and was started again",
+                "`iort-agent status` on the car names the thread, its stream `log` has the error: report it. "
+                "Until it runs again the car may take no commands, or send late",
+                evidence="cars",
+            ),
+        ),
         # The worst car counts; a mean would hide it. From the record lane, which is lossless; the rules fault
         # and battery are faster and name the car.
         Metric(

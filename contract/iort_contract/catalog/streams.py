@@ -56,6 +56,7 @@ CATALOG = {
                 Field("clock_uncertainty_ms", "ms", "uncertainty of the clock offset, either way"),
                 Field("files_waiting", "files", "files waiting to be uploaded"),
                 Field("files_sent_bytes", "bytes", "bytes of files sent", label="Files sent"),
+                Field("thread_errors", "errors", "errors of the agent's threads, since the sample before"),
             ),
             own=True,
         ),

@@ -7,7 +7,7 @@ the losses of every source by cause.
 from __future__ import annotations
 
 import json
-from typing import Mapping, NamedTuple, Union
+from typing import Mapping, NamedTuple, Optional, Union
 
 from iort_contract.limits import ContractError, Value
 
@@ -21,7 +21,9 @@ class StreamAccount(NamedTuple):
     """A stream's counts since the start of the run: samples ``taken``; samples ``stored`` in batches with
     sequence numbers from ``first_seq`` (inclusive) to ``next_seq`` (exclusive); ``refused`` samples, which no
     message can hold; and ``nulled`` values, which were not finite. The rest of the taken samples was in open
-    batches. ``ended`` marks the end of an orderly run, without open batches."""
+    batches. ``ended`` marks the end of an orderly run, without open batches. ``durable``: whether the queue
+    survives the end of the process; None from an older agent. ``replayed``: the samples' times passed faster
+    or slower than the clock, so they do not tell how late a batch is."""
 
     stream: str
     taken: int
@@ -31,6 +33,8 @@ class StreamAccount(NamedTuple):
     first_seq: int
     next_seq: int
     ended: bool
+    durable: Optional[bool] = None  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+    replayed: bool = False
 
     def sample(self) -> dict[str, Value]:
         """The account as a sample."""
@@ -87,11 +91,14 @@ def account(sample: Mapping[str, Value]) -> Account:
         except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
             raise ContractError(f"a source's account cannot be decoded: {error}") from error
     try:
-        names = StreamAccount._fields[1:-1]
+        names = ("taken", "stored", "refused", "nulled", "first_seq", "next_seq")
         taken, stored, refused, nulled, first_seq, next_seq = (int(sample[name] or 0) for name in names)
+        ended, durable = bool(sample["ended"]), sample.get("durable")
         return StreamAccount(
-            str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, bool(sample["ended"])
-        )
+            str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, ended,
+            durable=None if durable is None else bool(durable),
+            replayed=bool(sample.get("replayed")),
+        )  # fmt: skip
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ContractError(f"a stream's account cannot be decoded: {error}") from error
 

@@ -90,11 +90,12 @@ class StreamState(StreamReport):
 
 @dataclass(frozen=True)
 class Queue:
-    """The batches that wait, and those that were dropped."""
+    """The batches that wait, and those that were dropped. ``durable``: those that wait survive the agent."""
 
     batches: int
     samples: int
     bytes: int
+    durable: bool
     dropped_batches: int
     dropped_samples: int
 

@@ -9,6 +9,7 @@ import threading
 from collections import Counter
 from typing import Any, Mapping, Sequence, Tuple
 
+from iort_agent.common.threads import Supervised
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import AskConfig
 from iort_agent.control.questions import Questions
@@ -47,7 +48,7 @@ class Asks:
         self._bridge, self._questions = bridge, questions
         self._string = bridge.graph.definition(STRING)
         self._queue: queue.Queue[_Asked | None] = queue.Queue(_MOST_WAITING)
-        self._thread = threading.Thread(target=self._run, name="asks", daemon=True)
+        self._thread = Supervised("asks", self._run)
         self._lock = threading.Lock()
         self._counts: dict[str, Counter[str]] = {name: Counter() for name, _ in asks}
         for name, config in asks:

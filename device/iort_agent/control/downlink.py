@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Callable, Iterable, Sequence
 
 from iort_agent.common.state import ClockOffset
+from iort_agent.common.threads import Supervised
 from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.control.asks import Asks
 from iort_agent.control.bridge import Bridge
@@ -27,7 +28,7 @@ from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)
 
-_IDLE_S, _AGAIN_S = 1.0, 0.1
+_IDLE_S = 1.0
 
 
 class Downlink:
@@ -52,7 +53,7 @@ class Downlink:
     ) -> None:
         self._clock, self._graph, self._guard = link.clock, graph, guard
         self._wake, self._end = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="downlink", daemon=True)
+        self._thread = Supervised("downlink", self._run)
         self._rejections = ThrottledLog(_log, link.clock)
         bridge = Bridge(link, graph, offset, self._rejections)
         self._commands = Commands(config, bridge, operator=operator, guard=guard, wake=self._wake.set)
@@ -126,12 +127,7 @@ class Downlink:
     def _run(self) -> None:
         while not self._end.is_set():
             self._wake.clear()
-            try:
-                wait_s = self.tick()
-            except Exception:  # noqa: BLE001 - whatever a ROS library raises
-                # The thread must outlive it: the stops are published here.
-                _log.exception("the downlink failed, and tries again")
-                wait_s = _AGAIN_S
+            wait_s = self.tick()
             if not self._end.is_set():
                 self._clock.wait(self._wake, min(wait_s, _IDLE_S))
 

@@ -12,6 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
 from iort_agent.common.state import ClockOffset
+from iort_agent.common.threads import later
 from iort_agent.control.bridge import offset_us
 from iort_agent.errors import AskError, UplinkError, UploadError
 from iort_agent.files.file import read
@@ -100,9 +101,7 @@ class Questions:
                 raise AskError(NO_ANSWER, "the agent ends")
             self._waits[request_id] = wait
         # Also ends an upload that takes too long.
-        timer = threading.Timer(timeout_s, wait.fail, (f"no answer within {timeout_s:g} s",))
-        timer.daemon = True
-        timer.start()
+        timer = later(timeout_s, lambda: wait.fail(f"no answer within {timeout_s:g} s"))
         try:
             payload = self._encoded(request_id, body, until, wait)
             topic = self._link.topic(ASK, name)

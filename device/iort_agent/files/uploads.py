@@ -43,13 +43,7 @@ class Uploads:
             _log.debug("files: this system cannot set the priority of a thread")
         while not stop.is_set():
             self._wake.clear()
-            try:
-                more = self.step(stop)
-            except Exception:  # noqa: BLE001 - whatever a file system raises
-                # One file must not end the upload of all others.
-                _log.exception("files: continuing after an error")
-                more = False
-            if not more:
+            if not self.step(stop):
                 self._clock.wait(self._wake, _SCAN_S)
 
     def step(self, stop: threading.Event) -> bool:
@@ -82,7 +76,8 @@ class Uploads:
                 self._last_error = str(error)
                 _log.warning("files: %s", error)
                 folder.hold(name, error.again_s)
-        except Exception:
+        except BaseException:
+            # The thread starts again, with other files first.
             folder.hold(name, HELD_S)
             raise
         else:

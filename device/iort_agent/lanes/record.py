@@ -105,7 +105,9 @@ class RecordLane:
         self._wake.set()
 
     def run(self, stop: threading.Event) -> None:
-        """Publish until ``stop`` is set; call `wake` after setting it."""
+        """Publish until ``stop`` is set; call `wake` after setting it. It may run again after an error."""
+        with self._changed:
+            self._rewind()
         while not stop.is_set():
             self._wake.clear()
             self._clock.wait(self._wake, self.step())

@@ -19,6 +19,7 @@ from awscrt import mqtt5
 
 from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
+from iort_agent.common.threads import Supervised
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.client import ClientFactory
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -76,7 +77,7 @@ class IotCore:
         )
         self._client: Any = None
         self._generation = 0
-        self._thread = threading.Thread(target=self._keep_connected, name="uplink", daemon=True)
+        self._thread = Supervised("uplink", self._keep_connected)
         self._backoff = backoff or Backoff()
         self._causes = Causes()
         # Set when the attempt or the connection has ended, or should end.
@@ -182,13 +183,16 @@ class IotCore:
             self._slow = False
             if self._stop.is_set():
                 break
-            self._client.start()
-            while not self._clock.wait(self._down, _LOOK_S):
-                if self._connected and self._factory.replaced():
-                    _log.info("%s was replaced: connecting with it", self._factory.certificate_file)
-                    self._backoff.reset()
-                    break
-            self._stop_client()
+            try:
+                self._client.start()
+                while not self._clock.wait(self._down, _LOOK_S):
+                    if self._connected and self._factory.replaced():
+                        _log.info("%s was replaced: connecting with it", self._factory.certificate_file)
+                        self._backoff.reset()
+                        break
+            finally:
+                # After an error, too: a client that is left started would connect again tomorrow.
+                self._stop_client()
             if not self._stop.is_set():
                 self._pause(began)
 

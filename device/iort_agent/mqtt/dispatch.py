@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 from typing import Callable
+
+from iort_agent.common.threads import Supervised
 
 _log = logging.getLogger(__name__)
 
@@ -17,7 +18,7 @@ class Dispatcher:
 
     def __init__(self) -> None:
         self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="callbacks", daemon=True)
+        self._thread = Supervised("callbacks", self._run)
 
     def post(self, call: Call) -> None:
         """Run a call later; returns at once, from any thread."""

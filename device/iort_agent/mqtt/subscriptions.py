@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import logging
-import threading
 from concurrent.futures import Future
 from typing import Any, Callable
 
+from iort_agent.common.threads import later
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import code_name, explain
 from iort_agent.mqtt.uplink import MqttMessage, OnMessage, matches
@@ -82,9 +82,7 @@ class Subscriptions:
                 "If it is not authorized, the robot's policy is older than this agent",
                 topic_filter, why,
             )  # fmt: skip
-        timer = threading.Timer(delay_s, self._dispatcher.post, (self.renew,))
-        timer.daemon = True
-        timer.start()
+        later(delay_s, lambda: self._dispatcher.post(self.renew))
 
 
 def _refusal(future: Future[Any]) -> str | None:

@@ -19,6 +19,7 @@ import xmlrpc.client
 from typing import Any, Mapping
 
 from iort_agent.clock import Clock, SystemClock
+from iort_agent.common.threads import Supervised
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import connecting, master
 from iort_agent.ros1.graph import OnBytes
@@ -110,7 +111,7 @@ class Node:
             self._master = master.Master(self._uri, self._me)
         except OSError as error:
             raise SourceError(f"ROS_MASTER_URI is {self._uri!r}: {error}") from error
-        self._thread = threading.Thread(target=self._run, name="ros1 node", daemon=True)
+        self._thread = Supervised("ros1 node", self._run)
 
     def start(self) -> None:
         """Join the graph as soon as it is there; again has no effect."""
@@ -223,10 +224,11 @@ class Node:
                 self._await_name()
                 if not self._stop.is_set():
                     self._take_part()
-        except Exception as error:  # noqa: BLE001 - rospy may raise anything, and its thread is ours
+        except BaseException as error:
+            # rospy may raise anything at its end.
             if not self._stop.is_set():
-                _log.exception("the ROS node failed")
                 self._fail(f"{type(error).__name__}: {error}")
+                raise
 
     def _take_part(self) -> None:
         """Stay in the graph until the agent ends, or somebody ends the node."""

@@ -34,7 +34,8 @@ class Source(Protocol):
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit samples until there are no more or ``stop`` is set.
 
-        Raises `SourceError` when it cannot give samples and trying again would not help.
+        Raises `SourceError` when it cannot give samples and trying again would not help. After any other
+        error it is called again, unless its samples would come twice (`SourceConfig.recorded`).
         """
 
     def report(self) -> Mapping[str, Any]:
@@ -60,4 +61,12 @@ class SourceConfig(Protocol):
 
     def uploads_large(self) -> bool:
         """Whether the source sends large values as files."""
+        return False
+
+    def recorded(self) -> bool:
+        """Whether the samples come from a recording, so that another run would give them twice."""
+        return False
+
+    def replayed(self) -> bool:
+        """Whether the samples' times pass faster or slower than the clock."""
         return False

@@ -147,7 +147,8 @@ class Intake:
         left_out: dict[str, int] = {}
         # A message that is recorded whole has everything, whatever its view leaves out.
         for decoder in () if self._large and not self._config.fields else tuple(self._decoders):
-            for path, count in decoder.left_out.items():
+            # A copy: threads that receive messages count meanwhile.
+            for path, count in decoder.left_out.copy().items():
                 left_out[path] = left_out.get(path, 0) + count
         counts = {"messages": self._messages, "silent": self._silent, "left_out": left_out}
         return {**counts, **self.throttled.counts()}

@@ -126,5 +126,5 @@ class Ros1Source:
     def report(self) -> dict[str, Any]:
         """The counts of the messages, by topic, and what the node waits for, if it does."""
         waits = self._node.waits() if self._node is not None else None
-        topics = {topic: intake.report() for topic, intake in self._intakes.items()}
+        topics = {topic: intake.report() for topic, intake in self._intakes.copy().items()}
         return {**topics, "waits": waits} if waits is not None else topics

@@ -18,19 +18,23 @@ class SourceRun:
 
     def __init__(self, config: SourceConfig, clock: Clock) -> None:
         self.description, self.streams = config.describe(), config.streams()
+        self.recorded, self.replayed = config.recorded(), config.replayed()
         self.source = config.build(clock)
         self.failed = False
         self._ended = False
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Run until the source ends, fails or is stopped. Raises nothing, because the other sources go on."""
+        """Run until the source ends, fails or is stopped. Raises what is no `SourceError`, unless the source
+        plays a recording: run again, it would give its samples twice."""
         _log.info("source started: %s", self.description)
         try:
             self.source.run(emit, stop)
         except SourceError as error:
             _log.error("source failed: %s: %s", self.description, error)
             self.failed = True
-        except Exception:  # noqa: BLE001 - a driver may raise anything
+        except Exception:
+            if not self.recorded:
+                raise
             _log.exception("source failed: %s", self.description)
             self.failed = True
         else:

@@ -21,10 +21,12 @@ import logging
 import sqlite3
 import threading
 from collections import OrderedDict
+from contextlib import suppress
 from pathlib import Path
 from typing import Callable, Iterable
 
 from iort_agent.clock import Clock
+from iort_agent.common.threads import Supervised
 from iort_agent.errors import AgentError
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.file import READ_BYTES, READ_ENTRIES, QueueLock, SpoolFile
@@ -62,6 +64,8 @@ def make_spool(queue: QueueConfig, clock: Clock) -> Spool:
     """
     if queue.path is None:
         return MemorySpool(max_bytes=queue.max_bytes, policy=queue.policy)
+    with suppress(OSError):  # the spool tells it, and goes on in memory
+        queue.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     spool = SqliteSpool(
         queue.path, max_bytes=queue.max_bytes, policy=queue.policy, durability=queue.durability, clock=clock
     )
@@ -121,7 +125,7 @@ class SqliteSpool:
 
         # Of the thread that works.
         self._kick = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="spool", daemon=True)
+        self._thread = Supervised("spool", self._run)
         self._queue_lock: QueueLock | None = None
         self._file: SpoolFile | None = None
         try:
@@ -277,10 +281,10 @@ class SqliteSpool:
                 continue
             try:
                 self.work()
-            except Exception as error:  # noqa: BLE001 - the thread has to live
+            except BaseException as error:
                 # Whatever it is, batches must still go out.
-                _log.exception("queue: the thread failed, and goes on")
                 self._degrade(error)
+                raise
 
     def _write(self) -> None:
         if self._file is None:
@@ -403,7 +407,7 @@ class SqliteSpool:
         except errors as error:
             self._degrade(error)
 
-    def _degrade(self, error: Exception) -> None:
+    def _degrade(self, error: BaseException) -> None:
         """The disk does not work: go on in memory."""
         text = str(error)
         if not isinstance(error, AgentError):

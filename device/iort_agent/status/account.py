@@ -21,13 +21,21 @@ Reports = Sequence[Tuple[str, Callable[[], Mapping[str, Any]]]]
 
 
 class Accounts:
-    """Emits the accounts of every stream and every source. ``expected`` are the streams of the sources."""
+    """Emits the accounts of every stream and every source. ``expected`` are the streams of the sources;
+    ``replayed`` tells whether a stream's times pass at another speed than the clock's."""
 
     def __init__(
-        self, *, clock: Clock, spool: Spool, streams: Streams, expected: Sequence[str], reports: Reports
+        self,
+        *,
+        clock: Clock,
+        spool: Spool,
+        streams: Streams,
+        expected: Sequence[str],
+        replayed: Callable[[str], bool],
+        reports: Reports,
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
-        self._expected, self._reports = expected, reports
+        self._expected, self._replayed, self._reports = expected, replayed, reports
         self._told = clock.monotonic()
         self._lost = 0
 
@@ -54,6 +62,8 @@ class Accounts:
                 first_seq=0,
                 next_seq=counts.batches,
                 ended=ended,
+                durable=self._spool.durable,
+                replayed=self._replayed(name),
             )
             self._streams.record(ACCOUNT_STREAM, now_us, account.sample())
         dropped = self._spool.dropped()

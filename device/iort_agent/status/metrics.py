@@ -11,6 +11,7 @@ from typing import Mapping
 
 from iort_agent.clock import Clock
 from iort_agent.common.schema import flag, number, setting
+from iort_agent.common.threads import WATCH
 from iort_agent.files.uploads import Uploads
 from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.clock_offset import OffsetEstimator
@@ -74,6 +75,7 @@ class AgentMetrics:
         self._clock, self._spool, self._uplink, self._offset = clock, spool, uplink, offset
         self._uploads = uploads
         self._at, self._cpu_s, self._samples = clock.monotonic(), time.process_time(), 0
+        self._thread_errors = 0
 
     def sample(self, samples: int) -> dict[str, Value]:
         """The figures since the last call; ``samples`` counts what all sources have given so far."""
@@ -81,6 +83,7 @@ class AgentMetrics:
         passed = max(now - self._at, 1e-3)
         backlog, dropped, offset = self._spool.backlog(), self._spool.dropped(), self._offset.estimate()
         files = self._uploads.status() if self._uploads is not None else None
+        thread_errors = WATCH.errors
         values: dict[str, Value] = {
             "cpu_percent": round((cpu_s - self._cpu_s) / passed * 100, 2),
             "rss_mb": rss_mb(),
@@ -93,8 +96,10 @@ class AgentMetrics:
             "clock_uncertainty_ms": offset.uncertainty_ms if offset is not None else None,
             "files_waiting": files.waiting if files is not None else 0,
             "files_sent_bytes": files.sent_bytes if files is not None else 0,
+            "thread_errors": thread_errors - self._thread_errors,
         }
         self._at, self._cpu_s, self._samples = now, cpu_s, samples
+        self._thread_errors = thread_errors
         assert values.keys() == AGENT_FIELDS.keys()
         return values
 

@@ -9,11 +9,11 @@ import logging
 import os
 import socket
 import socketserver
-import threading
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping
 
 from iort_agent.common.state import Status, read
+from iort_agent.common.threads import Supervised
 from iort_agent.errors import AgentError, BusyError, NotRunningError
 
 _log = logging.getLogger(__name__)
@@ -32,6 +32,7 @@ class StatusServer:
         self._path = path
         self._status = status
         self._server: _Server | None = None
+        self._thread: Supervised | None = None
 
     def start(self) -> None:
         """Listen. Raises `AgentError` if an agent already runs there. If the socket cannot be made, the
@@ -45,7 +46,8 @@ class StatusServer:
             _log.warning("no status socket: %s: %s; set status_socket", self._path, error.strerror or error)
             return
         serve = functools.partial(self._server.serve_forever, poll_interval=_NEVER_S)
-        threading.Thread(target=serve, name="status", daemon=True).start()
+        self._thread = Supervised("status", serve)
+        self._thread.start()
 
     def stop(self) -> None:
         """Remove the socket."""
@@ -57,6 +59,8 @@ class StatusServer:
                 server.socket.shutdown(socket.SHUT_RDWR)
             server.shutdown()
             server.server_close()
+        if self._thread is not None:
+            self._thread.join()
 
     def _remove_left_over(self) -> None:
         try:

@@ -72,7 +72,8 @@ def _lanes(status: Status) -> Iterator[str]:
 
 def _queue(queue: Queue) -> str:
     return (
-        f"{queue.batches} batch(es), {queue.samples} sample(s), {queue.bytes:,} bytes waiting; "
+        f"{queue.batches} batch(es), {queue.samples} sample(s), {queue.bytes:,} bytes waiting "
+        f"{'on the disk' if queue.durable else 'IN MEMORY'}; "
         f"{queue.dropped_batches} batch(es) dropped"
     )
 

@@ -9,6 +9,7 @@ import os
 import shutil
 import stat
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Iterator
 
@@ -91,9 +92,11 @@ def _validity(certificate: Certificate) -> Finding:
 def _queue(config: Config) -> Iterator[Finding]:
     path: Path | None = config.queue.path
     if path is None:
-        todo = "set queue.path to a file, for the batches to survive a restart"
+        todo = "remove `queue.path: memory`, for the batches to survive a restart"
         yield Finding("queue", WARN, "in memory: undelivered batches end with the agent", todo)
         return
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     target = path if path.exists() else path.parent
     if not os.access(target, os.W_OK) or not os.access(path.parent, os.W_OK):
         yield Finding("queue", FAIL, f"{target} may not be written", f"chown it to {os.environ.get('USER')}")

@@ -25,7 +25,11 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
         return {f"RoundTrip{path.capitalize()}Ms": _numbers(batches, RTT_FIELDS[path]) for path in PING_PATHS}
     if stream == AGENT_STREAM:
         backlog = _numbers(batches, "backlog_batches")
-        return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
+        return {
+            "AgentReports": sum(len(batch.times_us) for batch in batches),
+            "BacklogBatches": backlog[-1:],
+            "ThreadErrors": sum(_numbers(batches, "thread_errors")),
+        }
     volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
     # A temperature has few different values.
     found = (measured_degc(name, value) for name in TEMPERATURES for value in set(_numbers(batches, name)))

@@ -66,7 +66,7 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 38
+    alarms: int = 39
     insights_metrics: int = 63
     dashboards: tuple[int, ...] = (49, 20, 20)
     dashboard_hours: float = 20.0

@@ -24,7 +24,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
-from iort_agent.sources import Emit
+from iort_agent.sources import Emit, SourceConfig
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.sim.source import SimConfig
 from iort_agent.spool.config import QueueConfig
@@ -49,7 +49,7 @@ DOWNLINK = {
 }
 
 
-class Script:
+class Script(SourceConfig):
     """A source that runs a function."""
 
     def __init__(self, run: Any) -> None:
@@ -63,6 +63,9 @@ class Script:
 
     def build(self, clock: Clock) -> Script:
         return self
+
+    def recorded(self) -> bool:
+        return True
 
     def report(self) -> dict[str, Any]:
         return {"played": True}

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 
 import pytest
 
+from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.sim.source import SimConfig
+from iort_agent.spool.config import QueueConfig, default_path
+from iort_agent.spool.sqlite import make_spool
 
 GOOD = """\
 robot: car1
@@ -90,6 +94,38 @@ def test_the_queues_path_is_relative_to_the_file(
         config = load_config(write(folder, f"{GOOD}queue: {{path: {said}}}\n"))
         assert config.queue.path == meant
         assert not meant.exists(), "reading a configuration makes nothing"
+
+
+@pytest.mark.parametrize(
+    "queue", ["", "queue:\n", "queue: {}\n", "queue: {path: }\n", "queue: {max_bytes: 200000}\n"]
+)
+def test_the_queue_is_on_disk_unless_memory_is_asked_for(folder: Path, queue: str) -> None:
+    assert load_config(write(folder, GOOD + queue)).queue.path == folder / "car1.queue.db"
+    assert load_config(write(folder, GOOD + "queue: {path: memory}\n")).queue.path is None
+    assert load_config(write(folder, GOOD + "queue: {path: ./memory}\n")).queue.path == folder / "memory"
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({"STATE_DIRECTORY": "{home}/a:{home}/b"}, "a"),
+        ({"XDG_STATE_HOME": "{home}/state"}, "state/iort"),
+        ({}, ".local/state/iort"),
+    ],
+)
+def test_beside_a_read_only_configuration_the_queue_is_in_the_folder_of_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: str
+) -> None:
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"HOME": "{home}", **environment}.items():
+        monkeypatch.setenv(name, value.format(home=tmp_path))
+    # A folder that is not there may not be written, not even by root.
+    path = default_path(tmp_path / "read_only" / "car.yaml", "car1")
+    assert path == tmp_path / expected / "car1.queue.db"
+    make_spool(QueueConfig(path), SystemClock()).close()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
 
 
 SIM = "  - type: sim\n"

@@ -15,7 +15,7 @@ from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.runtime import Runtime
-from iort_agent.sources import Emit
+from iort_agent.sources import Emit, SourceConfig
 from iort_agent.spool.config import REJECT_NEW
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM
@@ -94,7 +94,7 @@ def test_other_librarys_lines_stay_in_the_robots_own_log() -> None:
     assert troubles.lines.take() == []
 
 
-class Failing:
+class Failing(SourceConfig):
     def streams(self) -> list[str]:
         return ["vesc"]
 
@@ -116,7 +116,7 @@ def logging_agent(uplink: Loopback, clock: ManualClock) -> Iterator[Agent]:
     """An agent whose only source fails, and which sends what is logged."""
     troubles = Troubles()
     spool = MemorySpool(max_bytes=2000, policy=REJECT_NEW)
-    config = Config("car1", "host", Path(), Path(), (Failing(),))  # type: ignore[arg-type]  # no check
+    config = Config("car1", "host", Path(), Path(), (Failing(),))
     logging.getLogger().addHandler(troubles)
     try:
         yield Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)

@@ -327,7 +327,7 @@ def test_status_and_check_by_command(
     assert findings["certificate"]["level"] == "fail"
     assert findings["key's mode"]["level"] == "warn"
     assert findings["key's mode"]["todo"].startswith("chmod 600 ")
-    assert findings["queue"]["level"] == "warn"
+    assert findings["queue"]["text"].startswith(f"{tmp_path}/car1.queue.db, ")
     assert findings["record lane"]["level"] == "ok"
     assert findings["name"]["level"] == "fail"
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Mapping
 
 from iort_agent.clock import SystemClock
+from iort_agent.common.threads import Supervised
 from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.motion.stops import Stops
 from iort_agent.ros1.json_message import encode
@@ -167,7 +168,7 @@ def _end(guard: _Guard) -> int:
     for number in _SIGNALS:
         signal.signal(number, lambda *_: over.set())
     guard.agent_gone()
-    threading.Thread(target=guard.watch, args=(over,), daemon=True).start()
+    Supervised("guard", lambda: guard.watch(over)).start()
     while not over.is_set() and (left := guard.tick()) is not None:
         over.wait(left)
     guard.node.close()

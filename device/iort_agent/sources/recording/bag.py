@@ -56,6 +56,14 @@ class BagConfig(SourceConfig):
         """The source in a few words."""
         return f"bag {self.path}"
 
+    def recorded(self) -> bool:
+        """It plays a recording."""
+        return True
+
+    def replayed(self) -> bool:
+        """Its own times pass at the clock's pace at speed 1 only."""
+        return self.stamps == ORIGINAL and self.speed != 1
+
     def build(self, clock: Clock) -> BagSource:
         """Make the source; the file is opened when it runs."""
         return BagSource(self, clock)

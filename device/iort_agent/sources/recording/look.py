@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
+from iort_agent.common.threads import brief
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Open
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -42,7 +43,7 @@ def look_into(recording: Open, wanted: set[str], within_s: float) -> Looked:
             done.set()
 
     # A large index is read in one call, which only the end of the process can interrupt.
-    threading.Thread(target=look, name="check", daemon=True).start()
+    brief("check", look)
     done.wait(within_s)
     stop.set()
     return Looked(sorted(streams.copy()), ended.is_set(), errors[0] if errors else "")

@@ -116,7 +116,7 @@ class RosbridgeSource:
         """The counts of the messages, by topic."""
         return {
             name: {**hearing.report(), **self.connection.report(name)}
-            for name, hearing in self._hearings.items()
+            for name, hearing in self._hearings.copy().items()
         }
 
     def connected(self) -> None:

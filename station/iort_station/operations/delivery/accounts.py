@@ -18,6 +18,13 @@ from iort_station.operations.delivery.audit import Audit, RunAudit, Shortfall
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
+# What is lost with a run that did not end properly, by whether its queue was durable; None is not known.
+_OPEN = "were in open batches, at most one second"
+_NOT_ENDED = {
+    True: f"{_OPEN}: the run did not end properly",
+    False: f"{_OPEN}, or waited in the queue, which was in memory: the run did not end properly",
+    None: f"{_OPEN}, or in the queue if it was in memory: the run did not end properly",
+}
 
 
 @dataclass
@@ -75,13 +82,31 @@ def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit
     return replace(one, taken=taken, shortfalls=tuple(shortfalls))
 
 
+def without_lateness(one: Audit, found: Mapping[str, Account]) -> Audit:
+    """The audit without the lateness of recordings that were played at another speed than their own."""
+
+    def told(run: RunAudit) -> RunAudit:
+        account = found[run.boot].streams.get(one.stream) if run.boot in found else None
+        return replace(run, late=None, latest_ms=None) if account is not None and account.replayed else run
+
+    return replace(one, runs=[told(run) for run in one.runs])
+
+
+def in_car(last: int | None, audits: Iterable[Audit], found: Mapping[str, Account]) -> int | None:
+    """How many batches are in the car: the figure that it sent last, which is of a minute before its end. A
+    run that ended in good order says so in its last batch, behind all others: it has left nothing."""
+    newest = max(found.values(), key=lambda run: run.received_us, default=None)
+    ended = newest is not None and all(stream.ended for stream in newest.streams.values())
+    return 0 if last and ended and not any(one.missing or one.shortfalls for one in audits) else last
+
+
 def _shortfalls(
     boot: str, stream: StreamAccount, stored: RunAudit | None, *, running: bool
 ) -> Iterator[Shortfall]:
     if stream.refused:
         yield Shortfall(boot, stream.refused, "refused by the agent: no message can hold them")
     if not stream.ended and not running:
-        yield Shortfall(boot, None, "were in open batches, at most one second: the run did not end properly")
+        yield Shortfall(boot, None, _NOT_ENDED[stream.durable])
     if stored is None:
         if stream.stored:
             yield Shortfall(boot, stream.stored, "in batches that are not stored")

@@ -52,7 +52,8 @@ class RunAudit:
     """The stored batches of one run of the agent, from the lowest number to the highest.
 
     ``first_us`` and ``last_us`` are the start times of its earliest and latest batch. ``samples_of`` has the
-    number of samples by batch number.
+    number of samples by batch number. ``late`` and ``latest_ms`` are None if the samples' times do not tell:
+    those of a recording that was played at another speed.
     """
 
     boot: str
@@ -63,8 +64,8 @@ class RunAudit:
     batches: int
     samples: int
     duplicated: int
-    late: int
-    latest_ms: int
+    late: int | None
+    latest_ms: int | None
     missing: list[Missing]
     samples_of: Mapping[int, int]
 
@@ -95,8 +96,9 @@ class Audit:
 
     ``before_first`` counts numbers before the first stored one: expired, outside the range, or lost.
     ``refused`` counts items that are not batches. ``in_car`` and ``dropped`` are the agent's last metrics of
-    its queue; None if it sent none. ``taken`` counts the samples that the runs report in their accounts; None
-    without an account. ``shortfalls`` are the differences between the accounts and the table.
+    its queue; None if it sent none. After a run that ended in good order, nothing is in the car. ``taken``
+    counts the samples that the runs report in their accounts; None without an account. ``shortfalls`` are the
+    differences between the accounts and the table.
     """
 
     stream: str

@@ -241,6 +241,10 @@ export const FIELD_TABLE: FieldTable = {
       "meaning": "bytes of files sent",
       "label": "Files sent"
     },
+    "thread_errors": {
+      "unit": "errors",
+      "meaning": "errors of the agent's threads, since the sample before"
+    },
     "speed_mps": {
       "unit": "m/s",
       "meaning": "speed of the car",

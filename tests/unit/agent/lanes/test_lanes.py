@@ -24,6 +24,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
+from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.text import render
 from iort_contract.messages.batch import decode_batch
@@ -48,7 +49,7 @@ class Topic(NamedTuple):
     values: Callable[[], Mapping[str, Any]]
 
 
-class Named:
+class Named(SourceConfig):
     """A source that only names its streams."""
 
     def __init__(self, count: int) -> None:

@@ -91,6 +91,8 @@ STORED = (
     b'"samples":"eJyrVkopUbKKNtAxAiJT01gdpbTM1JyUYiWraqVEoIShjoGekU5eaU4OUCoJKKCUr6RTUlSaqpOWmFOcGltbCwBm'
     b'dxOr"}'
 )
+# Fields that came after the dictionary was frozen.
+NEWER = {"thread_errors"}
 FROZEN = "71f73f6da111bb52e14b827789e70220e1689946c9378dbab0ed3390b2cf0b95"
 
 
@@ -107,7 +109,7 @@ def test_the_compression_dictionary_stays_the_same():
         *VESC_FIELDS,
         *AGENT_FIELDS,
         *RTT_FIELDS.values(),
-    } <= names
+    } - NEWER <= names
 
 
 @pytest.mark.parametrize(

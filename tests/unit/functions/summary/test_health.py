@@ -49,8 +49,8 @@ def test_round_trips_and_the_agents_own_figures_are_measured():
         "RoundTripRuleMs": [31.5],
         "RoundTripLambdaMs": [],
     }
-    agent = batch({"backlog_batches": [0, 7]})
-    assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0]}
+    agent = batch({"backlog_batches": [0, 7], "thread_errors": [0, 2]})
+    assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0], "ThreadErrors": 2}
 
 
 @pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_station.operations.delivery.accounts import held_against, last_of
+from iort_station.operations.delivery.accounts import held_against, in_car, last_of, without_lateness
 from iort_station.operations.delivery.audit import audit
 
 T_US, BOOT = 1_750_000_000_000_000, "0badcafe"
@@ -19,8 +21,8 @@ def told(seq, *samples, t_us=T_US, received_us=T_US):
     return {**json.loads(encode_batch(batch)), "received_ms": received_us // 1000}
 
 
-def scan(taken, *, ended=False):
-    return StreamAccount("scan", taken, taken, 0, 0, 0, taken // 50, ended=ended).sample()
+def scan(taken, *, ended=False, **more):
+    return StreamAccount("scan", taken, taken, 0, 0, 0, taken // 50, ended=ended, **more).sample()
 
 
 def stored(count):
@@ -52,3 +54,41 @@ def test_the_clouds_clock_decides_whether_a_run_goes_on():
         assert held_against(stored(2), found, T_US + 1_000_000).complete
         (short,) = held_against(stored(2), found, T_US + HOUR_US).shortfalls
         assert "did not end properly" in short.cause
+
+
+@pytest.mark.parametrize(
+    ("durable", "cause"),
+    [
+        (True, "at most one second: the run"),
+        (False, "at most one second, or waited in the queue, which was in memory: the run"),
+        (None, "at most one second, or in the queue if it was in memory: the run"),
+    ],
+)
+def test_a_killed_run_has_lost_what_its_own_queue_could_not_keep(durable, cause):
+    sample = {name: value for name, value in scan(100, durable=durable).items() if value is not None}
+    (short,) = held_against(stored(2), last_of([told(0, sample)]), T_US + HOUR_US).shortfalls
+    assert cause in short.cause
+
+
+def test_a_recording_at_another_speed_does_not_tell_how_late_it_is():
+    def at(seq, *, late_ms):
+        return {
+            "batch": f"{T_US + seq:016d}-{BOOT}-{seq}",
+            "n": "50",
+            "received_ms": str(T_US // 1000 + late_ms),
+        }
+
+    late = audit("scan", [at(0, late_ms=0), at(1, late_ms=9000)])
+    assert late.runs[0].late == 1
+    assert without_lateness(late, last_of([told(0, scan(100))])).runs[0].late == 1
+    played = without_lateness(late, last_of([told(0, scan(100, replayed=True))]))
+    assert (played.runs[0].late, played.runs[0].latest_ms) == (None, None)
+    assert without_lateness(late, {}) == late
+
+
+def test_after_a_run_that_ended_in_good_order_nothing_is_in_the_car():
+    ended, running = (last_of([told(0, scan(100, ended=ended))]) for ended in (True, False))
+    whole = [held_against(stored(2), ended, T_US)]
+    assert [in_car(last, whole, ended) for last in (21, 0, None)] == [0, 0, None]
+    assert in_car(21, whole, running) == 21
+    assert in_car(21, [held_against(stored(1), ended, T_US)], ended) == 21, "batches are missing"

@@ -24,7 +24,7 @@ from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
     from iort_station.cloud import Cloud
-    from iort_station.operations.delivery.audit import Audit
+    from iort_station.operations.delivery.audit import Audit, RunAudit
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -152,13 +152,15 @@ def _audit(
             headers = audit.headers(cloud, robot, name, within.start_us, within.end_us, origin=origin)
             counted = _counting(headers, name, status)
             one = audit.audit(name, counted, late_ms=late_us // 1000, from_start=from_start)
+            one = accounts.without_lateness(one, told)
             # The agent counts a whole run, so a part of one cannot be compared.
             if within == Range(None, None):
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
                 found.append(one)
                 archived.hours += origin.within(within.start_us, within.end_us).hours
-    in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
+    waiting, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
+    in_car = accounts.in_car(waiting, found, told)
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
     for one in found if streams else ():
@@ -254,11 +256,17 @@ def _table(one: Audit) -> Table:
             f"{run.batches:,}",
             f"{missing:,}",
             f"{run.duplicated:,}",
-            f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else ""),
+            _late(run),
             f"{run.samples:,}",
             style="red" if missing else "",
         )
     return table
+
+
+def _late(run: RunAudit) -> str:
+    if run.late is None or run.latest_ms is None:
+        return "-"
+    return f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else "")
 
 
 def _as_json(one: Audit, contents: Mapping[str, str]) -> dict[str, Any]:
