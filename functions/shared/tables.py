@@ -10,7 +10,7 @@ from contextlib import suppress
 from itertools import count
 from typing import Any
 
-from botocore.exceptions import ClientError
+from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.archive.marks import Marks
 from iort_contract.catalog.derived import Vehicle
@@ -128,8 +128,8 @@ class Tables:
                 ExpressionAttributeNames={"#streams": STREAMS, "#robot": ROBOT},
                 ExpressionAttributeValues={":stream": {"SS": [stream]}, ":most": {"N": str(MAX_STREAMS)}},
             )
-        except ClientError as error:
-            # A failure is harmless: only the list of streams uses it.
+        except (BotoCoreError, ClientError) as error:
+            # A failure is harmless: only the list of streams uses it, and the batches wait for nothing.
             _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
         if len(self._noted) >= _NOTED:
             self._noted.clear()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from typing import Any, Callable, Mapping
 
 from iort_agent.control.runtime_settings import overlay
@@ -78,7 +79,10 @@ class Shadow:
         # The version that is followed, and the newest one that was heard of on this connection.
         self._version = self._newest = 0
         self._fetch_at: float | None = None
-        self._report_at: float | None = None
+        # Whether the state may have changed since the last report; any thread sets it, the ticker clears it.
+        self._news = False
+        # When the ticker repeats a report that is not confirmed.
+        self._again_at = math.inf
         for topic_filter, handler in self._filters.items():
             self._uplink.subscribe(topic_filter, handler)
         self._uplink.on_connection(self._on_connection)
@@ -90,13 +94,13 @@ class Shadow:
             if all(self._uplink.subscribed(topic_filter) for topic_filter in self._filters):
                 self._fetch_at = now + _FETCH_AGAIN_S
                 self._publish(self._get, b"")
-        elif self._report_at is not None and self._reported is not None and now >= self._report_at:
-            self._report_at = now + _AGAIN_S
-            change = _difference(self._reported, self._state())
+        elif (self._news or now >= self._again_at) and (reported := self._reported) is not None:
+            # Before the state is read: whatever another thread changes from here on is news again.
+            self._news = False
+            change = _difference(reported, self._state())
+            self._again_at = now + _AGAIN_S if change else math.inf
             if change:
                 self._publish(self._update, json.dumps({"state": {"reported": change}}).encode())
-            else:
-                self._report_at = None
 
     def known(self) -> bool:
         """Whether the operator's settings are known: fetched on this connection, and no change was missed."""
@@ -111,7 +115,7 @@ class Shadow:
             # Names that nobody has given the robot must not fill the shadow.
             del self._answers[next(iter(self._answers))]
         self._answers[name] = Outcome(command.session, command.seq, outcome)
-        self._report_at = self._clock.monotonic()
+        self._news = True
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
         self._fetch_at = self._clock.monotonic() if connected else None
@@ -191,7 +195,7 @@ class Shadow:
             _log.info("now in force: %s", json.dumps(settings.by_name()))
             self.settings = settings
             self._apply(settings)
-        self._report_at = self._clock.monotonic()
+        self._news = True
 
     def _note_over_share(self, said: OverShare) -> None:
         """Note that the cloud put off batches, and log it once."""

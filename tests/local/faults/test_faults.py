@@ -10,6 +10,7 @@ import os
 import shutil
 import sqlite3
 import subprocess
+import sys
 import threading
 import time
 from contextlib import closing
@@ -20,12 +21,14 @@ import pytest
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.fleet import robots
+from iort_station.fleet.identity import claims
 from iort_station.operations.delivery import accounts, audit, counts
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
 from tests.local.data.drives import RATE_HZ, Agent, counted, counter_log
 from tests.local.faults.test_uplink import set_status
+from tests.waiting import GUARD_S
 
 OUTAGE_S = 60
 DRIVE_S = 75
@@ -164,6 +167,37 @@ def test_a_killed_agent_resumes_its_queue(embedded, bundle, proxy, tmp_path, bro
     assert found[:restart] == list(range(restart))
     assert restart >= closed
     assert found[restart:] == list(range(10 * RATE_HZ))
+
+
+def test_a_claimed_robot_that_is_killed_in_an_outage_loses_only_its_open_batch(embedded, proxy, tmp_path):
+    """The recommended way to a robot sets no queue, and it is on the disk."""
+    claim = claims.claim(embedded.cloud, "claimed-killed", out=tmp_path / "claim")
+    car = robots.Bundle("claimed-killed", claim.parent)
+    provision = [Path(sys.executable).parent / "iort-agent", "provision", "--config", claim]
+    subprocess.run(provision, check=True, timeout=GUARD_S)
+    assert "queue" not in car.config.read_text()
+    log = counter_log(tmp_path / "long.csv", 600)
+    robots.configure(car, {"port": proxy.port, "sources": [{"type": "bag", "path": str(log)}]})
+    first = Agent(car)
+    until(lambda: first.said("connected to"))
+    proxy.mode = REFUSE
+    until(lambda: first.told()["spool"]["batches"] >= 12)
+    closed = first.told()["streams"]["vesc"]["stored"]
+    until(lambda: first.told()["streams"]["vesc"]["stored"] >= closed + RATE_HZ)
+    first.kill()
+    proxy.mode = PASS
+    robots.configure(car, {"sources": [{"type": "bag", "path": str(counter_log(tmp_path / "short.csv", 2))}]})
+    Agent(car).report()
+    found = counted(embedded, car.robot)
+    restart = found.index(0, 1)
+    assert found[:restart] == list(range(restart))
+    assert restart >= closed
+    told = accounts.accounts(embedded.cloud, car.robot)
+    headers = audit.headers(embedded.cloud, car.robot, "vesc")
+    vesc = accounts.held_against(audit.audit("vesc", headers), told, time.time_ns() // 1000)
+    assert (vesc.missing, len(vesc.runs)) == (0, 2)
+    (short,) = [one for one in vesc.shortfalls if one.samples is None]
+    assert short.cause == "were in open batches, at most one second: the run did not end properly"
 
 
 @pytest.mark.skipif(FAKETIME is None, reason="libfaketime is not installed: apt install faketime")

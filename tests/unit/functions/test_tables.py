@@ -8,7 +8,7 @@ from decimal import Decimal
 import boto3
 import pytest
 from botocore.config import Config
-from botocore.exceptions import ClientError
+from botocore.exceptions import ClientError, EndpointConnectionError
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -323,3 +323,11 @@ def test_a_robot_with_ever_new_streams_has_a_bounded_row(client):
         written.note_stream("car", f"s{number:04d}")
     row = client.get_item(TableName=ROBOTS, Key={"robot": {"S": "car"}})["Item"]
     assert len(row["streams"]["SS"]) == tables_module.MAX_STREAMS
+
+
+def test_a_stream_that_cannot_be_noted_fails_no_record(client):
+    class Unreachable:
+        def update_item(self, **_request):
+            raise EndpointConnectionError(endpoint_url="https://dynamodb")
+
+    tables(Unreachable()).note_stream("car", "vesc")

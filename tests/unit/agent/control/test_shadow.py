@@ -29,7 +29,7 @@ DOCUMENT = encode_reported(Reported(BASE.by_name(), agent_version="1.2.3", moves
 class Rig:
     """A robot and its shadow, which behaves as AWS'."""
 
-    def __init__(self, **desired: Any) -> None:
+    def __init__(self, version: str = "1.2.3", **desired: Any) -> None:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
         self.applied: list[RuntimeSettings] = []
@@ -40,7 +40,7 @@ class Rig:
             base=BASE,
             apply=self.applied.append,
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
-            version="1.2.3",
+            version=version,
             moves=True,
         )
         self.seen = 0
@@ -350,6 +350,35 @@ def test_no_desired_value_raises(desired: dict[str, Any]) -> None:
     settings, rejected = overlay(BASE, BASE, decode_desired(desired).settings, {})
     assert 0.01 <= settings.live_rate_hz <= 10
     json.dumps(rejected)
+
+
+class Compared(str):
+    """Calls a function when it is compared the ``count``-th time: in the middle of a report."""
+
+    __slots__ = ("call", "count")
+    call: Any
+    count: int
+
+    def __ne__(self, other: object) -> bool:
+        self.count -= 1
+        if not self.count:
+            self.call()
+        return super().__ne__(other)
+
+    __hash__ = str.__hash__
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_outcome_that_comes_while_a_report_is_made_is_reported(count: int) -> None:
+    version = Compared("1.2.3")
+    version.count = 0
+    rig = Rig(version)
+    command = Command("feedbeef", 1, 7, 2, 500, {}, answer=True)
+    version.count, version.call = count, lambda: rig.shadow.answer("late", command, None)
+    rig.shadow.answer("drive", command, None)
+    rig.settle()
+    assert version.count <= 0
+    assert rig.reported["commands"]["late"]["seq"] == 7
 
 
 def test_outcomes_of_commands_are_reported_until_the_run_ends() -> None:

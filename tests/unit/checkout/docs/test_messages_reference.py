@@ -149,7 +149,7 @@ WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
     **{name: (encode_answer(answer), as_object(decode_answer), answer) for name, answer in ANSWERS.items()},
 }
 SAMPLES: dict[str, accounts.Account | MessageType] = {
-    "account": accounts.StreamAccount("vesc", 1500, 1450, 0, 0, 0, 29, ended=False),
+    "account": accounts.StreamAccount("vesc", 1500, 1450, 0, 0, 0, 29, ended=False, durable=True),
     "lost": accounts.SourceAccount("ros1", {"/tf.malformed": 3}),
     "type": MessageType(
         "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
