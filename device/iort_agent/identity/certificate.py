@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Optional, Tuple
 from iort_agent.errors import IdentityError
 
 _PEM = re.compile(r"-----BEGIN CERTIFICATE-----\s+.+?-----END CERTIFICATE-----", re.DOTALL)
+_KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----")
 
 # Change time, size and inode of each file; None for a file that is missing.
 Stamp = Tuple[Optional[Tuple[int, int, int]], ...]
@@ -98,7 +99,15 @@ def parse_certificate(pem: str) -> Certificate:
 
 
 def check_pair(certificate: Path, private_key: Path) -> None:
-    """Raise `IdentityError` if the key is not the certificate's, or needs a password."""
+    """Raise `IdentityError` if a file cannot be read or is not what its name says, if the key is not the
+    certificate's, or if it needs a password."""
+    for path, other, what, content in (
+        (certificate, private_key, "certificate", _PEM),
+        (private_key, certificate, "private_key", _KEY),
+    ):
+        if not _holds(path, content):
+            swapped = f", and {other.name} has one: are the two swapped?" if _holds(other, content) else ""
+            raise IdentityError(f"{what}: {path} holds no PEM {what.replace('_', ' ')}{swapped}")
     try:
         # A password is never asked for: this may run without a terminal.
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(
@@ -109,6 +118,13 @@ def check_pair(certificate: Path, private_key: Path) -> None:
         if "MISMATCH" in str(reason):
             raise IdentityError(f"{private_key} is not the key of {certificate}") from error
         raise IdentityError(f"{certificate} and {private_key} cannot be used: {reason}") from error
+
+
+def _holds(path: Path, content: re.Pattern[str]) -> bool:
+    try:
+        return content.search(path.read_text(encoding="ascii", errors="replace")) is not None
+    except OSError as error:
+        raise IdentityError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def stamp(*paths: Path | None) -> Stamp:

@@ -20,7 +20,7 @@ from awscrt import mqtt5
 from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Supervised
-from iort_agent.errors import UplinkError
+from iort_agent.errors import IdentityError, UplinkError
 from iort_agent.mqtt.client import ClientFactory
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
@@ -122,8 +122,10 @@ class IotCore:
         """Connect in the background. Raises `UplinkError` if the certificate or the key cannot be used."""
         try:
             self._new_client()
+        except IdentityError as error:
+            raise UplinkError(str(error)) from error
         except Exception as error:
-            raise UplinkError(f"certificate, private_key or root_ca cannot be used: {error}") from error
+            raise UplinkError(f"root_ca or the certificate cannot be used: {error}") from error
         self._dispatcher.start()
         _log.info("connecting to %s as %s", self._endpoint, self._client_id)
         self._thread.start()

@@ -11,7 +11,7 @@ from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.errors import IdentityError
-from iort_agent.identity.certificate import Certificate, Validity, read_certificate, stamp
+from iort_agent.identity.certificate import Certificate, Validity, check_pair, read_certificate, stamp
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class ClientFactory:
         ping_timeout_s: float,
     ) -> None:
         self.certificate_file = certificate
-        self._files = (certificate, private_key, root_ca)
+        self._files: tuple[Path, Path, Path | None] = (certificate, private_key, root_ca)
         self._build = functools.partial(
             mqtt5_client_builder.mtls_from_path,
             str(certificate),
@@ -59,11 +59,14 @@ class ClientFactory:
         self._certificate: Certificate | None = None
 
     def make(self, **handlers: Any) -> Any:
-        """Make a client from the files as they are now. Raises whatever the library does for a wrong file."""
+        """Make a client from the files as they are now. Raises `IdentityError`, which says which of them does
+        not fit, and whatever the library does for a wrong ``root_ca``."""
         if self._bootstrap is None:
             group = io.EventLoopGroup(1)
             self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
         self._stamp = stamp(*self._files)
+        # The library's own error names no file.
+        check_pair(*self._files[:2])
         client = self._build(client_bootstrap=self._bootstrap, **handlers)
         try:
             self._certificate = read_certificate(self.certificate_file)

@@ -68,7 +68,7 @@ class Usage:
     function_logs: str = "own"
     alarms: int = 39
     insights_metrics: int = 63
-    dashboards: tuple[int, ...] = (49, 20, 20)
+    dashboards: tuple[int, ...] = (49, 20, 21)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False

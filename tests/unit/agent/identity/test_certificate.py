@@ -17,9 +17,12 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.errors import IdentityError
+from iort_agent.clock import SystemClock
+from iort_agent.errors import IdentityError, UplinkError
 from iort_agent.identity.certificate import check_pair, parse_certificate, read_certificate, stamp
 from iort_agent.identity.machine_key import make_key
+from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.dispatch import Dispatcher
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:
@@ -97,7 +100,7 @@ def test_a_key_belongs_to_its_certificate(tmp_path: Path) -> None:
     check_pair(tmp_path / "c", tmp_path / "k")
     with pytest.raises(IdentityError, match="is not the key of"):
         check_pair(tmp_path / "c", tmp_path / "o")
-    with pytest.raises(IdentityError, match="cannot be used"):
+    with pytest.raises(IdentityError, match="x holds no PEM private key"):
         check_pair(tmp_path / "c", tmp_path / "x")
     with pytest.raises(IdentityError, match="cannot be read"):
         read_certificate(tmp_path / "none")
@@ -116,3 +119,36 @@ def test_a_stamp_changes_with_every_replacement(tmp_path: Path) -> None:
     os.utime(file, (1, 1))
     seen.append(stamp(file))
     assert len(set(seen)) == 3
+
+
+def test_swapped_files_are_named_also_by_the_running_agent(tmp_path: Path) -> None:
+    now = dt.datetime.now(dt.timezone.utc)
+    certificate, key = made(now, now + dt.timedelta(days=1))
+    of_another = made(now, now + dt.timedelta(days=1))[1]
+    files = {"c.pem": text(certificate), "k.key": key, "other.key": of_another, "empty": ""}
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    for named, why in (
+        (
+            ("k.key", "c.pem"),
+            r"certificate: \S+/k.key holds no PEM certificate, and c.pem .* swapped\?",
+        ),
+        (("c.pem", "empty"), r"private_key: \S+/empty holds no PEM private key$"),
+        (("c.pem", "missing"), r"/missing: cannot be read: No such file"),
+        (("c.pem", "other.key"), r"/other.key is not the key of \S+/c.pem"),
+    ):
+        paths = tuple(tmp_path / name for name in named)
+        with pytest.raises(IdentityError, match=why):
+            check_pair(*paths)
+        uplink = IotCore(
+            endpoint="127.0.0.1",
+            port=9,
+            client_id="car1",
+            certificate=paths[0],
+            private_key=paths[1],
+            root_ca=None,
+            clock=SystemClock(),
+            dispatcher=Dispatcher(),
+        )
+        with pytest.raises(UplinkError, match=why):
+            uplink.start()

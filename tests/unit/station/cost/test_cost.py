@@ -133,7 +133,7 @@ def test_metrics_of_every_robot_are_billed_per_robot():
         usage = replace(_ONE, robots=robots, robot_metrics=True)
         rest = deployment_dollars_per_month(usage)
         assert rest["dashboards"] == billed * 3.0, "20 metrics and four a robot"
-        assert rest["metrics"] == pytest.approx((len(METRICS) + 9 * robots - 10) * 0.30)
+        assert rest["metrics"] == pytest.approx((len(METRICS) + 10 * robots - 10) * 0.30)
 
 
 def test_the_live_page_refreshes_as_often_as_the_model_assumes():
