@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import stat
 import threading
@@ -74,6 +75,54 @@ def test_a_link_in_place_of_a_written_file_is_replaced(folder, secret):
     assert not (folder / STATE).is_symlink()
     # The state was kept and is read again.
     assert watched(folder).next() is None
+
+
+def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
+    count = 300
+    for number in range(count):
+        (folder / f"{number:04d}.jpg").write_bytes(b"1")
+    files = watched(folder)
+    inodes, sizes = set(), [0]
+    for _ in range(count):
+        name = files.next()
+        files.uploaded(name, files.local(name, threading.Event()), "files/iort/car1/image/0123456789abcdef")
+        written = (folder / STATE).stat()
+        inodes.add(written.st_ino)
+        sizes.append(written.st_size)
+    assert len(inodes) == 1, "it is never written anew"
+    steps = {after - before for before, after in zip(sizes, sizes[1:])}
+    assert max(steps) < 200
+    assert max(steps) - min(steps) < 5, "a line each"
+    assert watched(folder).next() is None
+    # Killed in the middle of a line, which the next one does not continue.
+    with (folder / STATE).open("a") as state:
+        state.write('["0000.jpg", nu')
+    (folder / "more.jpg").write_bytes(b"1")
+    again = watched(folder)
+    name = again.next()
+    assert str(name) == "more.jpg"
+    again.uploaded(name, again.local(name, threading.Event()), "key")
+    assert watched(folder).next() is None
+    # Lines of files that are gone do not stay for ever.
+    for _ in range(4):
+        for path in folder.glob("*.jpg"):
+            path.unlink()
+        assert again.next() is None
+        for number in range(count):
+            (folder / f"{number:04d}.jpg").write_bytes(b"1")
+        for _ in range(count):
+            name = again.next()
+            again.uploaded(name, again.local(name, threading.Event()), "key")
+    assert len((folder / STATE).read_text().splitlines()) <= 1000 + 2 * count
+
+
+def test_the_state_of_an_earlier_agent_is_taken_over(folder):
+    (folder / "a.jpg").write_bytes(b"1")
+    look = (folder / "a.jpg").stat()
+    done = {"look": [look.st_size, look.st_mtime_ns], "key": "key", "at_s": 1}
+    (folder / ".iort-uploads.json").write_text(json.dumps({"read": {}, "done": {"a.jpg": done}}))
+    assert watched(folder).next() is None
+    assert (folder / STATE).exists()
 
 
 def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
@@ -150,7 +199,8 @@ def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask
     (folder / "uploads" / "a.bag").write_bytes(b"1")
     (folder / "uploads" / "a.bag").chmod(0o600)
     files = watched(folder / "uploads")
-    files.local(files.next(), threading.Event())
+    name = files.next()
+    files.uploaded(name, files.local(name, threading.Event()), "key")
     assert (folder / "uploads" / STATE).exists()
     attachments = Attachments("car", folder, LARGE, clock, stored=lambda: None, thumbnail=lambda *_: None)
     attachments.attach_to_fields("lidar", 1, {"scan": b"x"})

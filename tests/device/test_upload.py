@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from iort_agent.common.state import Files
+from iort_agent.common.threads import Supervised
 from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
@@ -30,6 +31,7 @@ from iort_contract.messages.requests.files import (
 from iort_contract.topics import FILE, PING, build_topic
 from tests.agent_fakes import Loopback, ManualClock, link_of
 from tests.store_standin import store
+from tests.waiting import GUARD_S
 
 
 class Rig:
@@ -448,8 +450,11 @@ def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
         return True
 
     uploads.step = odd
-    uploads.run(rig.stop)
-    assert "continuing after an error" in caplog.text
+    thread = Supervised("uploads", lambda: uploads.run(rig.stop))
+    thread.start()
+    assert rig.stop.wait(GUARD_S)
+    thread.join(GUARD_S)
+    assert "the thread uploads failed and starts again" in caplog.text
     assert list(rig.store.objects.values()) == [b"1"]
 
 

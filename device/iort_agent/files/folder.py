@@ -1,7 +1,8 @@
 """A folder whose finished files are uploaded, the oldest first.
 
-A small file in the folder keeps which files were uploaded, and the hashes of those that were read. So a
-restart neither uploads nor reads a file twice.
+A file in the folder keeps which files were uploaded, and the hashes of large ones that were read, so that a
+restart neither uploads nor reads them twice. Each line is a file's newest state, null once it is gone. Lines
+are appended, and written anew when most are out of force: a file costs the same, however many there are.
 """
 
 from __future__ import annotations
@@ -20,13 +21,18 @@ from iort_agent.files.file import LocalFile, Look, from_json, look_at, read, to_
 
 _log = logging.getLogger(__name__)
 
-STATE = ".iort-uploads.json"
+STATE = ".iort-uploads.jsonl"
+# The whole state in one object, as earlier agents wrote it.
+_OLD_STATE = ".iort-uploads.json"
+# The lines that may be out of force, beside as many as are in force.
+_SPARE_LINES = 1000
 _DEPTH = 6
 # A file that was refused is tried again when it has changed, or after this time: the cloud's rules may
 # change.
 _REFUSED_AGAIN_S = 86_400.0
 # The wait after a failure doubles from the first value to the last, whatever the cloud says.
 HELD_S, _MOST_HELD_S = 5.0, 300.0
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 # Suffixes of unfinished files. rosbag and rosbag2 rename a file when it is done.
 _UNFINISHED = (".active", ".tmp", ".part", "-wal", "-shm", "-journal")
 
@@ -47,9 +53,10 @@ class Folder:
         # By path below the folder: its look, and since when, on the monotonic clock.
         self._seen: dict[Path, tuple[Look, float]] = {}
         self._held: dict[Path, _Held] = {}
-        # In the file, by path below the folder.
+        # In the file of the state, by path below the folder.
         self._read: dict[str, Any] = {}
         self._done: dict[str, Any] = {}
+        self._lines = 0
         self.waiting = 0
         self._load()
 
@@ -81,8 +88,10 @@ class Folder:
         local = from_json(self.path, name, self._read.get(str(name), {}))
         if local is None:
             local = read(self.path, name, stop=stop)
-            self._read[str(name)] = to_json(local)
-            self._save()
+            # A file of one part is read again sooner than it is noted.
+            if len(local.parts) > 1:
+                self._read[str(name)] = to_json(local)
+                self._note(str(name))
         return local
 
     def uploaded(self, name: Path, local: LocalFile, key: str) -> None:
@@ -90,7 +99,7 @@ class Folder:
         self._read.pop(str(name), None)
         done = self._done[str(name)] = _done(local.look, key, self._clock.now_us() // 1_000_000)
         self.waiting = max(0, self.waiting - 1)
-        self._save()
+        self._note(str(name))
         self._remove_if_due(name, done)
 
     def hold(self, name: Path, again_s: float | None) -> None:
@@ -136,9 +145,10 @@ class Folder:
             for name in names.keys() - found.keys():
                 del names[name]
         kept = {str(name) for name in found}
-        for saved in (self._read, self._done):
-            for missing in saved.keys() - kept:
-                del saved[missing]
+        for missing in (self._read.keys() | self._done.keys()) - kept:
+            self._read.pop(missing, None)
+            self._done.pop(missing, None)
+            self._note(missing)
 
     def _remove_if_due(self, name: Path, done: dict[str, Any]) -> None:
         if self._remove_after_s is None:
@@ -154,21 +164,73 @@ class Folder:
 
     def _load(self) -> None:
         try:
-            with open_below(self.path, PurePath(STATE)) as file:
-                saved = json.load(file)
-            self._read = dict(saved["read"])
-            self._done = {name: _done(**done) for name, done in dict(saved["done"]).items()}
-        except FileNotFoundError:
-            pass
+            for line in self._saved().splitlines():
+                name, read_, done = json.loads(line)
+                self._take(str(name), read_, done)
+                self._lines += 1
         except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
             self._read, self._done = {}, {}
             # The cloud knows which files it has, so the agent only reads them again.
             _log.warning("files: %s cannot be used and is replaced: %s", self.path / STATE, error)
+            self._write()
 
-    def _save(self) -> None:
-        content = json.dumps({"read": self._read, "done": self._done}).encode()
+    def _saved(self) -> str:
+        """The lines of the state; an earlier agent's state becomes lines."""
         try:
-            write_below(self.path, PurePath(STATE), content)
+            with open_below(self.path, PurePath(STATE)) as file:
+                text = file.read().decode()
+        except FileNotFoundError:
+            try:
+                with open_below(self.path, PurePath(_OLD_STATE)) as file:
+                    saved = json.load(file)
+            except FileNotFoundError:
+                return ""
+            for name in {**saved["read"], **saved["done"]}:
+                self._take(name, saved["read"].get(name), saved["done"].get(name))
+            self._write()
+            return ""
+        # The agent may have been killed in the middle of the last line.
+        lines, newline, rest = text.rpartition("\n")
+        if rest:
+            _log.info("files: %s: its last line is not complete", self.path / STATE)
+            with folder_of(self.path, PurePath(STATE)) as folder:
+                file_ = os.open(STATE, _APPEND, dir_fd=folder)
+            os.ftruncate(file_, len((lines + newline).encode()))
+            os.close(file_)
+        return lines
+
+    def _take(self, name: str, read_: Any, done: Any) -> None:
+        """Take a file's state as it was saved."""
+        self._read.pop(name, None)
+        self._done.pop(name, None)
+        if read_ is not None:
+            self._read[name] = dict(read_)
+        if done is not None:
+            self._done[name] = _done(**done)
+
+    def _line(self, name: str) -> bytes:
+        return json.dumps([name, self._read.get(name), self._done.get(name)]).encode() + b"\n"
+
+    def _note(self, name: str) -> None:
+        """Append a file's state."""
+        self._lines += 1
+        if self._lines > _SPARE_LINES + 2 * len(self._read.keys() | self._done.keys()):
+            self._write()
+            return
+        try:
+            with folder_of(self.path, PurePath(STATE)) as folder:
+                file = os.open(STATE, _APPEND, 0o600, dir_fd=folder)
+            with os.fdopen(file, "ab") as lines:
+                lines.write(self._line(name))
+        except OSError as error:
+            _log.warning("files: %s: %s", self.path / STATE, error.strerror or error)
+
+    def _write(self) -> None:
+        """Write the state anew, without the lines that are no longer in force."""
+        names = self._read.keys() | self._done.keys()
+        self._lines = len(names)
+        try:
+            write_below(self.path, PurePath(STATE), b"".join(map(self._line, names)))
         except OSError as error:
             _log.warning("files: %s: %s", self.path / STATE, error.strerror or error)
 

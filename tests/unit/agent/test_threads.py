@@ -32,7 +32,7 @@ from iort_agent.sources.sim.source import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_agent.status.server import StatusServer, fetch
 from iort_contract.messages.batch import decode_batch
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
 from tests.unit.agent.control.downlink_rig import FakeGraph
 from tests.unit.agent.control.test_asks import ANSWERS, NAME, TOPIC, string
@@ -105,11 +105,19 @@ def in_the_whole_agent(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> N
     spool.start()
     agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
     runtime = Runtime(agent)
+    topic, recorded = "$aws/rules/iort_record/dt/iort/car1/vesc", threading.Event()
+
+    def verdict(message: Published) -> None:
+        if message.topic == topic:
+            recorded.set()
+
+    uplink.verdict = verdict
     ended: list[int] = []
     run = threading.Thread(target=lambda: ended.append(runtime.run(drain_s=SOON_S)))
     run.start()
     try:
         assert clock.back.wait(SOON_S), f"{kind} does not go on"
+        assert recorded.wait(SOON_S), "no sample is recorded any more"
         (alarm,) = [alarm for alarm in make_status(agent).alarms if "the thread" in alarm]
         assert alarm.startswith(f"the thread {kind}")
         assert alarm.endswith(WHY)
@@ -118,7 +126,6 @@ def in_the_whole_agent(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> N
         run.join()
         spool.close()
     assert ended == [0]
-    topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
     batches = {
         batch.seq: batch for m in uplink.published if m.topic == topic for batch in [decode_batch(m.payload)]
     }
