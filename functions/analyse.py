@@ -20,6 +20,7 @@ from iort_analysis.archive.tables import write_table
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, encode_result
+from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import drive_prefix
@@ -36,10 +37,13 @@ def analysed(planned: PlannedDrive, recordings: Recordings) -> DriveResult:
     streams: dict[str, Block] = {}
     notes: dict[str, str] = {}
     for stream in planned.streams:
-        items = recordings.items(drive.robot, stream, drive.start_us, planned.end_us + 1)
+        refused = RefusedItems()
+        items = recordings.items(drive.robot, stream, drive.start_us, planned.end_us + 1, refused=refused)
         found = recorded(drive, planned.end_us, stream, items)
         streams[stream] = found.block
         notes.update(found.notes)
+        if refused.count:
+            notes[f"{stream} archive"] = refused.reason
     result = analyse(drive, streams, registered.vehicle, registered.known)
     mined = replace(result.mined, missing={**notes, **result.mined.missing})
     return replace(result, end_us=planned.end_us, mined=mined)

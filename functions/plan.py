@@ -6,6 +6,7 @@ drive.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -23,10 +24,9 @@ from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
 from iort_analysis.drives.finding import STAND_US, Found, Heard, find
 from iort_analysis.drives.motion import Motion, motion_among
-from iort_analysis.samples.batches import RefusedItems, blocks
+from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import plan_key
-from iort_contract.dynamodb import Item
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.analysis.findings import DriveKey
@@ -40,6 +40,7 @@ from iort_contract.messages.analysis.run import (
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 
+_log = logging.getLogger(__name__)
 _END_US = 2**53
 # A drive may have begun so long before the range.
 _BEFORE_US = tuple(seconds * 1_000_000 for seconds in (120, 1_800, 28_800))
@@ -84,6 +85,7 @@ class _Heard:
 
     def __init__(self, recordings: Recordings, robot: str, stream: str, motion: Motion | None) -> None:
         self._recordings, self._robot, self._stream, self._motion = recordings, robot, stream, motion
+        self._refused = RefusedItems()
 
     def drives(self, request: AnalysisRequest) -> list[Found]:
         """The drives that have samples in the range."""
@@ -105,16 +107,20 @@ class _Heard:
 
     def between(self, start_us: int, end_us: int) -> Iterator[Heard]:
         """The batches with samples in a range."""
-        for item in self._recordings.items(self._robot, self._stream, start_us, end_us):
+        items = self._recordings.items(self._robot, self._stream, start_us, end_us, refused=self._refused)
+        for item in items:
             # What is not a batch has no time.
             with suppress(ContractError, KeyError):
                 yield Heard(batch_id(item[BATCH]["S"]), partial(self._moves, item))
+        if self._refused.count:
+            told = self._robot, self._refused.count, self._refused.reason
+            _log.warning("%s: %d stored items cannot be read; the first: %s", *told)
 
     def _moves(self, item: Item) -> bool:
         """Whether the car moves in a batch, or nobody knows."""
         if self._motion is None:
             return True
-        for block in blocks([[item]], RefusedItems(), self._motion.field.__eq__):
+        for block in blocks([[item]], self._refused, self._motion.field.__eq__):
             moves = self._motion.moves(block.columns)
             return moves is None or bool(moves.any() or np.isnan(block.columns[self._motion.field]).all())
         return False

@@ -20,23 +20,17 @@ ODD: tuple[Any, ...] = (
     *("", "a", "NaN", "1e9", "\ud800", "\x00", "é" * 3000, "2023-11-14T22", "1700000000000000-0badcafe-0"),
     *([], [[]], [None], {}, {"": {}}, {"a": 1}),
 )
-# The same for an attribute of DynamoDB; a damaged file of refused items may hold any of them.
+# What an attribute of a stored item may be.
 ODD_ATTRIBUTES: tuple[Any, ...] = (
-    *({"N": text} for text in ("-1", "0", "1E+125", "9" * 38, "-" + "9" * 30, "0.5", "NaN", "x", "")),
-    *({"S": text} for text in ("", "50", "steps", "ros1", "\ud800", "9" * 16 + "-0badcafe-0", "x" * 4000)),
+    *({"N": text} for text in ("-1", "0", "1E+125", "9" * 38, "-" + "9" * 30, "0.5", "1E-130", "2", "50001")),
+    *({"S": text} for text in ("", "50", "steps", "ros1", "9" * 16 + "-0badcafe-0", "x" * 4000, "\x00é")),
     *({"B": b"50"}, {"BOOL": True}, {"NULL": True}, {"L": [{"N": "2"}]}, {"M": {"a": {"S": "b"}}}),
-    *(
-        {"SS": ["a"]},
-        {"NS": ["1"]},
-        {},
-        {"X": "1"},
-        {"S": 5},
-        {"N": None},
-        {"S": "a", "N": "1"},
-        None,
-        "50",
-        7,
-    ),
+    *({"SS": ["a"]}, {"NS": ["1"]}),
+)
+# What DynamoDB gives never, and a damaged file may hold.
+NO_ATTRIBUTES: tuple[Any, ...] = (
+    *({}, {"X": "1"}, {"S": 5}, {"S": "\ud800"}, {"N": None}, {"N": "NaN"}, {"N": "x"}, {"N": ""}),
+    *({"S": "a", "N": "1"}, None, "50", 7),
 )
 _TEXT = b'0123456789"[]{},:-.eE\\ntrufalsNI \x00\xff'
 
@@ -112,7 +106,12 @@ def mutated_samples(random: Random, codec: str, samples: str) -> str:
     return base64.b64encode(deflater.compress(text + line + behind) + deflater.flush()).decode()
 
 
-def mutated_item(random: Random, item: Item, keep: frozenset[str] = frozenset()) -> Item:
+def mutated_item(
+    random: Random,
+    item: Item,
+    keep: frozenset[str] = frozenset(),
+    attributes: tuple[Any, ...] = ODD_ATTRIBUTES + NO_ATTRIBUTES,
+) -> Item:
     """A stored batch with one or two attributes damaged, except those to ``keep``."""
     item = copy.deepcopy(item)
     for _ in range(random.choice((1, 1, 1, 2))):
@@ -121,7 +120,7 @@ def mutated_item(random: Random, item: Item, keep: frozenset[str] = frozenset())
         if kind == 0:
             del item[name]
         elif kind < 4 or "samples" not in item or not isinstance(item["samples"], dict):
-            item[name] = copy.deepcopy(random.choice(ODD_ATTRIBUTES))
+            item[name] = copy.deepcopy(random.choice(attributes))
         elif isinstance(samples := item["samples"].get("S"), str) and isinstance(item.get("codec"), dict):
             try:
                 item["samples"] = {"S": mutated_samples(random, item["codec"].get("S", ""), samples)}

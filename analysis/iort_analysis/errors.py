@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class AnalysisError(Exception):
     """The root of the package's exceptions."""
+
+
+class ArchiveError(AnalysisError):
+    """An object of the archive that is missing or damaged; the text says which."""

@@ -12,7 +12,7 @@ from decimal import Decimal
 from itertools import islice
 from typing import Any, Callable, Dict, Iterable, Iterator, Mapping, NamedTuple, Sequence, TypeVar
 
-from iort_contract.checks import COMPACT, shown
+from iort_contract.checks import COMPACT, integer, shown
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH, SECOND, TOPIC
@@ -225,6 +225,14 @@ def deserialize(attribute: Mapping[str, Any]) -> Any:
         return _VALUES[kind](content)
     except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ContractError(f"attribute must be one of DynamoDB, got {shown(attribute)}") from error
+
+
+def whole(item: Mapping[str, Any], name: str) -> int | None:
+    """An item's attribute as an integer; None without it, and for anything else."""
+    try:
+        return integer(plain({name: item[name]}), name)
+    except (ContractError, KeyError):
+        return None
 
 
 def _same(content: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,7 +28,7 @@ from iort_analysis.archive.pieces import pieces
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
 from iort_contract.archive import Hour, content_hash, item_hash
 from iort_contract.catalog.streams import CATALOG
-from iort_contract.dynamodb import Item
+from iort_contract.dynamodb import Item, whole
 from iort_contract.tables import BATCH, EXPIRES_S
 
 # Gives a field's unit and its meaning, each perhaps empty.
@@ -74,13 +75,13 @@ def write_hour(
     def each() -> Iterator[Item]:
         for item in items:
             hashes.append((item[BATCH]["S"], item_hash(item)))
-            if EXPIRES_S in item:
-                expiries.append(int(item[EXPIRES_S]["N"]))
+            if (expires_s := whole(item, EXPIRES_S)) is not None:
+                expiries.append(expires_s)
             yield item
 
     def refuse(item: Item, reason: str) -> None:
         reasons[reason] += 1
-        refused.write(json.dumps(item, separators=(",", ":")).encode() + b"\n")
+        refused.write(json.dumps(item, separators=(",", ":"), default=_base64).encode() + b"\n")
 
     batches = samples = 0
     kinds: dict[str, str] = {}
@@ -100,6 +101,11 @@ def write_hour(
         _write(into, kinds, tables, {str(hour): (0, len(places))}, describe)
     ordered = content_hash(sorted(hashes))
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
+
+
+def _base64(content: bytes) -> str:
+    """Bytes as DynamoDB's JSON has them."""
+    return base64.b64encode(content).decode()
 
 
 def write_day(hours: Mapping[Hour, ArchiveFile], into: IO[bytes], *, describe: Describe) -> None:

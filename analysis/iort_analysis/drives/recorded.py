@@ -35,13 +35,13 @@ def recorded(drive: DriveKey, end_us: int, stream: str, items: Iterable[Item]) -
     After a clock was set back, samples of two times have the same time: the longest part counts.
     """
     notes: dict[str, str] = {}
-    refused = RefusedItems()
+    refused = RefusedItems(stream)
     own: list[tuple[BatchId, Item]] = []
     for item in items:
         try:
             found = batch_id(item[BATCH]["S"])
-        except (ContractError, KeyError) as error:
-            refused.add(error)
+        except (ContractError, KeyError, TypeError) as error:
+            refused.add(error, "an unknown time")
             continue
         if found.boot == drive.run:
             own.append((found, item))
@@ -59,7 +59,7 @@ def recorded(drive: DriveKey, end_us: int, stream: str, items: Iterable[Item]) -
     pages = (ordered[i : i + _PAGE_ITEMS] for i in range(0, len(ordered), _PAGE_ITEMS))
     block = join(list(blocks(pages, refused)))
     if refused.count:
-        notes[f"{stream} items"] = f"{refused.count} cannot be decoded: {refused.reason}"
+        notes[f"{stream} items"] = f"{refused.count} cannot be decoded; the first: {refused.reason}"
     times = block.times_us
     inside = slice(*np.searchsorted(times, [drive.start_us, end_us + 1]).tolist())
     return Recorded(block.take(inside), notes)

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from iort_analysis.samples.blocks import EMPTY, Block, Column, column_of, join, joined, ordered
 from iort_analysis.samples.steps import Written, decoded, written
+from iort_contract.checks import shown
 from iort_contract.codec.columns import SCALES, check_sums, decimals_of, not_integers, plain_values
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import (
     Batch,
+    BatchId,
     Envelope,
     Opened,
     batch_id,
@@ -33,6 +35,8 @@ from iort_contract.tables import BATCH, NONFINITE, SAMPLES
 
 # The attributes of a stored item that its samples need.
 ATTRIBUTES = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
+# So many of what cannot be read are named.
+MOST_NAMED = 20
 _SCALES = np.array(SCALES)
 # The arrays of so much text fit in a processor's cache, and malloc keeps memory for them.
 _TOGETHER_BYTES = 40 * 1024
@@ -41,16 +45,28 @@ Wanted = Callable[[str], bool]
 
 
 class RefusedItems:
-    """Counts stored items that are not batches, and keeps the first one's error."""
+    """Counts what cannot be read of a ``topic``, and keeps the first ones by name: topic, time and reason."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.reason = ""
+    def __init__(self, topic: str = "") -> None:
+        self.count, self.topic = 0, topic
+        self.named: list[str] = []
 
-    def add(self, error: Exception) -> None:
-        """Count one."""
+    @property
+    def reason(self) -> str:
+        """The first one; empty if there is none."""
+        return next(iter(self.named), "")
+
+    def add(self, error: Exception, what: object) -> None:
+        """Count one: the batch with this key, or something else."""
         self.count += 1
-        self.reason = self.reason or str(error)
+        if len(self.named) < MOST_NAMED:
+            try:
+                one = what if isinstance(what, BatchId) else batch_id(what)
+                at = np.datetime_as_string(np.datetime64(one.t_us, "us"))
+                what = f"{at}Z ({one})"
+            except ContractError:
+                what = what if isinstance(what, str) else shown(what)
+            self.named.append(f"{self.topic} at {what}: {error}".lstrip())
 
 
 class Part(NamedTuple):
@@ -117,7 +133,7 @@ def _written(items: Iterable[Item], refused: RefusedItems) -> Iterator[Written |
         try:
             envelope = read_envelope(plain({name: item[name] for name in ATTRIBUTES if name in item}))
         except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
-            refused.add(error)
+            refused.add(error, item.get(BATCH, {}).get("S", "") if isinstance(item.get(BATCH), dict) else "")
         else:
             yield written(envelope) or envelope
 
@@ -144,7 +160,7 @@ def _opened(envelopes: Iterable[Envelope], refused: RefusedItems, *, messages: b
         try:
             batch = open_envelope(envelope)
         except ContractError as error:
-            refused.add(error)
+            refused.add(error, BatchId(envelope.first_us, envelope.boot, envelope.seq))
             continue
         if messages or (batch.serialized is None and not batch.about):
             yield batch
@@ -176,7 +192,7 @@ def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) ->
         try:
             batches.append(decode_opened(one))
         except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
-            refused.add(error)
+            refused.add(error, BatchId(one.times_us[0], one.boot, one.seq))
     for _, same in groupby(batches, key=lambda batch: list(batch.columns)):
         group = list(same)
         columns = {

@@ -262,7 +262,8 @@ class Archived(Extent):
 class HistoryAnswer(TypedDict):
     """Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0
     if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units.
-    ``archive`` is null if all comes from the table."""
+    ``archive`` is null if all comes from the table. ``refused`` counts what is stored in the range and
+    cannot be read; ``reason`` names the first by topic, time and error."""
 
     times_s: list[float]
     fields: dict[str, Column]
@@ -270,6 +271,8 @@ class HistoryAnswer(TypedDict):
     ros2: bool
     row_s: float
     archive: Archived | None
+    refused: int
+    reason: str
 
 
 class Series(TypedDict):

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache
-from itertools import groupby, islice
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from functions.shared import clients
-from functions.shared.analysis.expired import Expired
 from functions.shared.environment import variables
+from iort_analysis.archive.hours import Stores
+from iort_analysis.archive.stored import Stored
+from iort_analysis.samples import batches
 from iort_contract.archive import ArchiveTable
 from iort_contract.catalog.derived import Vehicle, registered_vehicle
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.dynamodb import Item, TelemetryTable, plain, quick, with_samples_between
+from iort_contract.dynamodb import TelemetryTable, plain, quick, with_samples_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import batch_id, decode_batch
-from iort_contract.tables import BATCH, ROBOT, STREAMS
+from iort_contract.messages.batch import decode_batch
+from iort_contract.tables import ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 
 if TYPE_CHECKING:
@@ -48,11 +49,8 @@ class Registered(NamedTuple):
 class Recordings:
     """Reads the tables of telemetry and of robots."""
 
-    def __init__(
-        self, client: DynamoDBClient, expired: Expired, *, telemetry: str, robots: str, namespace: str
-    ) -> None:
-        self._client, self._expired, self._robots, self._namespace = client, expired, robots, namespace
-        self._telemetry = TelemetryTable(client, telemetry)
+    def __init__(self, client: DynamoDBClient, stores: Stores, *, robots: str, namespace: str) -> None:
+        self._client, self._stores, self._robots, self._namespace = client, stores, robots, namespace
 
     def robots(self) -> list[str]:
         """The names of all registered robots."""
@@ -67,19 +65,22 @@ class Recordings:
         return Registered(streams, registered_vehicle(known), known)
 
     def items(
-        self, robot: str, stream: str, start_us: int, end_us: int, *, page_items: int | None = None
-    ) -> Iterator[Item]:
-        """The stored batches with samples from ``start_us`` to ``end_us`` (exclusive), in order of time.
+        self,
+        robot: str,
+        stream: str,
+        start_us: int,
+        end_us: int,
+        *,
+        page_items: int | None = None,
+        refused: batches.RefusedItems | None = None,
+    ) -> Iterator[batches.Item]:
+        """The stored items with samples from ``start_us`` to ``end_us`` (exclusive), in order of time.
 
-        Where the table's items expire, the archive has them; those that both have come once.
+        ``refused`` gets what cannot be read of the archive; what is no batch is among the items.
         """
-        topic = build_topic(RECORD, robot, stream, self._namespace)
-        keys = with_samples_between(start_us, end_us)
-        pages = self._telemetry.pages(topic, keys, page_items=page_items)
-        stored = (item for page in pages for item in page.items)
-        archived = self._expired.items(topic, start_us, end_us)
-        for _, same in groupby(heapq.merge(archived, stored, key=_key), _key):
-            yield next(same)
+        stored = Stored(self._stores, build_topic(RECORD, robot, stream, self._namespace), refused=refused)
+        for items in stored.items(with_samples_between(start_us, end_us), (), page_items=page_items):
+            yield from items
 
     def fields(self, robot: str, stream: str, start_us: int, end_us: int) -> list[str] | None:
         """The fields that a stream has at the beginning of a range or at some times later; None if it has no
@@ -91,7 +92,7 @@ class Recordings:
         while looks < _LOOKS and at_us < end_us:
             found = list(islice(self.items(robot, stream, at_us, end_us, page_items=_TRIES), _TRIES))
             if found:
-                looks, seen_us = looks + 1, max(at_us, _start_us(found[0]))
+                looks, seen_us = looks + 1, max(at_us, batches.start_us(found[0]))
             elif not looks or apart_us < _LEAST_APART_US:
                 break
             else:
@@ -112,18 +113,6 @@ def robots_of(client: DynamoDBClient, table: str) -> list[str]:
     return sorted(str(item[ROBOT]["S"]) for page in pages for item in page["Items"])
 
 
-def _key(item: Item) -> str:
-    return str(item[BATCH]["S"])
-
-
-def _start_us(item: Item) -> int:
-    """The time of a stored batch, by its id; 0 for what is not a batch."""
-    try:
-        return batch_id(_key(item)).t_us
-    except ContractError:
-        return 0
-
-
 def _is_number(value: Any) -> bool:
     return not isinstance(value, (bool, str, set, list, dict, bytes)) and value is not None
 
@@ -135,8 +124,11 @@ def deployed() -> Recordings:
     dynamodb = quick(clients.dynamodb())
     return Recordings(
         dynamodb,
-        Expired(ArchiveTable(dynamodb, given.archive_table), clients.s3(), given.files_bucket),
-        telemetry=given.telemetry_table,
+        Stores(
+            TelemetryTable(dynamodb, given.telemetry_table),
+            ArchiveTable(dynamodb, given.archive_table),
+            lambda: (clients.s3(), given.files_bucket),
+        ),
         robots=given.robots_table,
         namespace=given.namespace,
     )

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functions.shared.archive.archive import Archive
 from functions.shared.metrics import emit
 from iort_contract.archive import SAFE_UNTIL_S, Pending, parse_hour
-from iort_contract.dynamodb import starting_between
+from iort_contract.dynamodb import starting_between, whole
 from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, TOPIC
 
 _DAY_S = 86_400
@@ -27,7 +27,7 @@ def put_off(archive: Archive, pending: Pending, now_ms: int) -> int:
     keys = starting_between(hour.start_us, hour.end_us - 1)
     for page in archive.telemetry.pages(pending.topic, keys, attributes=(TOPIC, BATCH, EXPIRES_S)):
         for item in page.items:
-            expires_s = int(item[EXPIRES_S]["N"]) if EXPIRES_S in item else None
+            expires_s = whole(item, EXPIRES_S)
             if expires_s is None:
                 continue
             if expires_s > now_s + margin:

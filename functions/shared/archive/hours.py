@@ -11,19 +11,17 @@ import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from heapq import merge
-from itertools import groupby
 from tempfile import TemporaryFile
 from typing import IO, Any, NamedTuple
 
 from functions.shared.archive.archive import Archive
 from functions.shared.metrics import emit
+from iort_analysis.archive.hours import key_of, merged
 from iort_analysis.archive.items import items as archived_items
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import described, write_hour
 from iort_contract.archive import ArchivedHour, Pending, hour_key, parse_hour, refused_key
 from iort_contract.dynamodb import Item, starting_between
-from iort_contract.tables import BATCH
 from iort_contract.topics import parse_topic
 
 # An item may go a little before its time, by another clock.
@@ -133,14 +131,8 @@ def _with_archived(
         sources.append(archived_items(ArchiveFile(file), row.topic, hour))
     if row.refused:
         lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour)).file)
-        sources.append(iter(sorted(map(json.loads, lines), key=_id)))
-    # The stored one is the first of a kind.
-    for _, same in groupby(merge(*sources, key=_id), key=_id):
-        yield next(same)
-
-
-def _id(item: Item) -> str:
-    return str(item[BATCH]["S"])
+        sources.append(iter(sorted(map(json.loads, lines), key=key_of)))
+    return merged(*sources)
 
 
 def _keep(archive: Archive, row: ArchivedHour, before: ArchivedHour | None) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_analysis.errors import AnalysisError
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.lazy import Verbs
@@ -82,7 +83,7 @@ def main() -> None:
         app(prog_name="iort")
     except UsageError as error:
         _end(str(error), 2)
-    except StationError as error:
+    except (StationError, AnalysisError) as error:
         _end(str(error))
     except ClientError as error:
         _end(f"AWS refused a call: {error}")

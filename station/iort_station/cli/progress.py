@@ -12,7 +12,7 @@ from iort_station.cli.console import errors
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
-    from iort_station.data.stored.batches import PageProgress
+    from iort_analysis.archive.stored import PageProgress
 
 # A bar that would be gone sooner is not shown.
 _PATIENCE_S = 1.0

@@ -23,6 +23,12 @@ def examples(*commands: str) -> str:
     return "\n".join(["\b", "Examples:", *(f"  iort {command}" for command in commands)])
 
 
+def say_refused(count: int, reason: str) -> None:
+    """Say what is stored and cannot be read, if there is something; ``reason`` names the first."""
+    if count:
+        say(f"{count:,} stored items cannot be read and are left out; the first: {reason}")
+
+
 def say_archived(archived: Archived | None) -> None:
     """Say what came from the archive, if something did."""
     if archived is not None:

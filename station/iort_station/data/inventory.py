@@ -152,7 +152,7 @@ def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
 
 
 def _blocks(cloud: Cloud, robot: str, stream: str, start_us: int | None = None) -> Iterator[Block]:
-    parts = Recorded(cloud, robot, stream).parts(with_samples_between(start_us, None), RefusedItems())
+    parts = Recorded(cloud, robot, stream).parts(with_samples_between(start_us, None))
     return in_order(parts)
 
 
@@ -166,6 +166,6 @@ def newest_block(cloud: Cloud, robot: str, stream: str) -> Block:
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:
     """The fields of the first stored samples in the selection's range."""
     keys = with_samples_between(selection.start_us, selection.end_us)
-    parts = Recorded(cloud, selection.robot, selection.stream).parts(keys, RefusedItems())
+    parts = Recorded(cloud, selection.robot, selection.stream).parts(keys)
     page = next(parts, None)
     return set() if page is None else set(page.block.columns)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from iort_analysis.archive.stored import Origin
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis.insights import Extent
@@ -12,7 +13,6 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import has_fraction
 from iort_station.data.runs import runs
-from iort_station.data.stored.recorded import Origin
 from iort_station.data.units import unit
 
 _MOST_RUNS = 100

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.archive.stored import AUTO, TABLE, Origin, PageProgress, Source
 from iort_analysis.samples.batches import RefusedItems, in_order
 from iort_analysis.samples.blocks import Block, Column, join, resample
 from iort_contract.catalog.derived import DERIVED
@@ -22,8 +23,7 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
 from iort_station.data.conditions import derive, holds
 from iort_station.data.selection import Selection, select
-from iort_station.data.stored.batches import PageProgress
-from iort_station.data.stored.recorded import AUTO, TABLE, Origin, Recorded, Source
+from iort_station.data.stored.recorded import Recorded
 from iort_station.data.summary import in_column_order, seconds
 from iort_station.data.units import unit
 from iort_station.errors import StationError
@@ -40,10 +40,11 @@ class Result:
     """Samples in order of time.
 
     ``times_us`` are int64 microseconds since the epoch. ``columns`` has an array per field: float64 with NaN
-    for null, bool for flags, objects for texts. ``refused`` counts stored items that are not batches;
-    ``reason`` is the first one's error. ``absent`` counts values by field that became null because their
-    sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units. ``origin``
-    tells what came from the archive. ``kind_of`` returns the type of the stream's messages, if known.
+    for null, bool for flags, objects for texts. ``refused`` counts what is stored and cannot be read;
+    ``reason`` names the first: topic, time and error. ``absent`` counts values by field that became null
+    because their sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units.
+    ``origin`` tells what came from the archive. ``kind_of`` returns the type of the stream's messages, if
+    known.
     """
 
     robot: str
@@ -114,7 +115,9 @@ def query(
             cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress
         )
     elif summary:
-        found = seconds(cloud, selection, source=source, origin=origin, scan=scan, progress=progress)
+        found = seconds(
+            cloud, selection, source=source, origin=origin, refused=refused, scan=scan, progress=progress
+        )
     else:
         found = samples(
             cloud,
@@ -143,7 +146,7 @@ def query(
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
     if summary and fields is None:
         block = in_column_order(block)
-    if not len(block.times_us):
+    if not len(block.times_us) and not refused.count:
         inventory.check_there(cloud, robot, stream)
     return Result(
         robot,
@@ -177,11 +180,11 @@ def samples(
     recorded. Without ``messages``, samples of ROS messages are skipped. ``origin`` grows by what comes from
     the archive. Raises `StationError` at the end for a named field that no sample has.
     """
-    recorded = Recorded(cloud, selection.robot, selection.stream, source=source, origin=origin)
-    keys = with_samples_between(selection.start_us, selection.end_us)
-    parts = recorded.parts(
-        keys, refused or RefusedItems(), selection.needs, messages=messages, scan=scan, progress=progress
+    recorded = Recorded(
+        cloud, selection.robot, selection.stream, source=source, origin=origin, refused=refused
     )
+    keys = with_samples_between(selection.start_us, selection.end_us)
+    parts = recorded.parts(keys, selection.needs, messages=messages, scan=scan, progress=progress)
     found = in_order(parts)
     named = selection.named()
     derived = sorted(named & DERIVED.keys())

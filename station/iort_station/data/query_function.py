@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from iort_analysis.archive.stored import PageProgress
 from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, join, ordered
 from iort_contract.limits import ContractError
@@ -26,7 +27,6 @@ from iort_contract.messages.requests.query import (
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import PageProgress
 from iort_station.errors import StationError
 
 _DOWNLOAD_S = 60
@@ -63,7 +63,7 @@ def samples(
         parts.append(part)
         there |= set(answer.fields)
         refused.count += answer.refused
-        refused.reason = refused.reason or answer.reason
+        refused.named += [answer.reason] if answer.reason else []
         absent.update(answer.absent)
         if progress is not None and len(part.times_us):
             progress(answer.items, int(part.times_us[-1]))

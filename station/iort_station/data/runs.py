@@ -15,9 +15,10 @@ from contextlib import suppress
 from itertools import islice
 from typing import NamedTuple
 
+from iort_analysis.archive.stored import Origin
 from iort_analysis.samples.batches import ATTRIBUTES
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
-from iort_contract.dynamodb import plain, starting_between
+from iort_contract.dynamodb import plain, starting_between, whole
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
 from iort_contract.messages.analysis.insights import Extent
@@ -26,7 +27,7 @@ from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.recorded import Origin, Recorded
+from iort_station.data.stored.recorded import Recorded
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
@@ -181,7 +182,7 @@ class _Reader:
                     batch = decode_batch(plain(item))
                     if batch.boot != part.last.boot:
                         continue
-                    received_us = int(item[RECEIVED_MS]["N"]) * 1000
+                    received_us = (whole(item, RECEIVED_MS) or 0) * 1000
                     for i in range(len(batch.times_us)):
                         one = account({name: column[i] for name, column in batch.columns.items()})
                         if isinstance(one, StreamAccount):

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from iort_analysis.samples.batches import Item
+from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Pages, Source, ahead, only
+from iort_analysis.samples.batches import Item, RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, objects
 from iort_analysis.samples.seconds import reach, summarized
 from iort_contract import expression
@@ -32,8 +33,8 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.conditions import derive, holds
 from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import PageProgress, Pages, ahead, summary_table, topic_of
-from iort_station.data.stored.recorded import AUTO, Origin, Recorded, Source, only
+from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.data.stored.recorded import Recorded
 from iort_station.errors import unknown
 
 _SECOND_US = 1_000_000
@@ -47,6 +48,7 @@ def seconds(
     *,
     source: Source = AUTO,
     origin: Origin | None = None,
+    refused: RefusedItems | None = None,
     scan: bool = False,
     progress: PageProgress | None = None,
 ) -> Iterator[Block]:
@@ -56,7 +58,9 @@ def seconds(
     ``_min``, ``_mean``, ``_max`` and ``_last``. Raises `StationError` for a field that no second has.
     """
     there: dict[str, None] = {}
-    recorded = Recorded(cloud, selection.robot, selection.stream, source=source, origin=origin)
+    recorded = Recorded(
+        cloud, selection.robot, selection.stream, source=source, origin=origin, refused=refused
+    )
     for whole in _blocks(cloud, selection, recorded, scan=scan):
         block = whole
         if progress is not None:

@@ -15,7 +15,7 @@ from iort_analysis.archive.writing import described, write_day
 from iort_contract.archive import ArchivedHour, hour_key, parse_hour, refused_key
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import Archive
+from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 
 
@@ -31,10 +31,10 @@ def copy(source: Cloud, target: Cloud, topic: str) -> Hours:
 
     An hour that both have stays as it is: `iort_station.moving.recorded.merge` copies what the target lacks.
     """
-    there = {row.hour for row in Archive(target, topic).rows()}
+    there = {row.hour for row in archive_of(target, topic).rows()}
     copied = left = 0
     copies = _Objects(source, target)
-    for row in Archive(source, topic).rows():
+    for row in archive_of(source, topic).rows():
         if row.hour in there:
             continue
         new: ArchivedHour | None = row

@@ -10,12 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from iort_analysis.archive.hours import key_of
+from iort_analysis.archive.stored import HEADER
 from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import key_of
-from iort_station.data.stored.recorded import HEADER, Recorded
+from iort_station.data.stored.recorded import Recorded
+from iort_station.errors import StationError
 from iort_station.moving.recorded import BatchProgress
 from iort_station.operations.delivery.audit import Audit, audit
 
@@ -78,8 +80,11 @@ def compare(
 
 def _batches(cloud: Cloud, robot: str, stream: str, progress: BatchProgress) -> Iterator[_Batch]:
     attributes = tuple({*ENVELOPE, *HEADER, HASH})
-    for items in Recorded(cloud, robot, stream).items(starting_between(None, None), attributes):
+    recorded = Recorded(cloud, robot, stream)
+    for items in recorded.items(starting_between(None, None), attributes):
         progress(len(items))
         for item in items:
             header = {name: next(iter(item[name].values())) for name in HEADER if name in item}
             yield _Batch(key_of(item), item_hash(dict(item)), header)
+    if recorded.refused.count:
+        raise StationError(f"{stream} cannot be compared: {recorded.refused.reason}")

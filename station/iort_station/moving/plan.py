@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from iort_contract.tables import MOVED_FROM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.archive import Archive
 from iort_station.data.stored.batches import topic_of
+from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile
@@ -103,7 +103,7 @@ def _of(source: Cloud, target: Cloud, robot: str) -> Plan:
     there = {(one.key, one.size) for one in files.listed(target, robot)}
     here = list(files.listed(source, robot))
     lacking = [one for one in here if (one.key, one.size) not in there]
-    hours = sum(1 for stream in streams for _ in Archive(source, topic_of(source, robot, stream)).rows())
+    hours = sum(1 for stream in streams for _ in archive_of(source, topic_of(source, robot, stream)).rows())
     return Plan(
         robot=robot,
         registered=_registered(source, target, robot),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+from iort_analysis.archive.hours import HourFile, is_expiring, key_of
+from iort_analysis.archive.stored import ahead
 from iort_analysis.samples.batches import Item
-from iort_contract.dynamodb import WRITE_ITEMS, Keys
+from iort_contract.dynamodb import WRITE_ITEMS, Keys, whole
 from iort_contract.tables import BATCH, EXPIRES_S
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import Archive, HourFile, is_expiring, key_of
-from iort_station.data.stored.batches import ahead, telemetry_table
+from iort_station.data.stored.batches import telemetry_table
+from iort_station.data.stored.recorded import archive_of
 from iort_station.recordings.adopt import UNITS_PER_S, write
 
 # The target's archive finds a batch within a day, by a sweep.
@@ -51,7 +53,7 @@ def merge(
 ) -> int:
     """Copy what only the source's archive still has of hours that both have archived, into the target's
     table, from where its own archive takes it up; returns the number of batches."""
-    ours, theirs = Archive(source, topic), Archive(target, topic)
+    ours, theirs = archive_of(source, topic), archive_of(target, topic)
     there = {row.hour: row for row in theirs.rows()}
     table, batches = telemetry_table(target), 0
     for row in ours.rows():
@@ -78,5 +80,6 @@ def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]
     there = {key_of(item) for page in pages for item in page.items}
     now_s = time.time()
     for item in items:
-        if key_of(item) not in there and int(item.get(EXPIRES_S, {"N": now_s + 1})["N"]) > now_s:
+        expires_s = whole(item, EXPIRES_S)
+        if key_of(item) not in there and (expires_s is None or expires_s > now_s):
             yield item

@@ -31,8 +31,8 @@ from iort_contract.tables import BATCH, SAMPLES, TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.archive import Archive
 from iort_station.data.stored.batches import telemetry_table, topic_of
+from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 
@@ -98,7 +98,7 @@ def verify(cloud: Cloud, topic: str) -> Verified:
     found = Verified()
     table = telemetry_table(cloud)
     objects = _Objects(cloud)
-    archived = {row.hour: row for row in Archive(cloud, topic).rows()}
+    archived = {row.hour: row for row in archive_of(cloud, topic).rows()}
     until_us = time.time_ns() // 1000 - HOUR_REST_MS * 1000
     stored = [str(hour) for hour in stored_hours(table, topic, until_us)]
     for name in sorted({*archived, *stored}):

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+from iort_analysis.archive.stored import TABLE, PageProgress
 from iort_analysis.samples.batches import Item
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import with_samples_between
@@ -24,8 +25,7 @@ from iort_contract.tables import (
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
 from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import PageProgress
-from iort_station.data.stored.recorded import TABLE, Recorded
+from iort_station.data.stored.recorded import Recorded
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
 

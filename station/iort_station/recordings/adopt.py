@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
+from iort_analysis.archive.stored import ahead
 from iort_analysis.samples.batches import Item
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.dynamodb import WRITE_ITEMS, TableError, TelemetryTable, plain
@@ -20,7 +21,6 @@ from iort_contract.messages.batch import Batch, decode_item
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, Topic, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import ahead
 from iort_station.errors import StationError
 
 # A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half

@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 
+from iort_analysis.archive.stored import Origin, PageProgress
 from iort_analysis.samples.batches import RefusedItems
 from iort_contract.messages.message_type import ROS2, MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import PageProgress
-from iort_station.data.stored.recorded import Origin
 from iort_station.fleet import files
 from iort_station.recordings import messages
 from iort_station.recordings.published import Export
@@ -58,11 +57,11 @@ def write(
         if name not in known:
             say("  its definition is not stored, so topic, comments and constants are not the publisher's")
     if export.refused.count:
-        say(f"{export.refused.count} stored items cannot be exported; the first: {export.refused.reason}")
+        say(f"{export.refused.count:,} stored items cannot be exported; the first: {export.refused.reason}")
     if export.empty:
         say(f"{export.empty} messages have an empty array: their content was not kept, or is not uploaded")
     made = _make(cloud, selection, file, known, say) if export.others else 0
-    if not counts and not made:
+    if not counts and not made and not export.refused.count:
         inventory.check_there(cloud, robot, stream)
         say(f"{robot} {stream}: no samples in this range")
     return sum(counts.values()) + made

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from iort_analysis.samples.batches import RefusedItems
+from iort_analysis.archive.hours import key_of
+from iort_analysis.archive.stored import Origin, PageProgress
+from iort_analysis.samples.batches import Item
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
@@ -15,8 +17,7 @@ from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIEL
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import PageProgress
-from iort_station.data.stored.recorded import Origin, Recorded
+from iort_station.data.stored.recorded import Recorded
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
 Content = Callable[[str], "bytes | None"]
@@ -47,8 +48,8 @@ class Export:
     ) -> None:
         self.types = dict(types)
         self.others = self.empty = 0
-        self.refused = RefusedItems()
         self._recorded = Recorded(cloud, selection.robot, selection.stream, origin=origin)
+        self.refused = self._recorded.refused
         self._selection, self._content = selection, content
         self._layouts = {name: kind.layout for name, kind in types.items()}
 
@@ -57,20 +58,20 @@ class Export:
         keys = with_samples_between(self._selection.start_us, self._selection.end_us)
         for items in self._recorded.items(keys, progress=progress):
             for item in items:
-                yield from self._of(plain(item))
+                yield from self._of(item)
 
-    def _of(self, item: Mapping[str, Any]) -> Sequence[Published]:
+    def _of(self, item: Item) -> Sequence[Published]:
         try:
-            batch, messages = messages_of(item, self._layouts)
+            batch, messages = messages_of(plain(item), self._layouts)
         except ContractError as error:
-            self.refused.add(error)
+            self.refused.add(error, key_of(item))
             return ()
         inside = [i for i, t_us in enumerate(batch.times_us) if self._selection.holds_time(t_us)]
         if messages is None:
             self.others += len(inside)
             return ()
         if messages.type_id not in self.types and not messages.layout:
-            self.refused.add(ContractError(f"the type {messages.type_id} is not declared"))
+            self.refused.add(ContractError(f"the type {messages.type_id} is not declared"), batch.id)
             return ()
         if messages.type_id not in self.types:
             kind, _, definition = messages.layout.partition("\n")
@@ -80,7 +81,7 @@ class Export:
         try:
             return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
         except ContractError as error:
-            self.refused.add(error)
+            self.refused.add(error, batch.id)
             return ()
 
     def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:

@@ -39,8 +39,8 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data.analysis import notes
-from iort_station.data.stored.archive import Archive
 from iort_station.data.stored.batches import telemetry_table, topic_of
+from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry, robots, tags
 from iort_station.fleet.control import shadow
@@ -219,7 +219,7 @@ def test_an_hour_that_both_have_archived_is_merged(
     # By its hash the batch is the archived one, though it may be compressed in another way.
     archive.run(other.cloud, topic)
     archive.wait(other.cloud, lambda _left: None)
-    assert [row.batches for row in Archive(other.cloud, topic).rows()] == [3]
+    assert [row.batches for row in archive_of(other.cloud, topic).rows()] == [3]
 
 
 def test_a_robot_moves_with_everything_that_is_known_of_it(

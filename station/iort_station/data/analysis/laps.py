@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
+from iort_analysis.archive.stored import PageProgress
 from iort_analysis.drives.building import build
 from iort_analysis.drives.motion import motion_of
 from iort_analysis.mining import laps
@@ -19,7 +21,6 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import query
 from iort_station.data.runs import runs
-from iort_station.data.stored.batches import PageProgress
 from iort_station.fleet import registry
 
 
@@ -61,14 +62,18 @@ def laps_within(
 ) -> Mined:
     """The laps from ``start_us`` to before ``end_us``; raises `StationError` over ``most`` values."""
     streams: dict[str, Block] = {}
+    notes: dict[str, str] = {}
     for name in inventory.check_recorded(cloud, robot):
         if name in OWN_STREAMS or not _tells_laps(name, inventory.newest_block(cloud, robot, name)):
             continue
         read = query(cloud, robot, name, start_us, end_us, progress=progress, most=most)
         streams[name] = Block(read.times_us, dict(read.columns))
+        if read.refused:
+            notes[f"{name} items"] = f"{read.refused:,} cannot be read; the first: {read.reason}"
     vehicle = registered_vehicle(registry.find(cloud, robot) or {})
     drive = build(DriveKey(robot, start_us, ""), streams, vehicle)
-    return laps.mine(with_gain(drive))
+    mined = laps.mine(with_gain(drive))
+    return replace(mined, missing={**notes, **mined.missing})
 
 
 def _tells_laps(stream: str, block: Block) -> bool:

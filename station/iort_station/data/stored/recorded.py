@@ -1,292 +1,45 @@
-"""A stream's recorded batches: in the telemetry table, in the archive, or in both.
-
-The table has every batch until it expires. The archive has every finished hour; an hour is rewritten if
-batches arrive late. So until the first batch of an hour is about to expire the table is enough. Later the
-archive's hour and what the table has beside it are everything. Callers do not see the difference: the batches
-come in the order of their ids.
-"""
+"""A deployment's recordings, for the one reader of table and archive."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import chain
-from typing import TYPE_CHECKING, Final, Generic, Literal, TypeAlias, TypeVar
 
-from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
-from iort_analysis.samples.blocks import Block, join
-from iort_analysis.samples.seconds import Batches, batches_of
-from iort_contract.archive import ArchivedHour, Hour, hour_of, parse_hour
-from iort_contract.dynamodb import Keys, starting_between
-from iort_contract.limits import ContractError
-from iort_contract.messages.batch import BatchId, batch_id
-from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
+from iort_analysis.archive.hours import Archive, Stores
+from iort_analysis.archive.stored import AUTO, Origin, Source, Stored
+from iort_analysis.samples.batches import RefusedItems
+from iort_contract.archive import ArchiveTable
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import Archive, HourFile, is_expiring, key_of, within
-from iort_station.data.stored.batches import PageProgress, Pages, ahead, telemetry_table, topic_of
-
-if TYPE_CHECKING:
-    from iort_contract.messages.page import Archived
-
-# Where batches are read: where each is, in the table alone, or in the archive alone.
-Source: TypeAlias = Literal["auto", "table", "archive"]
-AUTO: Final = "auto"
-TABLE: Final = "table"
-ARCHIVE: Final = "archive"
-HEADER = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
-# Hours that are read while the caller uses one, and their samples: 30 fields of half a million take 120 MB.
-_HOURS_AHEAD, _SAMPLES_AHEAD = 8, 500_000
-_T = TypeVar("_T")
+from iort_station.data.stored.batches import telemetry_table, topic_of
+from iort_station.errors import StationError
 
 
-@dataclass
-class Origin:
-    """Where a reading found its batches: the hours that it took from the archive."""
-
-    hours: list[Hour] = field(default_factory=list)
-
-    def told(self) -> Archived | None:
-        """What came from the archive; None if nothing did."""
-        if not self.hours:
-            return None
-        first, last = min(self.hours), max(self.hours)
-        return {"from_us": first.start_us, "to_us": last.end_us, "hours": len(set(self.hours))}
-
-    def within(self, start_us: int | None, end_us: int | None) -> Origin:
-        """Only the hours that are partly in a range; the hour before it may have been looked into."""
-        return Origin(
-            [
-                hour
-                for hour in self.hours
-                if (start_us is None or hour.end_us > start_us) and (end_us is None or hour.start_us < end_us)
-            ]
-        )
-
-
-class Recorded:
-    """The batches of a robot's stream. ``origin`` grows while they are read."""
+class Recorded(Stored):
+    """The batches of a robot's stream. ``origin`` and ``refused`` grow while they are read."""
 
     def __init__(
-        self, cloud: Cloud, robot: str, stream: str, *, source: Source = AUTO, origin: Origin | None = None
+        self,
+        cloud: Cloud,
+        robot: str,
+        stream: str,
+        *,
+        source: Source = AUTO,
+        origin: Origin | None = None,
+        refused: RefusedItems | None = None,
     ) -> None:
-        self._topic = topic_of(cloud, robot, stream)
-        self._table, self._archive = telemetry_table(cloud), Archive(cloud, self._topic)
-        self._source = source
-        self._known: dict[str, list[BatchId]] = {}
-        self.origin = origin or Origin()
-
-    def parts(
-        self,
-        keys: Keys,
-        refused: RefusedItems,
-        wanted: Wanted = lambda _name: True,
-        *,
-        messages: bool = True,
-        scan: bool = False,
-        progress: PageProgress | None = None,
-    ) -> Iterator[Part]:
-        """The samples of the batches with these keys, with the fields that are ``wanted``, in the order of
-        the batches. Without ``messages``, batches of ROS messages are skipped."""
-
-        def of_hour(hour: HourFile) -> list[Part]:
-            return hour.parts(wanted, messages=messages, keys=keys)
-
-        for found in self._found(keys, of_hour, ATTRIBUTES, scan=scan, progress=progress):
-            if isinstance(found, _Archived):
-                yield from found.content
-            elif found:
-                yield part(found, refused, wanted, messages=messages)
-
-    def items(
-        self, keys: Keys, attributes: Sequence[str] = ATTRIBUTES, *, progress: PageProgress | None = None
-    ) -> Iterator[Sequence[Item]]:
-        """Pages of the stored items with these keys. Those from the archive decode to the same batches and
-        messages as the stored ones."""
-        for found in self._found(keys, HourFile.items, attributes, progress=progress):
-            yield within(found.content, keys) if isinstance(found, _Archived) else found
-
-    def headers(self, keys: Keys) -> Iterator[Item]:
-        """The stored items with these keys, without their samples."""
-        for found in self._found(keys, HourFile.headers, HEADER):
-            yield from within(found.content, keys) if isinstance(found, _Archived) else found
-
-    def batches(self, keys: Keys, wanted: Wanted = lambda _name: True) -> Iterator[Batches]:
-        """The batches with these keys; what is not one is left out."""
-
-        def of_hour(hour: HourFile) -> list[Batches]:
-            return hour.batches(wanted, keys)
-
-        for found in self._found(keys, of_hour, (*ATTRIBUTES, PREVIOUS)):
-            if isinstance(found, _Archived):
-                yield from found.content
-            else:
-                yield batches_of(found, wanted)
-
-    def after(self, t_us: int | None) -> BatchId | None:
-        """The first batch from a time on; None is the oldest of all."""
-        found = self._next(starting_between(t_us, None), newest=False)
-        ids = (one for row in self._rows(t_us, found and found.t_us) for one in self._ids(row))
-        archived = next((one for one in ids if t_us is None or one.t_us >= t_us), None)
-        if archived is None or (found is not None and found <= archived):
-            return found
-        return self._from_archive(archived)
-
-    def before(self, t_us: int | None) -> BatchId | None:
-        """The last batch before a time; None is the newest of all."""
-        last_us = None if t_us is None else t_us - 1
-        found = self._next(starting_between(None, last_us), newest=True)
-        rows = self._rows(found and found.t_us, last_us, newest_first=True)
-        ids = (one for row in rows for one in reversed(self._ids(row)))
-        archived = next((one for one in ids if last_us is None or one.t_us <= last_us), None)
-        if archived is None or (found is not None and found >= archived):
-            return found
-        return self._from_archive(archived)
-
-    def block(self, batch: BatchId, wanted: Wanted = lambda _name: True) -> Block:
-        """The samples of one batch; empty if it is not there, or is invalid."""
-        return join([found.block for found in self.parts(only(batch), RefusedItems(), wanted)])
-
-    def archived(self, keys: Keys) -> list[Hour]:
-        """The hours that are read from the archive for these keys."""
-        return [parse_hour(row.hour) for row in self._rows(*_times(keys))]
-
-    @property
-    def reads_table(self) -> bool:
-        """Whether the table is read, too."""
-        return self._source != ARCHIVE
-
-    def _found(
-        self,
-        keys: Keys,
-        read: Callable[[HourFile], _T],
-        attributes: Sequence[str],
-        *,
-        scan: bool = False,
-        progress: PageProgress | None = None,
-    ) -> Iterator[_Archived[_T] | Sequence[Item]]:
-        """Pages of items, and what ``read`` makes of hours in the archive, in the order of the batches."""
-        if keys.empty:
-            return
-        pool = ThreadPoolExecutor(_HOURS_AHEAD)
-        try:
-            listed = pool.submit(lambda: list(self._rows(*_times(keys))))
-            # Meanwhile the first page is read, which is nearly always needed.
-            table = Pages(self._pages(keys, attributes, scan=scan), key_of)
-            for row, content in self._ahead(pool, listed.result(), read):
-                hour = parse_hour(row.hour)
-                for items in table.until(_first_key(hour.start_us)):
-                    yield _told(items, progress)
-                beside = [item for items in table.until(_first_key(hour.end_us)) for item in items]
-                found = self._with(beside, row, content, keys)
-                if isinstance(found, _Archived) and not found.content:
-                    continue
-                self.origin.hours.append(hour)
-                if progress is not None:
-                    progress(row.batches, hour.end_us)
-                yield found
-            for items in table.until(None):
-                yield _told(items, progress)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-    def _rows(
-        self, first_us: int | None, last_us: int | None, *, newest_first: bool = False
-    ) -> Iterator[ArchivedHour]:
-        """The hours to read from the archive, of batches that start between two times."""
-        if self._source == TABLE:
-            return
-        for row in self._archive.rows(first_us, last_us, newest_first=newest_first):
-            if self._source == ARCHIVE or is_expiring(row):
-                yield row
-
-    def _pages(self, keys: Keys, attributes: Sequence[str], *, scan: bool) -> Iterator[Sequence[Item]]:
-        if not self.reads_table:
-            return
-        pages = self._table.pages(self._topic, keys, attributes=attributes, scan=scan)
-        found: Iterator[Sequence[Item]] = (page.items for page in pages if page.items)
-        if scan:
-            # A scan has no order.
-            found = iter([sorted(chain.from_iterable(found), key=key_of)])
-        yield from ahead(found)
-
-    def _ahead(
-        self, pool: ThreadPoolExecutor, rows: Sequence[ArchivedHour], read: Callable[[HourFile], _T]
-    ) -> Iterator[tuple[ArchivedHour, _T | None]]:
-        """The hours with what ``read`` makes of them; while the caller uses one, the next ones are read."""
-        coming: deque[tuple[ArchivedHour, Future[_T] | None]] = deque()
-        left = deque(rows)
-        while coming or left:
-            while left and len(coming) < _HOURS_AHEAD:
-                if coming and sum(row.samples for row, _ in coming) + left[0].samples > _SAMPLES_AHEAD:
-                    break
-                row = left.popleft()
-                # An hour with anything else than batches is read in `_with`.
-                content = None if row.refused else pool.submit(self._archive.read, row, read)
-                coming.append((row, content))
-            row, content = coming.popleft()
-            yield row, None if content is None else content.result()
-
-    def _with(
-        self, beside: Sequence[Item], row: ArchivedHour, content: _T | None, keys: Keys
-    ) -> _Archived[_T] | Sequence[Item]:
-        """What an hour holds in the archive and ``beside`` it in the table."""
-        if beside:
-            archived = set(self._archive.read(row, HourFile.ids))
-            beside = [item for item in beside if key_of(item) not in archived]
-        if not beside and content is not None:
-            return _Archived(content)
-        # Rare and slow: batches that came late, or items that are not batches.
-        return within(sorted([*self._archive.read(row, HourFile.items), *beside], key=key_of), keys)
-
-    def _from_archive(self, batch: BatchId) -> BatchId:
-        self.origin.hours.append(hour_of(batch.t_us))
-        return batch
-
-    def _ids(self, row: ArchivedHour) -> list[BatchId]:
-        if row.hour not in self._known:
-            self._known[row.hour] = list(_batch_ids(self._archive.read(row, HourFile.ids)))
-        return self._known[row.hour]
-
-    def _next(self, keys: Keys, *, newest: bool) -> BatchId | None:
-        """The table's first or last batch with one of these keys."""
-        if not self.reads_table:
-            return None
-        pages = self._table.pages(self._topic, keys, attributes=(BATCH,), page_items=1, newest_first=newest)
-        # What is not a batch has no time.
-        return next((one for page in pages for one in _batch_ids(map(key_of, page.items))), None)
+        topic = topic_of(cloud, robot, stream)
+        super().__init__(stores(cloud), topic, source=source, origin=origin, refused=refused)
 
 
-@dataclass(frozen=True)
-class _Archived(Generic[_T]):
-    """What was made of an hour in the archive."""
-
-    content: _T
+def archive_of(cloud: Cloud, topic: str) -> Archive:
+    """The archive of a topic."""
+    return Archive(stores(cloud), topic)
 
 
-def only(batch: BatchId) -> Keys:
-    """The key of one batch."""
-    return Keys({"S": str(batch)}, {"S": str(batch)}, empty=False)
-
-
-def _told(items: Sequence[Item], progress: PageProgress | None) -> Sequence[Item]:
-    if progress is not None:
-        progress(len(items), start_us(items[-1]))
-    return items
-
-
-def _first_key(t_us: int) -> str:
-    return starting_between(t_us, None).first["S"]
-
-
-def _times(keys: Keys) -> tuple[int, int]:
-    """The times with which the first and the last key begin."""
-    return int(keys.first["S"][:16]), int(keys.last["S"][:16])
-
-
-def _batch_ids(keys: Iterable[str]) -> Iterator[BatchId]:
-    for key in keys:
-        with suppress(ContractError):
-            yield batch_id(key)
+def stores(cloud: Cloud) -> Stores:
+    """Where a deployment's recordings are. One from before the archive has no table of it."""
+    manifest = None
+    with suppress(StationError):
+        manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
+    return Stores(
+        telemetry_table(cloud), manifest, lambda: (cloud.client("s3"), cloud.output("storage", "FilesBucket"))
+    )

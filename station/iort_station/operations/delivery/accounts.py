@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from iort_contract.checks import integer
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
@@ -52,7 +53,8 @@ def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
     batches: list[tuple[Batch, int]] = []
     for item in stored:
         with suppress(ContractError):  # the stream's own audit counts these
-            batches.append((decode_batch(item), int(item.get(RECEIVED_MS, 0)) * 1000))
+            received_ms = integer(item, RECEIVED_MS) if RECEIVED_MS in item else 0
+            batches.append((decode_batch(item), received_ms * 1000))
     found: dict[str, Account] = {}
     for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
         run = found.setdefault(batch.boot, Account())

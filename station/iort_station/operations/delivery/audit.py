@@ -9,17 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
+from iort_analysis.archive.stored import HEADER, Origin, only
+from iort_analysis.samples.batches import ATTRIBUTES, RefusedItems, part
+from iort_contract.archive import HASH
 from iort_contract.catalog.streams import AGENT_STREAM
+from iort_contract.checks import shown
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.stored.recorded import Origin, Recorded, only
+from iort_station.data.stored.recorded import Recorded
 
+# So many batches are decoded together.
+_TOGETHER = 200
 # A batch is late if it took this much longer to arrive than the run's fastest one. It spans a second, and
 # arrives within milliseconds if nothing delays it.
 LATE_MS = 5_000
@@ -95,9 +101,10 @@ class Audit:
     """The audit of one stream; its runs are in the order in which they arrived.
 
     ``before_first`` counts numbers before the first stored one: expired, outside the range, or lost.
-    ``refused`` counts items that are not batches. ``in_car`` and ``dropped`` are the agent's last metrics of
-    its queue; None if it sent none. After a run that ended in good order, nothing is in the car. ``taken``
-    counts the samples that the runs report in their accounts; None without an account. ``shortfalls`` are the
+    ``refused`` counts what is stored and cannot be read, and ``named`` has the first of these. ``in_car``
+    and ``dropped`` are the agent's last metrics of its queue; None if it sent none. After a run that ended
+    in good order, nothing is in the car. ``taken`` counts the samples that the runs report in their
+    accounts; None without an account. ``shortfalls`` are the
     differences between the accounts and the table.
     """
 
@@ -105,6 +112,7 @@ class Audit:
     runs: list[RunAudit]
     before_first: int = 0
     refused: int = 0
+    named: tuple[str, ...] = ()
     in_car: int | None = None
     dropped: int | None = None
     taken: int | None = None
@@ -197,6 +205,12 @@ def _header(item: Mapping[str, Any]) -> Header | None:
     return header if header.samples >= 1 else None
 
 
+def _check_header(item: Mapping[str, Any]) -> None:
+    """Raise `ContractError` for what the audit does not take for a batch."""
+    if _header(item) is None:
+        raise ContractError(f"{RECEIVED_MS} must be a time, got {shown(item.get(RECEIVED_MS))}")
+
+
 def _run(found: Sequence[Header], last: int, late_ms: int) -> RunAudit:
     by_seq = {header.id.seq: header for header in found}
     seqs = sorted(by_seq)
@@ -238,12 +252,35 @@ def headers(
     last_us: int | None = None,
     *,
     origin: Origin | None = None,
+    refused: RefusedItems | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """The stored batches that start between two times, both inclusive, without their samples. ``origin``
-    grows by what comes from the archive."""
-    for item in Recorded(cloud, robot, stream, origin=origin).headers(starting_between(first_us, last_us)):
-        # Strings and numbers only, so no deserializer is needed.
-        yield {name: next(iter(value.values())) for name, value in item.items()}
+    """The stored batches that start between two times, both inclusive, without their samples.
+
+    Each batch of the table is decoded. Of one that cannot be read the header is empty, and ``refused`` names
+    it. The archive's writer has decoded what is there, and `iort archive verify` checks it by digests.
+    ``origin`` grows by what comes from the archive.
+    """
+    recorded = Recorded(cloud, robot, stream, origin=origin, refused=refused)
+    items = recorded.headers(starting_between(first_us, last_us), (*HEADER, *ATTRIBUTES))
+    while page := list(islice(items, _TOGETHER)):
+        written = [item for item in page if HASH not in item]
+        damaged = RefusedItems()
+        part(written, damaged)
+        for item in page:
+            # Strings and numbers only, so no deserializer is needed.
+            header = {
+                name: next(iter(item[name].values()), None)
+                for name in HEADER
+                if isinstance(item.get(name), dict)
+            }
+            try:
+                if damaged.count and HASH not in item:
+                    decode_batch(plain(item))
+                _check_header(header)
+            except ContractError as error:
+                recorded.refused.add(error, header.get(BATCH, ""))
+                header = {}
+            yield header
 
 
 def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+from iort_analysis.archive.hours import key_of
 from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import key_of
 from iort_station.data.stored.recorded import Recorded
 
 

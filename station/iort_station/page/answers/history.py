@@ -85,6 +85,8 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
         "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
         "archive": found.origin.told(),
+        "refused": found.refused,
+        "reason": found.reason,
     }
 
 

@@ -714,7 +714,7 @@ export interface Archived {
   readonly hours: number;
 }
 
-/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. ``archive`` is null if all comes from the table. */
+/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. ``archive`` is null if all comes from the table. ``refused`` counts what is stored in the range and cannot be read; ``reason`` names the first by topic, time and error. */
 export interface HistoryAnswer {
   readonly times_s: readonly number[];
   readonly fields: Readonly<Record<string, Column>>;
@@ -722,6 +722,8 @@ export interface HistoryAnswer {
   readonly ros2: boolean;
   readonly row_s: number;
   readonly archive: Archived | null;
+  readonly refused: number;
+  readonly reason: string;
 }
 
 /** A line of a chart; ``right`` for the right axis. */

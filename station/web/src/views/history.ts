@@ -6,7 +6,7 @@ import { age, number, when } from "../base/format";
 import { LEAST_S, readRange, readTime, rounded, same, writeTime, type Range } from "../base/range";
 import { route, setAddress, type Query } from "../base/route";
 import { RangeForm } from "../history/range_form";
-import { fromArchive } from "../history/origin";
+import { fromArchive, unread } from "../history/origin";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import type { Fleet } from "../live/fleet";
@@ -237,7 +237,7 @@ export class HistoryView {
       if (drive.samples === 0) this.result.clear();
       else this.result.set(this.robot, this.form.stream, drive, range);
       const each = drive.row_s > 0 ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max` : "";
-      this.note.set(drive.samples === 0 ? this.nothing() : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.${fromArchive(drive.archive, range)}`);
+      this.note.set(drive.samples === 0 ? this.nothing() : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.${fromArchive(drive.archive, range)}${unread(drive)}`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
     }

@@ -95,8 +95,8 @@ def test_an_item_with_an_invalid_key_is_refused_and_its_neighbours_are_read(key)
     refused, told = RefusedItems(), []
     cloud = cloud_of()
     cloud.table.query = lambda **how: {"Items": items if how["TableName"] == TELEMETRY else []}
-    recorded, keys = Recorded(cloud, "car", "vesc"), starting_between(None, None)
-    (part,) = recorded.parts(keys, refused, progress=lambda *seen: told.append(seen))
+    recorded, keys = Recorded(cloud, "car", "vesc", refused=refused), starting_between(None, None)
+    (part,) = recorded.parts(keys, progress=lambda *seen: told.append(seen))
     block = part.block
     # The start of an item without a valid key is unknown, so no time is reported as read.
     assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])

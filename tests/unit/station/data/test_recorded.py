@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from functions.shared.summary.processing import recompute
+from iort_analysis.archive import hours as archive_hours
+from iort_analysis.archive.stored import Origin
+from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import values
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.messages.account import StreamAccount
@@ -25,8 +28,6 @@ from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.data.overview import overview
 from iort_station.data.runs import runs
-from iort_station.data.stored import archive as station_archive
-from iort_station.data.stored.recorded import Origin
 from iort_station.errors import StationError
 from iort_station.operations.delivery import accounts, audit
 from iort_station.page.answers.downloads import downloads
@@ -302,11 +303,11 @@ def test_of_a_large_file_only_what_is_needed_is_read(monkeypatch):
     compact(cloud.table, cloud.bucket)
     expire(cloud.table)
     (size,) = map(len, cloud.bucket.objects.values())
-    monkeypatch.setattr(station_archive, "_END_BYTES", 70_000)
+    monkeypatch.setattr(archive_hours, "_END_BYTES", 70_000)
     requests, read = [], []
     # The whole file at once; its end and the hour; its end and some columns.
     for most in (size, size - 100_000, 0):
-        monkeypatch.setattr(station_archive, "_AT_ONCE_BYTES", most)
+        monkeypatch.setattr(archive_hours, "_AT_ONCE_BYTES", most)
         del cloud.bucket.reads[:]
         assert asked(data.query(cloud, "car", "vesc", START + HOUR, fields=["f7"])) == asked(expected)
         requests.append(len(cloud.bucket.reads))
@@ -334,5 +335,51 @@ def test_a_file_that_moves_while_it_is_read_is_found_again(before):
         cloud.table.put(ARCHIVE, row)
     assert asked(data.query(cloud, "car", "vesc")) == asked(data.query(before, "car", "vesc"))
     cloud.bucket.objects.clear()
-    with pytest.raises(StationError, match="the archive lacks archive/robot=car/"):
-        data.query(cloud, "car", "vesc")
+    lost = data.query(cloud, "car", "vesc")
+    assert (len(lost), lost.refused) == (0, 3)
+    assert "dt/iort/car/vesc at" in lost.reason
+    assert "archive/robot=car/" in lost.reason
+    assert "is missing: run `iort archive verify`" in lost.reason
+
+
+def rows_of(cloud, stream="vesc"):
+    """The manifest's rows of a stream, by hour."""
+    rows = cloud.table.items[ARCHIVE].values()
+    return sorted((row for row in rows if row["topic"]["S"] == CAR[stream]), key=lambda row: row["hour"]["S"])
+
+
+def without_hour(found, hour):
+    """The samples of batches that start in other hours; none of the drive's goes on in the next."""
+    return [t for t in found.times_us.tolist() if t // HOUR != hour]
+
+
+@pytest.mark.parametrize("summary", [False, True])
+def test_around_a_damaged_file_the_rest_is_read_and_the_hour_is_named(before, summary):
+    cloud = later("expired")
+    damaged = rows_of(cloud)[0]["key"]["S"]
+    cloud.bucket.objects[damaged] = cloud.bucket.objects[damaged][:-300] + bytes(300)
+    cut, whole = (data.query(one, "car", "vesc", summary=summary) for one in (cloud, before))
+    assert set(without_hour(whole, START // HOUR)) <= set(cut.times_us.tolist())
+    assert 0 < len(cut) < len(whole)
+    assert cut.refused
+    assert f"{damaged} of {CAR['vesc']} is damaged" in cut.reason
+    refused = RefusedItems()
+    list(audit.headers(cloud, "car", "vesc", refused=refused))
+    assert damaged in refused.reason
+
+
+def test_a_damaged_row_of_the_manifest_is_passed_over_and_named(before):
+    cloud = later("expired")
+    rows_of(cloud)[0]["batches"] = {"S": "many"}
+    found = data.query(cloud, "car", "vesc")
+    assert 0 < len(found) < len(data.query(before, "car", "vesc"))
+    assert "batches must be an integer, got 'many'" in found.reason
+
+
+@pytest.mark.parametrize("summary", [False, True])
+@pytest.mark.parametrize("state", ["archived", "expired"])
+def test_a_range_that_ends_before_1970_is_empty(state, summary):
+    cloud = later(state)
+    assert len(data.query(cloud, "car", "vesc", -9 * S, -5 * S, summary=summary)) == 0
+    assert list(audit.headers(cloud, "car", "vesc", -9 * S, -5 * S)) == []
+    assert runs(cloud, "car", start_us=-9 * S, end_us=-5 * S)["runs"] == []

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
+from iort_analysis.archive.hours import HourFile
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import described, write_day
 from iort_analysis.samples.blocks import join, values
@@ -23,7 +24,6 @@ from iort_contract.messages.analysis.findings import Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.stored.archive import HourFile
 from iort_station.errors import StationError
 from iort_station.moving import archived, plan, recorded, written
 from tests.unit.analysis.archive.test_archive import batch_at, item_of
@@ -103,7 +103,7 @@ def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, account: Account, _topic: str) -> None:
             self.rows = account.rows.copy
 
-    monkeypatch.setattr(archived, "Archive", Rows)
+    monkeypatch.setattr(archived, "archive_of", Rows)
     monkeypatch.setattr(written.findings, "table", lambda account: account.findings)
 
 
@@ -164,7 +164,7 @@ def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: 
         def put(self, new: list[Any]) -> None:
             table.extend(new)
 
-    monkeypatch.setattr(recorded, "Archive", Hours)
+    monkeypatch.setattr(recorded, "archive_of", Hours)
     monkeypatch.setattr(recorded, "telemetry_table", lambda _side: Table())
     sides: Any = "source", "target"
     assert [recorded.merge(*sides, TOPIC) for _ in range(2)] == [1, 0]

@@ -45,9 +45,9 @@ def export(
     fields. For CSV and Parquet, use iort query.
     """
     # numpy takes longer to load than most commands to run.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
     from iort_station.data.selection import select  # noqa: PLC0415 - as above
-    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.recordings import recordings  # noqa: PLC0415 - as above
     from iort_station.recordings.export import write  # noqa: PLC0415 - as above
 

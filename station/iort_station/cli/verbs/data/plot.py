@@ -25,7 +25,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import examples, say, say_archived
+from iort_station.cli.words import examples, say, say_archived, say_refused
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.output import check_free
@@ -72,8 +72,8 @@ def plot(
     drawn as metres to the east and north of the first known place.
     """
     # Together they take longer to load than most commands to run.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_station.cli import plots  # noqa: PLC0415 - see above
-    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
 
     plots.check_ending(out)
     check_free(out, force=force)
@@ -86,6 +86,7 @@ def plot(
     for name in dict.fromkeys([robot, *(also or ())]):
         for within in ranges:
             result = _read(cloud, name, stream, within, fields=wanted, where=where, every=every)
+            say_refused(result.refused, result.reason)
             if not len(result):
                 say(f"{name} {stream}: no samples in this range")
                 continue

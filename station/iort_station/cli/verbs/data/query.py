@@ -25,7 +25,7 @@ from iort_station.cli.options import (
     to_file,
 )
 from iort_station.cli.progress import reading
-from iort_station.cli.words import examples, say, say_archived
+from iort_station.cli.words import examples, say, say_archived, say_refused
 from iort_station.errors import UsageError
 from iort_station.output import check_free, whole
 
@@ -127,8 +127,7 @@ def query(
     else:
         with whole(out, force=force) as part, part.open("w", encoding="utf-8", newline="") as file:
             _write(result, form, file, raw=raw)
-    if result.refused:
-        say(f"{result.refused} stored items are not batches and are left out; the first: {result.reason}")
+    say_refused(result.refused, result.reason)
     if result.absent:
         counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
         say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")

@@ -16,7 +16,7 @@ from iort_station.cloud import Cloud
 from iort_station.times import between, between_hours, iso, iso_s
 
 if TYPE_CHECKING:
-    from iort_station.data.stored.recorded import Origin
+    from iort_analysis.archive.stored import Origin
     from iort_station.operations.delivery.audit import Missing
 
 commands = typer.Typer()
@@ -43,8 +43,8 @@ def runs(
     record.
     """
     # numpy takes longer to load than TAB may take.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - see above
     from iort_station.data.runs import runs as find  # noqa: PLC0415 - as above
-    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - see above
 
     within, cloud, origin = when.range(), context.obj.cloud(), Origin()
     gaps: Gaps = {}

@@ -26,8 +26,8 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
     The command reads some batches of each run, never all samples. The fields are those of the newest batch.
     """
     # numpy takes longer to load than TAB may take.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_station.data.overview import overview  # noqa: PLC0415 - see above
-    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
 
     cloud, origin = context.obj.cloud(), Origin()
     with errors.status("reading"):

@@ -12,7 +12,7 @@ from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson
 from iort_station.cli.progress import bar
 from iort_station.cli.words import examples, say
-from iort_station.data.stored.archive import Archive
+from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
 from iort_station.texts import one_line
@@ -38,7 +38,7 @@ def show(
     cloud = context.obj.cloud()
     streams: list[dict[str, Any]] = []
     for topic in archive.topics(cloud, robot, stream):
-        rows = list(Archive(cloud, topic).rows())
+        rows = list(archive_of(cloud, topic).rows())
         if not rows:
             continue
         name = parse_topic(topic)

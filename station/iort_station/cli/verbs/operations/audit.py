@@ -62,9 +62,9 @@ def audit_(
 ) -> None:
     """Prove that every sample of a robot arrived, for each of its streams and each run of its agent.
 
-    The command checks the sequence numbers of the batches. It compares the stored samples with those that the
-    agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
-    and the agent left nothing out; 1 otherwise, or if nothing is stored.
+    The command decodes every batch and checks their sequence numbers. It compares the stored samples with
+    those that the agent counted, and lists by cause what the agent did not record. Exit status 0 if every
+    stream is complete and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
     if (robot is None) != every:
         raise UsageError("give a robot, or --all")
@@ -134,8 +134,9 @@ def _audit(
     from_start: bool,
 ) -> _Audited:
     # numpy takes longer to load than TAB may take.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
+    from iort_analysis.samples.batches import RefusedItems  # noqa: PLC0415 - as above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.data.stored.recorded import Origin  # noqa: PLC0415 - as above
     from iort_station.operations.delivery import accounts, audit  # noqa: PLC0415 - as above
 
     try:
@@ -148,11 +149,14 @@ def _audit(
     told = accounts.accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
-            origin = Origin()
-            headers = audit.headers(cloud, robot, name, within.start_us, within.end_us, origin=origin)
+            origin, refused = Origin(), RefusedItems()
+            headers = audit.headers(
+                cloud, robot, name, within.start_us, within.end_us, origin=origin, refused=refused
+            )
             counted = _counting(headers, name, status)
             one = audit.audit(name, counted, late_ms=late_us // 1000, from_start=from_start)
             one = accounts.without_lateness(one, told)
+            one = replace(one, refused=refused.count, named=tuple(refused.named))
             # The agent counts a whole run, so a part of one cannot be compared.
             if within == Range(None, None):
                 one = accounts.held_against(one, told, now_us)
@@ -220,7 +224,9 @@ def _show(one: Audit) -> None:
         count = "an unknown number of samples" if samples is None else f"{samples:,} samples"
         out.print(f"  run {boot[:8]}: {count} {cause}", style="red")
     if one.refused:
-        out.print(f"  {one.refused:,} items are not batches", style="red")
+        out.print(f"  {one.refused:,} stored items cannot be read", style="red")
+        for named in one.named:
+            out.print(f"    {named}", style="red", soft_wrap=True)
     if one.in_car:
         out.print(f"  the car's queue held {one.in_car:,} batches at its last report")
     if one.dropped:

@@ -1,4 +1,4 @@
-"""The archive as the station reads it: the manifest's rows, and the files in the bucket."""
+"""The archive's manifest and its hours as they are in the bucket, for whoever reads them."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import io
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
+from heapq import merge
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar, cast
 
 import numpy as np
-from botocore.exceptions import ClientError
 
-from iort_analysis.samples.batches import Item, Part, Wanted
+from iort_analysis.errors import ArchiveError
+from iort_analysis.samples.batches import Item, Part, RefusedItems, Wanted
 from iort_analysis.samples.blocks import join
 from iort_analysis.samples.seconds import Batches, batches_of
 from iort_contract.archive import (
+    HOUR,
     ArchivedHour,
     ArchiveTable,
     archived_hour,
@@ -25,12 +27,12 @@ from iort_contract.archive import (
     parse_hour,
     refused_key,
 )
-from iort_contract.dynamodb import Keys, plain
+from iort_contract.checks import shown
+from iort_contract.dynamodb import Keys, TelemetryTable, plain
+from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id, run_ends
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, SAMPLES
 from iort_contract.topics import parse_topic
-from iort_station.cloud import Cloud
-from iort_station.errors import StationError
 
 if TYPE_CHECKING:
     from iort_analysis.archive.reading import ArchiveFile
@@ -44,53 +46,94 @@ _AT_ONCE_BYTES = 8_000_000
 # The end of a day's file, which tells where the hours are.
 _END_BYTES = 256 * 1024
 _GONE = frozenset({"404", "NoSuchKey", "412", "PreconditionFailed"})
+# What reading a damaged file raises: pyarrow's errors are of these. Those of the network are none of them.
+_DAMAGED = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 _T = TypeVar("_T")
+_Item = TypeVar("_Item", bound=Item)
+
+
+class Stores(NamedTuple):
+    """Where recordings are. Without ``manifest`` there is no archive; ``files`` makes boto3's client of S3
+    and the name of the bucket, when the first object is read."""
+
+    telemetry: TelemetryTable
+    manifest: ArchiveTable | None
+    files: Callable[[], tuple[Any, str]]
 
 
 class Archive:
-    """A deployment's archive of one topic."""
+    """The archive of one topic. ``refused`` gets the manifest's rows that are damaged."""
 
-    def __init__(self, cloud: Cloud, topic: str) -> None:
-        self._cloud, self._topic = cloud, topic
-        # A deployment from before the archive has no table of it.
-        self._table: ArchiveTable | None = None
-        with suppress(StationError):
-            self._table = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
+    def __init__(self, stores: Stores, topic: str, refused: RefusedItems | None = None) -> None:
+        self._stores, self._topic = stores, topic
+        self._refused = RefusedItems() if refused is None else refused
 
     def rows(
         self, first_us: int | None = None, last_us: int | None = None, *, newest_first: bool = False
     ) -> Iterator[ArchivedHour]:
         """The archived hours that have batches which start between two times, both inclusive; in order of
         time."""
-        if self._table is not None:
-            first, last = (None if t_us is None else hour_of(max(0, t_us)) for t_us in (first_us, last_us))
-            pages = self._table.pages(self._topic, hours_between(first, last), newest_first=newest_first)
-            yield from (archived_hour(item) for page in pages for item in page.items)
+        if self._stores.manifest is None:
+            return
+        first, last = (None if t_us is None else hour_of(max(0, t_us)) for t_us in (first_us, last_us))
+        keys = hours_between(first, last)
+        for page in self._stores.manifest.pages(self._topic, keys, newest_first=newest_first):
+            for item in page.items:
+                try:
+                    row = archived_hour(item)
+                    parse_hour(row.hour)
+                except ContractError as error:  # noqa: PERF203 - each row is refused by itself
+                    self._refused.add(error, f"the archive's row {item.get(HOUR, {}).get('S', '')}")
+                else:
+                    yield row
 
     def read(self, row: ArchivedHour, use: Callable[[HourFile], _T]) -> _T:
         """What ``use`` makes of an hour's file.
 
         A file may be replaced or joined with a day's others while it is read; it is then read again. Raises
-        `StationError` if it is missing.
+        `ArchiveError` if it is missing or damaged.
         """
         problem: Exception | None = None
         for _ in range(2):
             try:
-                return use(HourFile(self._cloud, row))
-            except ClientError as error:  # noqa: PERF203 - it is tried twice
-                if error.response["Error"]["Code"] not in _GONE:
+                return use(HourFile(self._stores, row))
+            except Exception as error:  # noqa: PERF203 - it is tried twice, whatever S3's client is
+                if not isinstance(error, _DAMAGED) and _code(error) not in _GONE:
                     raise
                 problem = error
                 hour = parse_hour(row.hour)
                 row = next(self.rows(hour.start_us, hour.start_us), row)
-        raise StationError(
-            f"the archive lacks {row.key or row.hour} of {self._topic}: run `iort archive verify`"
+        what = "is damaged" if isinstance(problem, _DAMAGED) else "is missing"
+        raise ArchiveError(
+            f"the archive's {row.key or row.hour} of {self._topic} {what}: run `iort archive verify`"
         ) from problem
+
+
+def _code(error: Exception) -> str:
+    """The code of an error of boto3's; "" for any other."""
+    answer = getattr(error, "response", None)
+    return str(answer.get("Error", {}).get("Code", "")) if isinstance(answer, dict) else ""
 
 
 def is_expiring(row: ArchivedHour) -> bool:
     """Whether the table may lack items of the hour."""
     return row.first_expires_s < time.time() + _BEFORE_EXPIRY_S
+
+
+def merged(*sources: Iterable[_Item]) -> Iterator[_Item]:
+    """The items of sources in the order of their keys, each key once: of the first source that has it."""
+    for _, same in groupby(merge(*sources, key=key_of), key_of):
+        yield next(same)
 
 
 def within(items: Iterable[Item], keys: Keys) -> list[Item]:
@@ -100,15 +143,18 @@ def within(items: Iterable[Item], keys: Keys) -> list[Item]:
 
 def key_of(item: Item) -> str:
     """The key of an item."""
-    return str(item[BATCH]["S"])
+    key = item[BATCH]["S"]
+    if not isinstance(key, str):
+        raise TypeError(f"{BATCH} must be a text, got {shown(key)}")
+    return key
 
 
 class HourFile:
     """An hour of the archive, to be read."""
 
-    def __init__(self, cloud: Cloud, row: ArchivedHour) -> None:
+    def __init__(self, stores: Stores, row: ArchivedHour) -> None:
         self._row, self._hour = row, parse_hour(row.hour)
-        self._client, self._bucket = cloud.client("s3"), cloud.output("storage", "FilesBucket")
+        self._client, self._bucket = stores.files()
 
     def parts(self, wanted: Wanted, *, messages: bool, keys: Keys) -> list[Part]:
         """The samples of the batches with these keys, in the order of the batches."""
