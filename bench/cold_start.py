@@ -27,7 +27,6 @@ from bench.command import parser, write
 from bench.report.result import Table
 from bench.sections.utilisation import ONE_VCPU_MB
 from scripts.layer import compile_all
-from stacks.settings import Settings
 from tests.runtime.deployed import functions
 from tests.runtime.environment import Function, RuntimeFailedError, link_runtime, started
 from tests.runtime.events import events
@@ -92,7 +91,7 @@ def measure(rounds: int, console: Console) -> Iterator[Start]:
         for package in link_runtime(folder / "runtime"):
             compile_ = compileall.compile_dir if package.is_dir() else compileall.compile_file
             compile_(package, quiet=2)
-        for function in functions(folder / "app", Settings(layer=LAYER)).values():
+        for function in functions(folder / "functions", LAYER).values():
             console.print(f"{function.name} ...", style="dim")
             kinds = _kinds(function, folder)
             figures: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in kinds}
@@ -105,7 +104,7 @@ def measure(rounds: int, console: Console) -> Iterator[Start]:
 
 
 def _kinds(function: Function, folder: Path) -> dict[str, Function]:
-    bare, code = folder / "layer", folder / "code"
+    bare, code = folder / f"layer-{function.layer and function.layer.name}", folder / "code"
     if function.layer is not None and not bare.exists():
         shutil.copytree(function.layer, bare, ignore=shutil.ignore_patterns("__pycache__"))
     if not code.exists():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from aws_cdk import App
 
 from app import build
@@ -13,10 +15,19 @@ from stacks.settings import Settings
 from tests.runtime.environment import Function
 
 
-def functions(folder: Path, settings: Settings) -> dict[str, Function]:
-    """Return every function by its module's name; the app is synthesized into ``folder``."""
+def functions(folder: Path, layer: Path) -> dict[str, Function]:
+    """Return every function by its module's name, synthesized into ``folder`` with Lambda 1's ``layer``.
+
+    The analysis has this machine's numpy and pyarrow in place of its layer for AWS' processors.
+    """
+    arrays, empty = folder / "arrays", folder / "empty"
+    (arrays / "python").mkdir(parents=True)
+    for name in ("numpy", "numpy.libs", "pyarrow"):
+        (arrays / "python" / name).symlink_to(Path(np.__file__).parents[1] / name)
+    empty.mkdir()
+    folder /= "app"
     app = App(outdir=str(folder))
-    build(app, settings)
+    build(app, Settings(layer=layer, analysis_layer=empty))
     found = {}
     for stack in app.synth().stacks:
         resources: dict[str, Any] = stack.template["Resources"]
@@ -31,7 +42,8 @@ def functions(folder: Path, settings: Settings) -> dict[str, Function]:
                 "functions."
             ):
                 made = _function(folder, one["Properties"], layers)
-                found[made.name] = made
+                of_analysis = made.layer is not None and not any(made.layer.iterdir())
+                found[made.name] = replace(made, layer=arrays) if of_analysis else made
     return dict(sorted(found.items()))
 
 

@@ -7,16 +7,14 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("awslambdaric", reason="it has wheels for Linux alone")
 
 from scripts.layer import compile_all
-from stacks.settings import ROOT, Settings
+from stacks.settings import ROOT
 from tests.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
 from tests.runtime.deployed import functions
 from tests.runtime.environment import RuntimeFailedError, started
@@ -69,16 +67,7 @@ TAKES = {
 def deployed(tmp_path_factory):
     if not LAYER.is_dir():
         pytest.skip(f"{LAYER} is missing: run `make setup`")
-    arrays = tmp_path_factory.mktemp("arrays")
-    found = functions(tmp_path_factory.mktemp("app"), Settings(layer=LAYER, analysis_layer=arrays))
-    # This machine's packages in place of the layer for AWS' processors.
-    (arrays / "python").mkdir()
-    for name in ("numpy", "numpy.libs", "pyarrow"):
-        (arrays / "python" / name).symlink_to(Path(np.__file__).parents[1] / name)
-    return {
-        name: replace(one, layer=arrays) if one.layer and not any(one.layer.iterdir()) else one
-        for name, one in found.items()
-    }
+    return functions(tmp_path_factory.mktemp("functions"), LAYER)
 
 
 def test_every_function_has_an_event_and_an_answer(deployed):
