@@ -23,7 +23,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
 from iort_analysis.results import Mined
-from iort_analysis.statistics.fitting import Fit, fit, propagated
+from iort_analysis.statistics.fitting import Fit, Part, fit, propagated
 from iort_contract.catalog.analysis.car import KNOWN
 from iort_contract.messages.analysis.findings import Estimate
 
@@ -37,8 +37,8 @@ _BRAKES_A, _RELEASE_S = 2.0, 4.0
 _LEAST_A = 1.0
 # Places of coefficients of the motion: the drag, and the first of the four of the slip.
 _DRAG, _SLIPS = 3, 5
-# The share of the friction that the tyres carry, a bit more than half: no field tells. Mean and variance.
-_BEYOND = (np.array([0.57]), np.array([[0.08**2]]))
+# The share of the friction that the tyres carry, a bit more than half: no field tells. A prior.
+_BEYOND = Part(np.array([0.57]), np.array([[0.08**2]]), np.array([[0.08**2]]))
 # The mass that the motor moves, for that which does not turn.
 _TURNING = 1.1
 _GAIN = "speed_to_erpm_gain"
@@ -114,7 +114,7 @@ def _impossible(forces: Mapping[str, Estimate], known_kg: float | None) -> str:
 
 def _ratios(drive: Drive, motion: Fit, gain: float) -> dict[str, Estimate]:
     """What is left without the motor's flux linkage: forces for each kg."""
-    speed2, moved = _mean_square(drive, gain), (motion.coefficients, motion.covariance)
+    speed2, moved = _mean_square(drive, gain), motion.part()
 
     def per_amp(c: Array) -> Any:
         return math.sqrt(max(c[0] * c[1], 0.0)) * _coasting(c, speed2)
@@ -179,13 +179,8 @@ def _fit_motion(drive: Drive, gain: float) -> Fit | str:
 
 def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain: float) -> Mined:
     """The forces, which the motor's flux linkage scales."""
-    flux = (motor.fit.coefficients[:1], motor.fit.covariance[:1, :1])
-    gains = (
-        (np.array([used_gain]), np.zeros((1, 1)))
-        if isinstance(gain, str)
-        else (gain.coefficients[:1], gain.covariance[:1, :1])
-    )
-    moved = (motion.coefficients, motion.covariance)
+    flux, moved, none = motor.fit.part(0), motion.part(), np.zeros((1, 1))
+    gains = Part(np.array([used_gain]), none, none) if isinstance(gain, str) else gain.part(0)
 
     def per_amp(flux_wb: float, erpm_per_mps: float) -> float:
         return 1.5 * flux_wb * RAD_S_PER_ERPM * erpm_per_mps
@@ -232,7 +227,7 @@ def _forces(drive: Drive, motion: Fit, motor: Motor, gain: Fit | str, used_gain:
 
 def _efficiency(motion: Fit) -> Estimate:
     """By what an ampere does while the motor drives, and while it brakes."""
-    moved = (motion.coefficients, motion.covariance)
+    moved = motion.part()
     return propagated(lambda c: math.sqrt(max(c[0] / c[1], 0.0)), moved, unit="1")
 
 

@@ -27,9 +27,6 @@ Array = NDArray[np.float64]
 
 # Windows in which motor and car are compared, and the distance that both need at least.
 _WINDOW_S, _LEAST_M, _LEAST_DRIVE_M = 1.0, 0.3, 20.0
-# An error of a position between two blocks is in both, with different signs: a jackknife that takes them for
-# independent is too wide, and the less so the fewer blocks there are.
-_BLOCKS = 10
 # A position that is this close to the motor's distance was calculated from it.
 _SAME_M = 5e-4
 # Speeds in m/s, by the last parts of their names: of a receiver, and calculated from the motor's, whose gain
@@ -105,12 +102,13 @@ def _of_way(turned: Array, way_m: Array, error: float) -> Fit | str:
     """The gain by the motor's way in erpm seconds and the car's in metres, with an ``error`` as a share."""
     if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
         return f"needs {_LEAST_DRIVE_M:g} m of driving with a second source of speed"
-    found = fit([turned], way_m, blocks=_BLOCKS)
+    found = fit([turned], way_m)
     if found is None or not found.coefficients[0]:
         return "the drive is too short for the gain"
     gain = 1 / found.coefficients
-    covariance = found.covariance * gain**4 + (error / sides() * gain) ** 2
-    return found._replace(coefficients=gain, covariance=covariance)
+    entered = (error / sides() * gain) ** 2
+    covariance, given = (of * gain**4 + entered for of in (found.covariance, found.given))
+    return found._replace(coefficients=gain, covariance=covariance, given=given, moved=found.moved * gain**2)
 
 
 def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
@@ -142,14 +140,19 @@ def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
     slips = (np.diff(squares[np.append(starts, len(times_us) - 1)]), cubes)
     usable = np.isfinite(way_m + turned + cubes + slips[0])
     found = fit(
-        [turned, *(slip - turned * slip[usable].sum() / turned[usable].sum() for slip in slips)], way_m
+        [turned, *(slip - turned * slip[usable].sum() / turned[usable].sum() for slip in slips)],
+        way_m,
+        shared=True,
     )
     if found is None or not found.coefficients[0]:
         return "the drive is too short for the gain"
     if found.sigma < _SAME_M:
         return f"the positions of {drive.pose} are calculated from the motor's speed, so they say nothing new"
     gain = 1 / found.coefficients[:1]
-    return found._replace(coefficients=gain, covariance=found.covariance[:1, :1] * gain**4)
+    covariance, given = (of[:1, :1] * gain**4 for of in (found.covariance, found.given))
+    return found._replace(
+        coefficients=gain, covariance=covariance, given=given, moved=found.moved[:, :1] * gain**2
+    )
 
 
 def _steps(x: Array, y: Array, heading: Array) -> Array:

@@ -16,6 +16,7 @@ Torque for each ampere needs the number of pole pairs; the force at the tyres do
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -49,7 +50,14 @@ _MOST_ROWS = 60_000
 _LATE, _MEAN_S = 0.5, 0.1
 # The time in which a motor warms, where no sensor tells.
 _HEAT_S, _HEAT_STEP_S = 300.0, 1.0
-UNKNOWN_OHM = "speed and voltage may be too far apart in time for the resistance"
+# A board's dead time is felt in full from about this current on.
+_DEAD_A = 1.0
+# A shorter time of motion, and a resistance that is known to this share of itself only, are none.
+_LEAST_S, _WIDEST = 20.0, 0.5
+_UNKNOWN_OHM = (
+    "the drive tells the resistance as {value:.2g} ohm from {low:.2g} to {high:.2g} only: its currents change"
+    " too little, or speed and voltage are too far apart in time"
+)
 _NAMES = ("motor_resistance_ohm", "motor_flux_linkage_wb", "motor_inductance_h", "motor_torque_nm_per_a")
 
 
@@ -70,6 +78,14 @@ class Motor(NamedTuple):
         """The resistance of a phase with its MOSFETs and wires: at 25 degC, or as it was in the drive."""
         return self.fit.of(1, "ohm")
 
+    @property
+    def unknown_ohm(self) -> str:
+        """Why the drive does not tell the resistance; empty if it does."""
+        ohm = self.resistance
+        if ohm.value > 0 and ohm.high - ohm.value < _WIDEST * ohm.value:
+            return ""
+        return _UNKNOWN_OHM.format(**ohm._asdict())
+
 
 def mine(drive: Drive) -> Mined:
     """The motor's resistance, flux linkage and inductance."""
@@ -79,10 +95,10 @@ def mine(drive: Drive) -> Mined:
     estimates = {"motor_flux_linkage_wb": motor.flux_linkage}
     missing = {}
     name = "motor_resistance_25_ohm" if motor.at_reference else "motor_resistance_ohm"
-    if motor.resistance.low > 0:
-        estimates[name] = motor.resistance
+    if motor.unknown_ohm:
+        missing[name] = motor.unknown_ohm
     else:
-        missing[name] = UNKNOWN_OHM
+        estimates[name] = motor.resistance
     if not motor.at_reference:
         missing["motor_resistance_25_ohm"] = (
             "needs temp_motor: the resistance is that of the drive's mean heat"
@@ -95,9 +111,8 @@ def mine(drive: Drive) -> Mined:
     if pairs is None:
         missing["motor_torque_nm_per_a"] = "needs the motor's number of pole pairs, which no field depends on"
     else:
-        torque = (motor.fit.coefficients[:1], motor.fit.covariance[:1, :1])
         estimates["motor_torque_nm_per_a"] = propagated(
-            lambda flux: 1.5 * pairs * float(flux[0]), torque, unit="Nm/A"
+            lambda flux: 1.5 * pairs * float(flux[0]), motor.fit.part(0), unit="Nm/A"
         )
     return Mined(estimates, missing)
 
@@ -109,10 +124,20 @@ def fit_motor(drive: Drive) -> Motor | str:
     speed, vq, iq = (drive.of(drive.vesc, name) for name in ("speed", "avg_vq", "avg_iq"))
     if speed is None:
         return "needs the motor's speed"
+    if reason := _hardly_moves(drive, speed):
+        return reason
     rows = slice(None, None, -(-len(speed) // _MOST_ROWS))
     if vq is not None and iq is not None and np.nanstd(vq) and np.nanstd(iq):
         return _from_axes(drive, speed[rows], vq[rows], iq[rows], rows)
     return _from_duty(drive, speed[rows], rows)
+
+
+def _hardly_moves(drive: Drive, speed: Array) -> str:
+    """Why the drive has too little motion to tell anything of the motor; empty if it has enough."""
+    moves_s = float(np.mean(np.abs(speed) > _LEAST_ERPM)) * float(drive.seconds[-1])
+    if moves_s >= _LEAST_S:
+        return ""
+    return f"needs {_LEAST_S:g} s of motion faster than {_LEAST_ERPM:g} erpm, got {moves_s:.0f} s"
 
 
 def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) -> Motor | str:
@@ -124,8 +149,12 @@ def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) ->
     vd = drive.of(drive.vesc, "avg_vd")
     # The length of the voltage is right even where the controller's angle is late.
     volts = vq if vd is None else np.copysign(np.hypot(vd[rows], vq), vq)
+    same = [] if vd is None else [vq]
+    duty, voltage = drive.of(drive.vesc, "duty_cycle"), drive.of(drive.vesc, VOLTAGE_FIELD)
+    if duty is not None and voltage is not None:
+        same.append(duty[rows] * voltage[rows] / math.sqrt(3))
     found = _with_winding(
-        drive, [omega, iq], volts, rows, *([] if vd is None else [_square(omega, iq, volts)])
+        drive, [omega, iq], [volts, *same], rows, *([] if vd is None else [_square(omega, iq, volts)])
     )
     if found is None:
         return "the drive's speeds and currents do not tell resistance from flux linkage"
@@ -155,7 +184,7 @@ def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor | str:
         return reason
     omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
     volts = duty * voltage / math.sqrt(3)
-    found = _with_winding(drive, [omega, current], volts, rows, _square(omega, current, volts))
+    found = _with_winding(drive, [omega, current], [volts], rows, _square(omega, current, volts))
     if found is None:
         return "the drive's speeds and currents do not tell resistance from flux linkage"
     return Motor(*found, None)
@@ -173,12 +202,17 @@ def _ratios(drive: Drive) -> dict[str, Estimate]:
     speed, duty, voltage, current, battery = (drive.of(drive.vesc, name) for name in names)
     if speed is None or duty is None or voltage is None or current is None or battery is None:
         return {}
+    if _hardly_moves(drive, speed):
+        return {}
     usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
     if not _follows(np.where(usable, duty * current, np.nan), battery):
         return {}
-    found = fit([np.where(usable, speed / 1000, np.nan), current], duty * voltage)
+    krpm, volts = np.where(usable, speed / 1000, np.nan), duty * voltage
+    found = fit([krpm, current], volts)
     if found is None:
         return {}
+    tried = [fit([krpm, current, beyond], volts) for beyond in _beyond(krpm, current)]
+    found = found.beside([one for one in tried if one is not None], (0, 1))
     return {"motor_volts_per_krpm": found.of(0, "V/krpm"), "motor_volts_per_a": found.of(1, "V/A")}
 
 
@@ -208,11 +242,14 @@ def _not_field_oriented(modulated: Array, battery: Array) -> str:
 
 
 def _with_winding(
-    drive: Drive, columns: list[Array], volts: Array, rows: slice, *more: Array
+    drive: Drive, columns: list[Array], volts: Sequence[Array], rows: slice, *more: Array
 ) -> tuple[Fit, bool] | None:
-    """The fit, whose resistance grows with the motor's temperature where that is known; and if so."""
+    """The fit, whose resistance grows with the motor's temperature where that is known; and if so.
+
+    The first of ``volts`` is fitted; the others are the same voltage as other fields tell it.
+    """
     omega, current = columns
-    rough = fit([*columns, *more], volts)
+    rough = fit([*columns, *more], volts[0])
     if rough is None:
         return None
     flux, size = (abs(float(one)) for one in rough.coefficients[:2])
@@ -222,23 +259,32 @@ def _with_winding(
     late = np.gradient(omega, seconds)
     priors = {2: Prior(0.0, _LATE * apart_s * flux)}
     degc = drive.of(drive.vesc, "temp_motor")
-    if degc is None or not np.nanstd(degc):
+    warms = degc is not None and bool(np.nanstd(degc))
+    if degc is not None and warms:
+        warmer = current * COPPER_PER_K * (degc[rows] - REFERENCE_DEGC)
+        priors[3] = Prior(_WINDING * size, _WINDING_DEVIATION * size)
+    else:
         # The winding warms with the current's square, some minutes late.
         squares = current**2
         heat = _late(seconds, squares)
-        heat -= np.nansum(squares * heat) / np.nansum(squares)
-        found = _averaged_fit(seconds, [*columns, late, current * heat, *more], volts, priors)
-        return None if found is None else (found, False)
-    warmer = current * COPPER_PER_K * (degc[rows] - REFERENCE_DEGC)
-    priors[3] = Prior(_WINDING * size, _WINDING_DEVIATION * size)
-    found = _averaged_fit(seconds, [*columns, late, warmer, *more], volts, priors)
-    return None if found is None else (found, True)
+        warmer = current * (heat - np.nansum(squares * heat) / np.nansum(squares))
+    beyond = _beyond(omega, current)
+    # Means, since noise of a current that follows the acceleration makes the resistance small.
+    means = averaged(seconds, [omega, current, late, warmer, *more, *beyond, *volts], _MEAN_S)
+    first = 4 + len(more)
+    equations, others = means[:first], means[first : first + len(beyond)]
+    wanted, *same = means[first + len(beyond) :]
+    found = fit(equations, wanted, priors=priors)
+    if found is None:
+        return None
+    tried = [fit([*equations, *beyond], wanted, priors=priors) for beyond in (*zip(others), others)]
+    tried += [fit(equations, other, priors=priors) for other in same]
+    return found.beside([one for one in tried if one is not None], (0, 1)), warms
 
 
-def _averaged_fit(seconds: Array, columns: list[Array], volts: Array, priors: dict[int, Prior]) -> Fit | None:
-    """The fit of means: noise of a current that follows the acceleration makes the resistance small."""
-    *means, volts = averaged(seconds, [*columns, volts], _MEAN_S)
-    return fit(means, volts, priors=priors)
+def _beyond(speed: Array, current: Array) -> list[Array]:
+    """What the equations leave out: dead time, and a voltage for the speed that is no straight line."""
+    return [np.tanh(current / _DEAD_A), speed * np.abs(speed)]
 
 
 def _late(seconds: Array, values: Array) -> Array:

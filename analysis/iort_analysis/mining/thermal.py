@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, UNKNOWN_OHM, fit_motor
+from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, fit_motor
 from iort_analysis.results import Mined
-from iort_analysis.statistics.fitting import Fit, Prior, fit, propagated
+from iort_analysis.statistics.fitting import Fit, Part, Prior, fit, propagated
 from iort_analysis.statistics.signals import binned, bridged, lagged
 from iort_contract.messages.analysis.findings import Estimate
 
@@ -83,9 +83,9 @@ class Body(NamedTuple):
         """The warming for each A^2 of the mean square of the current, of copper at 25 degC."""
         return self.fit.estimate(self._rises, "K/A2")
 
-    def resistance(self, ohm: tuple[Array, Array]) -> Estimate:
+    def resistance(self, ohm: Part) -> Estimate:
         """The thermal resistance for the losses in a motor of so much resistance."""
-        return propagated(lambda c: self._rises @ c[:-1] / (1.5 * c[-1]), self._known, ohm, unit="K/W")
+        return propagated(lambda c: self._rises @ c[:-1] / (1.5 * c[-1]), self.fit.part(), ohm, unit="K/W")
 
     def final(self, other_degc: float | None = None) -> Estimate:
         """The temperature at which it settles if the present load goes on, and the other body settles too."""
@@ -98,7 +98,7 @@ class Body(NamedTuple):
             warm = 0.0 if self.alone else c[3] * above
             return (c[0] + warm + rise * (1 - grows * REFERENCE_DEGC)) / (1 - rise * grows)
 
-        found = propagated(settled, self._known, unit="degC")
+        found = propagated(settled, self.fit.part(), unit="degC")
         # Nobody knows a temperature better than the sensor does.
         return found._replace(low=found.low - _SENSOR_K / 2, high=found.high + _SENSOR_K / 2)
 
@@ -119,10 +119,6 @@ class Body(NamedTuple):
     def alone(self) -> bool:
         """Whether the other body's temperature is not known."""
         return math.isnan(self.other_degc)
-
-    @property
-    def _known(self) -> tuple[Array, Array]:
-        return self.fit.coefficients, self.fit.covariance
 
     @property
     def _rises(self) -> Array:
@@ -150,8 +146,8 @@ def mine(drive: Drive) -> Mined:
         "controller": _fit_body(load._replace(copper=None), controller, motor),
     }
     resistance = fit_motor(drive)
-    if not isinstance(resistance, str) and resistance.resistance.low <= 0:
-        resistance = UNKNOWN_OHM
+    if not isinstance(resistance, str) and resistance.unknown_ohm:
+        resistance = resistance.unknown_ohm
     estimates: dict[str, Estimate] = {}
     missing: dict[str, str] = {}
     finals = _finals(found)
@@ -163,7 +159,7 @@ def mine(drive: Drive) -> Mined:
             "rise_k_per_a2": body.rise,
             "thermal_resistance_k_per_w": resistance
             if isinstance(resistance, str)
-            else body.resistance((resistance.fit.coefficients[1:2], resistance.fit.covariance[1:2, 1:2])),
+            else body.resistance(resistance.fit.part(1)),
             "final_degc": finals[name],
             "time_to_limit_s": body.time_to(LIMITS_DEGC[name], finals[name]),
         }

@@ -7,7 +7,9 @@ jackknife (Künsch 1989), which is the cluster-robust covariance CR3 (Bell and M
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +17,8 @@ from numpy.typing import NDArray
 
 from iort_analysis.statistics.intervals import sides
 from iort_analysis.statistics.normal import between
+from iort_analysis.statistics.signals import quantum
+from iort_analysis.statistics.student import quantile
 from iort_contract.messages.analysis.findings import Estimate
 
 Array = NDArray[np.float64]
@@ -25,6 +29,10 @@ _TUKEY = 4.685
 _ROUNDS = 6
 # A reading whose interval is further from the model than this many sigma is an outlier.
 _FAR = 4.0
+# A model differs from another one if chance does so less often than this.
+_CHANCE = 0.01
+# Student's t of as many degrees of freedom is as good as normal.
+_MANY = 1000
 _MOST_STEPS = 12
 # The largest condition of the scaled normal equations at which their solution means something.
 _CONDITION = 1e10
@@ -37,28 +45,65 @@ class Prior(NamedTuple):
     deviation: float
 
 
+class Part(NamedTuple):
+    """Some coefficients with their covariance. ``given`` is the part of it that is not of the blocks' spread,
+    such as a prior's."""
+
+    coefficients: Array
+    covariance: Array
+    given: Array
+
+
 class Fit(NamedTuple):
     """The coefficients of a linear model with their covariance; and the residuals, NaN where none is known.
 
-    ``sigma`` is the deviation of a single value from the model, without outliers. ``blocks`` is how many
-    blocks' spread the covariance is of.
+    ``sigma`` is the deviation of a single value from the model, without outliers. ``given`` is the part of
+    the covariance that is not of the blocks' spread. ``moved`` is how far the coefficients move without each
+    block, from their mean.
     """
 
     coefficients: Array
     covariance: Array
     residuals: Array
     sigma: float
-    blocks: int = BLOCKS
+    given: Array
+    moved: Array
 
     def estimate(self, weights: Array, unit: str) -> Estimate:
         """A weighted sum of the coefficients."""
-        deviation = float(np.sqrt(weights @ self.covariance @ weights))
-        return estimate(float(weights @ self.coefficients), deviation, unit, self.blocks)
+        whole, given = (float(weights @ one @ weights) for one in (self.covariance, self.given))
+        return _estimate(float(weights @ self.coefficients), [whole - given], given, unit)
 
     def of(self, index: int, unit: str) -> Estimate:
         """One coefficient."""
-        deviation = float(np.sqrt(self.covariance[index, index]))
-        return estimate(float(self.coefficients[index]), deviation, unit, self.blocks)
+        return self.estimate(np.eye(len(self.coefficients))[index], unit)
+
+    def part(self, *indices: int) -> Part:
+        """Some of the coefficients, for `propagated`; all without indices."""
+        chosen = indices or range(len(self.coefficients))
+        among = np.ix_(chosen, chosen)
+        return Part(self.coefficients[list(chosen)], self.covariance[among], self.given[among])
+
+    def beside(self, others: Sequence[Fit], indices: Sequence[int]) -> Fit:
+        """The fit with what other models of the same samples say of some of its coefficients.
+
+        A difference beyond chance, by its own spread over the blocks (Hausman 1978), is an error of the
+        model. The variance of two models so far apart is then part of the coefficient's: the interval holds
+        both (Draper 1995).
+        """
+        covariance, given = self.covariance.copy(), self.given.copy()
+        for i in indices:
+            variance = max((self._apart(other, i) for other in others), default=0.0) ** 2 / 2
+            covariance[i, i] += variance
+            given[i, i] += variance
+        return self._replace(covariance=covariance, given=given)
+
+    def _apart(self, other: Fit, index: int) -> float:
+        """The difference of a coefficient from another model's; 0 if chance makes it as large."""
+        moved = other.moved[:, index] - self.moved[:, index]
+        apart = abs(float(other.coefficients[index] - self.coefficients[index]))
+        error = math.sqrt(float(moved @ moved) * (BLOCKS - 1) / BLOCKS)
+        return apart if apart > quantile(1 - _CHANCE / 2, BLOCKS - 1) * error else 0.0
 
 
 def fit(
@@ -67,7 +112,7 @@ def fit(
     *,
     priors: Mapping[int, Prior] | None = None,
     resolution: float = 0.0,
-    blocks: int = BLOCKS,
+    shared: bool = False,
 ) -> Fit | None:
     """Fit ``wanted`` as a sum of columns; None if the drive does not tell the columns apart.
 
@@ -75,43 +120,58 @@ def fit(
     ``resolution`` is the step of the values wanted: a reading of 11.6 V in steps of 0.1 V says that the
     voltage was between 11.55 V and 11.65 V, and no more. Where a battery moves less than a few steps, the
     error of rounding follows the load, and least squares are wrong however many samples there are.
+    ``shared`` is for values between two readings each, such as a way between two positions: neighbours share
+    the error of the reading between them.
     """
     design = np.stack(columns)
     known = np.isfinite(design).all(axis=0) & np.isfinite(wanted)
     design, y = design[:, known], wanted[known]
-    if len(y) < 2 * blocks or len(y) < 4 * len(design):
+    if len(y) < 2 * BLOCKS or len(y) < 4 * len(design):
         return None
     scale = np.sqrt(np.einsum("ij,ij->i", design, design) / len(y))
     if not scale.all():
         return None
     design /= scale[:, None]
-    problem = _Problem(design, y, resolution, *_scaled(priors or {}, scale), _starts(len(y), blocks))
+    problem = _Problem(design, y, resolution, *_scaled(priors or {}, scale))
     solved = problem.solve()
     if solved is None:
         return None
-    coefficients, covariance, sigma = solved
+    coefficients, influence, moved, given, sigma = solved
     residuals = np.full(len(wanted), np.nan)
     residuals[known] = y - coefficients @ design
-    return Fit(coefficients / scale, covariance / np.outer(scale, scale), residuals, sigma, blocks)
+    sampled = moved.T @ moved * ((BLOCKS - 1) / BLOCKS)
+    if shared:
+        given = given - _shared(influence, np.flatnonzero(known), np.diag(sampled))
+    given = given + np.diag(np.maximum(_rounded(design, y) - np.diag(sampled + given), 0.0))
+    moved, given = moved / scale, given / np.outer(scale, scale)
+    covariance = sampled / np.outer(scale, scale) + given
+    return Fit(coefficients / scale, covariance, residuals, sigma, given, moved)
 
 
-def propagated(function: Callable[[Array], Any], *parts: tuple[Array, Array], unit: str) -> Estimate:
-    """A function of the coefficients of independent fits, given with their covariances."""
-    at = np.concatenate([coefficients for coefficients, _ in parts])
-    deviations = np.concatenate([np.sqrt(np.diag(covariance)) for _, covariance in parts])
+def propagated(function: Callable[[Array], Any], *parts: Part, unit: str) -> Estimate:
+    """A function of the coefficients of independent fits."""
+    at = np.concatenate([part.coefficients for part in parts])
+    deviations = np.concatenate([np.sqrt(np.diag(part.covariance)) for part in parts])
     steps = np.where(deviations > 0, deviations, 1.0) * 1e-3
     slopes = np.array([(function(at + step) - function(at - step)) for step in np.diag(steps)]) / (2 * steps)
-    variance, first = 0.0, 0
-    for coefficients, covariance in parts:
-        own = slopes[first : first + len(coefficients)]
-        variance += float(own @ covariance @ own)
-        first += len(coefficients)
-    return estimate(float(function(at)), float(np.sqrt(variance)), unit)
+    spread: list[float] = []
+    given, first = 0.0, 0
+    for part in parts:
+        own = slopes[first : first + len(part.coefficients)]
+        known = float(own @ part.given @ own)
+        spread.append(float(own @ part.covariance @ own) - known)
+        given += known
+        first += len(part.coefficients)
+    return _estimate(float(function(at)), spread, given, unit)
 
 
-def estimate(value: float, deviation: float, unit: str, blocks: int = BLOCKS) -> Estimate:
-    """The estimate with its interval."""
-    half = sides(blocks - 1) * deviation
+def _estimate(value: float, spread: Sequence[float], given: float, unit: str) -> Estimate:
+    """The estimate with its interval: Student's t, since few blocks tell the variances in ``spread``, with
+    the degrees of freedom of their sum with what is given (Satterthwaite 1946)."""
+    whole = max(sum(spread) + given, 0.0)
+    uncertain = sum(variance**2 for variance in spread) / (BLOCKS - 1)
+    freedom = round(whole**2 / uncertain) if uncertain > whole**2 / _MANY else math.inf
+    half = sides(max(1, freedom)) * math.sqrt(whole)
     return Estimate(value, value - half, value + half, unit)
 
 
@@ -123,10 +183,10 @@ class _Problem(NamedTuple):
     resolution: float
     precision: Array
     mean: Array
-    starts: NDArray[np.int64]
 
-    def solve(self) -> tuple[Array, Array, float] | None:
-        """The coefficients, their covariance and sigma."""
+    def solve(self) -> tuple[Array, Array, Array, Array, float] | None:
+        """The coefficients, the rows' influence on them, how far they move without each block, the priors'
+        covariance, and sigma."""
         sigma = max(float(np.std(self.y)), 1e-12)
         weights = np.ones(len(self.y))
         coefficients = np.zeros(len(self.columns))
@@ -147,7 +207,7 @@ class _Problem(NamedTuple):
             if refined is None:
                 return None
             coefficients, sigma, score, curve = refined
-        return coefficients, self._covariance(curve, score), sigma
+        return coefficients, *self._spread(curve, score), sigma
 
     def _refined(self, coefficients: Array, sigma: float) -> tuple[Array, float, Array, Array] | None:
         """The most likely coefficients, where each reading stands for an interval (by Newton's steps)."""
@@ -170,21 +230,39 @@ class _Problem(NamedTuple):
                 break
         return coefficients, sigma, score, curve
 
-    def _covariance(self, curve: Array, score: Array) -> Array:
+    def _spread(self, curve: Array, score: Array) -> tuple[Array, Array, Array]:
         # The normal equations of each block.
-        ends = [*self.starts[1:], len(self.y)]
-        curved = self.columns * curve
-        gram = np.stack(
-            [curved[:, a:b] @ self.columns[:, a:b].T for a, b in zip(self.starts, ends, strict=True)]
-        )
+        starts = np.linspace(0, len(self.y), BLOCKS + 1).astype(np.int64)
+        curved, scored = self.columns * curve, self.columns * score
+        gram = np.stack([curved[:, a:b] @ self.columns[:, a:b].T for a, b in pairwise(starts)])
         total = gram.sum(axis=0) + self.precision
-        scores = np.add.reduceat(self.columns * score, self.starts, axis=1).T
+        scores = np.add.reduceat(scored, starts[:-1], axis=1).T
         # How far the coefficients move without each block.
         moved = np.linalg.solve(total - gram, scores[..., None])[..., 0]
         moved -= moved.mean(axis=0)
         inverse = np.linalg.inv(total)
-        spread: Array = moved.T @ moved * ((len(gram) - 1) / len(gram)) + inverse @ self.precision @ inverse
-        return spread
+        return inverse @ scored, moved, inverse @ self.precision @ inverse
+
+
+def _shared(influence: Array, rows: NDArray[np.intp], variances: Array) -> Array:
+    """What the blocks' spread has too much of errors that the rows on either side of a block's end share: at
+    most half of its variances, which so few blocks do not tell better."""
+    neighbours = np.diff(rows) == 1
+    if not neighbours.any():
+        return np.zeros((len(influence), len(influence)))
+    products = influence[:, :-1][:, neighbours] @ influence[:, 1:][:, neighbours].T / neighbours.sum()
+    twice = (1 - BLOCKS) * (products + products.T)
+    return np.asarray(twice / max(1.0, float((2 * np.diag(twice) / np.maximum(variances, 1e-300)).max())))
+
+
+def _rounded(design: Array, y: Array) -> Array:
+    """The least variance of each coefficient for values that hardly ever change: readings that stay the same
+    share the error of rounding, which no block's spread shows then."""
+    plateaus = 1 + np.count_nonzero(np.diff(y))
+    if plateaus > BLOCKS:
+        return np.zeros(len(design))
+    inverse = np.linalg.pinv(design @ design.T)
+    return np.asarray(quantum(y) ** 2 / 12 * len(y) / plateaus * np.diag(inverse))
 
 
 def _scaled(priors: Mapping[int, Prior], scale: Array) -> tuple[Array, Array]:
@@ -194,10 +272,6 @@ def _scaled(priors: Mapping[int, Prior], scale: Array) -> tuple[Array, Array]:
         precision[index] = 1 / (prior.deviation * scale[index]) ** 2
         mean[index] = prior.mean * scale[index]
     return np.diag(precision), mean
-
-
-def _starts(rows: int, blocks: int) -> NDArray[np.int64]:
-    return np.linspace(0, rows, blocks + 1)[:-1].astype(np.int64)
 
 
 def _median(known: Array) -> float:

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.statistics.signals import quantum
 from iort_analysis.statistics.student import quantile
 from iort_contract.messages.analysis.findings import INTERVAL
 
@@ -20,9 +21,10 @@ def sides(freedom: float = math.inf) -> float:
 
 
 def mean_of(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """The mean of at least two values, and its interval."""
+    """The mean of at least two values, and its interval: at least the step in which they are reported."""
     mean, n = float(values.mean()), len(values)
     either = sides(n - 1) * float(values.std(ddof=1)) / math.sqrt(n)
+    either = max(either, sides() * quantum(values) / math.sqrt(12 * len(np.unique(values))))
     return mean, mean - either, mean + either
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _FADES = 8
+# Decimal places that a sensor's values may have, and how many values show at once that they have more.
+_MOST_PLACES, _FIRST = 6, 64
 
 
 def binned(times_s: Array, values: Array, width_s: float) -> Array:
@@ -85,3 +87,17 @@ def resolution(values: Array) -> float:
     # Values that a float rounds differ by next to nothing.
     steps = steps[steps > 1e-6 * np.abs(different[1:])]
     return float(steps.min()) if len(steps) else 0.0
+
+
+def quantum(values: Array) -> float:
+    """The step in which values are reported, by their decimal places; if they have too many to tell, that of
+    a 32-bit float."""
+    first, largest = values[:_FIRST], float(np.abs(values).max(initial=0.0))
+    for places in range(_MOST_PLACES + 1):
+        if _whole(first * 10.0**places) and _whole(values * 10.0**places):
+            return float(10.0**-places)
+    return float(np.spacing(np.float32(largest)))
+
+
+def _whole(values: Array) -> bool:
+    return bool((np.abs(values - np.rint(values)) < 1e-9 * np.maximum(np.abs(values), 1.0)).all())

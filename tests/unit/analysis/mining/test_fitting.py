@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from iort_analysis.statistics.fitting import Prior, fit, propagated
-from iort_analysis.statistics.signals import lagged, resolution
+from iort_analysis.statistics.fitting import Part, Prior, fit, propagated
+from iort_analysis.statistics.intervals import mean_of
+from iort_analysis.statistics.signals import lagged, quantum, resolution
 
 
 def test_intervals_hold_although_neighbouring_errors_are_alike() -> None:
@@ -57,15 +58,70 @@ def test_outliers_weigh_nothing_and_a_prior_decides_what_the_data_does_not() -> 
     told = fit([x, 2 * x], noisy, priors={1: Prior(1.0, 0.1)})
     assert told is not None
     assert told.coefficients == pytest.approx([1, 1], abs=0.02)
-    assert told.of(1, "1").high - told.of(1, "1").low == pytest.approx(2 * 1.729 * 0.1, rel=0.05)
+    # A prior's deviation is known, unlike one that the spread of twenty blocks tells.
+    assert told.of(1, "1").high - told.of(1, "1").low == pytest.approx(2 * 1.645 * 0.1, rel=0.002)
+    assert found.of(0, "1").high - found.of(0, "1").low == pytest.approx(
+        2 * 1.729 * math.sqrt(found.covariance[0, 0]), rel=0.001
+    )
 
 
-def test_a_function_of_independent_fits_has_the_errors_of_all() -> None:
+@pytest.mark.parametrize(("given", "t"), [(0.0, 1.686), (0.01, 1.645), (0.0025, 1.668)])
+def test_a_function_of_independent_fits_has_the_errors_of_all(given: float, t: float) -> None:
+    # Two variances that 19 degrees of freedom tell each; one of them may be given in part.
+    nothing = np.zeros((1, 1))
     ratio = propagated(
         lambda c: c[0] / c[1],
-        (np.array([4.0]), np.array([[0.04]])),
-        (np.array([2.0]), np.array([[0.01]])),
+        Part(np.array([4.0]), np.array([[0.04]]), np.array([[4 * given]])),
+        Part(np.array([2.0]), np.array([[0.01]]), nothing + given),
         unit="1",
     )
     assert ratio.value == 2
-    assert ratio.high - ratio.value == pytest.approx(1.729 * 2 * math.hypot(0.05, 0.05), rel=1e-3)
+    assert ratio.high - ratio.value == pytest.approx(t * 2 * math.hypot(0.05, 0.05), rel=2e-3)
+
+
+def test_values_between_two_readings_share_the_error_of_the_one_between_them() -> None:
+    chance, widths, plain, apart = np.random.default_rng(7), [], [], []
+    for _ in range(100):
+        # Ways between positions with noise: an error of one is in both ways beside it.
+        way = chance.uniform(0.5, 1.5, 600)
+        seen = 3 * way + np.diff(chance.normal(0, 0.1, 601))
+        found, other = fit([way], seen, shared=True), fit([way], seen)
+        assert found is not None
+        assert other is not None
+        widths.append(found.covariance[0, 0])
+        plain.append(other.covariance[0, 0])
+        apart.append(found.coefficients[0] - 3)
+
+    assert np.sqrt(np.mean(widths)) == pytest.approx(np.std(apart), rel=0.2)
+    assert np.sqrt(np.mean(plain)) > 1.1 * np.std(apart)
+
+
+def test_another_model_of_the_same_samples_counts_if_it_differs_beyond_chance() -> None:
+    chance = np.random.default_rng(2)
+    x = chance.uniform(0, 2, 2000)
+    noise = lagged(chance.normal(size=2000), 10) * 0.3
+    for bend, holds in ((0.0, False), (0.2, True)):
+        y = 2 * x + bend * x**2 + noise
+        line, curve = fit([x], y), fit([x, x**2], y)
+        assert line is not None
+        assert curve is not None
+        before, after = line.of(0, "1"), line.beside([curve], [0]).of(0, "1")
+        # At the origin the slope is 2, on the whole it is more: the interval holds both.
+        assert (after.high - after.low > before.high - before.low) is holds
+        assert (after.low < 2 < after.high) is True
+        assert (before.low < 2 < before.high) is not holds
+
+
+@pytest.mark.parametrize("value", [6.0, 11.6, 5.63999])
+def test_an_interval_is_never_narrower_than_the_step_in_which_values_are_reported(value: float) -> None:
+    step = {6.0: 1.0, 11.6: 0.1, 5.63999: 1e-5}[value]
+    constant = np.full(400, value)
+    assert quantum(constant) == pytest.approx(step)
+    found = fit([np.ones(400)], constant)
+    assert found is not None
+    of_fit = found.of(0, "s")
+    of_mean = mean_of(constant)
+    for low, high in ((of_fit.low, of_fit.high), of_mean[1:]):
+        assert high - low == pytest.approx(2 * 1.645 * step / math.sqrt(12), rel=0.01)
+    # Values with more places than a sensor sends are 32-bit floats.
+    assert 0 < quantum(np.full(5, math.pi)) < 1e-6

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import drivetrain, motor
 from iort_analysis.mining.gain import with_gain
+from iort_analysis.statistics.fitting import Fit
 from iort_contract.catalog.derived import Vehicle
 from tests.unit.analysis.proven import proven
 
@@ -50,6 +52,61 @@ def test_a_motor_in_six_step_control_is_not_taken_for_one_in_field_oriented_cont
     assert mined.estimates.keys() == {"motor_volts_per_krpm", "motor_volts_per_a"}
     assert mined.estimates["motor_volts_per_krpm"].value == pytest.approx(volts, rel=0.002)
     assert "1.00 of duty_cycle times current_motor" in mined.missing["motor_resistance_ohm"]
+
+
+def _seen(car: int, dead_v: float, bend: float) -> tuple[Drive, float, float]:
+    """A car's drive with a board's dead time, and a voltage that bends with the speed by a share; its flux
+    linkage, and that of least squares."""
+    drive, truth = proven(car)
+    columns = dict(drive.samples.columns)
+    speed, current = columns["vesc.speed"], columns["vesc.current_motor"]
+    omega = speed * motor.RAD_S_PER_ERPM
+    bent = truth["flux_linkage_wb"] * bend * omega * np.abs(omega) / np.nanmax(np.abs(omega))
+    beyond = dead_v * np.tanh(current) - bent
+    columns["vesc.duty_cycle"] = (
+        columns["vesc.duty_cycle"] + np.sqrt(3) * beyond / columns["vesc.voltage_input"]
+    )
+    volts = columns["vesc.duty_cycle"] * columns["vesc.voltage_input"] / np.sqrt(3)
+    if "vesc.avg_vq" in columns:
+        volts = columns["vesc.avg_vq"] = columns["vesc.avg_vq"] + beyond
+    usable = (np.abs(speed) > 500) & np.isfinite(volts)
+    (flux, _), *_ = np.linalg.lstsq(np.stack([omega, current], axis=1)[usable], volts[usable])
+    return replace(drive, samples=drive.samples._replace(columns=columns)), truth["flux_linkage_wb"], flux
+
+
+@pytest.mark.parametrize("car", range(4))
+@pytest.mark.parametrize(("dead_v", "bend"), [(0.0, 0.02), (0.2, 0.02), (-0.1, 0.04)])
+def test_what_the_equations_leave_out_is_in_the_interval(car: int, dead_v: float, bend: float) -> None:
+    drive, truth, plain = _seen(car, dead_v, bend)
+    flux = motor.mine(drive).estimates["motor_flux_linkage_wb"]
+
+    # At a stand the flux linkage is the truth; over all speeds it is what a plain fit says.
+    assert flux.low < truth < flux.high
+    assert flux.low < plain < flux.high
+    assert flux.high - flux.low < 0.16 * truth
+    healthy = motor.mine(proven(car).drive).estimates["motor_flux_linkage_wb"]
+    assert healthy.high - healthy.low < 0.003 * truth
+
+
+def test_a_drive_that_hardly_moves_tells_nothing_of_the_motor() -> None:
+    for car in (0, 1):
+        drive = proven(car).drive
+        short = replace(drive, samples=drive.samples.take(slice(0, 16 * 50)))
+        mined = motor.mine(short)
+        assert not mined.estimates
+        assert "needs 20 s of motion faster than 500 erpm, got 1" in mined.missing["motor_resistance_ohm"]
+
+
+def test_a_resistance_with_an_interval_as_wide_as_itself_is_not_given() -> None:
+    nothing = np.zeros((2, 2))
+
+    def unknown(ohm: float, error: float) -> str:
+        fitted = Fit(np.array([1e-3, ohm]), np.diag([1e-12, error**2]), np.zeros(9), 0.1, nothing, nothing)
+        return motor.Motor(fitted, False, None).unknown_ohm
+
+    assert unknown(0.06, 0.0015) == ""
+    assert "as 0.0042 ohm from 0.0017 to 0.0067 only" in unknown(0.0042, 0.00145)
+    assert unknown(-0.06, 0.0015) != ""
 
 
 def test_mass_and_forces_follow_from_the_pose_and_the_electrical_fit() -> None:
