@@ -83,7 +83,7 @@ bench-stop: setup ## measure the emergency stop under full overload: TRIES=20 RE
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
 	@$(BIN)/python -m bench.browser.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
 
-bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 ONLY=speed OUT=docs/bench
+bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 ONLY=coverage OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysis $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY)) $(if $(OUT),--out $(OUT))
 
 bench-analysis-cloud: setup ## analyse 50 robot-hours on an embedded cloud, with progress: HOURS=50 REPORT=figures.json

@@ -1,12 +1,12 @@
 """`make bench-analysis`: the proof of the analysis, on simulated cars whose parameters and faults are known.
 
-    python -m bench.analysis [--quick] [--only speed] [--out build/bench-analysis]
+    python -m bench.analysis [--quick] [--only speed | coverage] [--out build/bench-analysis]
 
 It measures how often each of twelve faults is found at three strengths, how many findings healthy cars have,
 how often the 90 % intervals hold the truth, and what the analysis takes and costs. Drives and results stay
 under build/bench-analysis: an ended run goes on where it was, and a changed analysis needs no new drives. The
-exit status is 1 if a target is missed. ``--only speed`` times the analysis again, for the report that is in
-the folder: on a machine without other work.
+exit status is 1 if a target is missed. ``--only`` measures a part of the report that is in the folder again:
+``speed`` on a machine without other work, ``coverage`` the intervals and the recordings of real cars.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import Progress
 
 from bench import ROOT
 from bench.command import progress
 from bench.proof import recordings, report, speed
 from bench.proof.analysing import Analysed, analysed, on_all_cores
 from bench.proof.cars import DriveSpec
-from bench.proof.judging import Car, Judged, coverage, detection, judge
+from bench.proof.judging import Car, coverage, detection, judge
 from bench.proof.plan import FULL, QUICK, Plan
 from bench.proof.truths import TRUTHS
 from bench.report import machine, writer
@@ -42,9 +43,12 @@ def main() -> None:
     here = machine.describe()
     try:
         if options.only:
-            sections, here = writer.read(options.out, writer.ANALYSIS)
-            timed = _timed(FULL)
-            sections = [timed if section.key == timed.key else section for section in sections]
+            sections, measured = writer.read(options.out, writer.ANALYSIS)
+            again = {section.key: section for section in _again(options.only, console)}
+            for section in again.values():
+                section.notes.append(f"Measured again on {here['date'][:10]}, commit {here['commit']}.")
+            sections = [again.get(section.key, section) for section in sections]
+            here = measured
         else:
             sections = _measure(QUICK if options.quick else FULL, console)
     except KeyboardInterrupt:
@@ -63,15 +67,32 @@ def main() -> None:
 
 def _measure(plan: Plan, console: Console) -> list[Section]:
     with progress(console) as bars:
-        specs = list(plan.all_drives())
-        driving = bars.add_task("drives simulated and analysed", total=len(specs))
-        drives = dict(zip(specs, on_all_cores(analysed, specs, lambda: bars.advance(driving)), strict=True))
+        drives = _drives(list(plan.all_drives()), bars)
         judging = bars.add_task("cars judged", total=plan.cars)
         judged = on_all_cores(judge, _cars(plan, drives), lambda: bars.advance(judging))
         hours = bars.add_task("hours timed", total=1)
         timed = _timed(plan)
         bars.advance(hours)
-    return _sections(plan, drives, judged, timed)
+    return [
+        report.detected(plan, detection(judged)),
+        report.alarms(plan, judged),
+        _covered(plan, drives),
+        timed,
+        *_recordings(),
+    ]
+
+
+def _again(part: str, console: Console) -> list[Section]:
+    if part == "speed":
+        return [_timed(FULL)]
+    with progress(console) as bars:
+        drives = _drives(FULL.covered_drives(), bars)
+    return [_covered(FULL, drives), *_recordings()]
+
+
+def _drives(specs: Sequence[DriveSpec], bars: Progress) -> dict[DriveSpec, Analysed]:
+    driving = bars.add_task("drives simulated and analysed", total=len(specs))
+    return dict(zip(specs, on_all_cores(analysed, specs, lambda: bars.advance(driving)), strict=True))
 
 
 def _timed(plan: Plan) -> Section:
@@ -93,25 +114,23 @@ def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:
     ]
 
 
-def _sections(
-    plan: Plan, drives: dict[DriveSpec, Analysed], judged: Sequence[Judged], timed: Section
-) -> list[Section]:
+def _covered(plan: Plan, drives: dict[DriveSpec, Analysed]) -> Section:
     truths = [drives[spec] for spec in plan.covered_drives()]
     estimated = {name for drive in truths for name in drive.result.mined.estimates}
+    return report.covered(plan.covered, coverage(truths), sorted(estimated - TRUTHS.keys()))
+
+
+def _recordings() -> list[Section]:
     real = recordings.section()
-    return [
-        report.detected(plan, detection(judged)),
-        report.alarms(plan, judged),
-        report.covered(plan.covered, coverage(truths), sorted(estimated - TRUTHS.keys())),
-        timed,
-        *([] if real is None else [real]),
-    ]
+    return [] if real is None else [real]
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="make bench-analysis", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a small version, to see that it works")
-    parser.add_argument("--only", choices=("speed",), help="measure this again for the report in the folder")
+    parser.add_argument(
+        "--only", choices=("speed", "coverage"), help="measure this again for the report that is there"
+    )
     parser.add_argument("--out", type=Path, default=OUT, metavar="FOLDER")
     options = parser.parse_args()
     if options.only and not (options.out / f"{writer.ANALYSIS.name}.json").exists():

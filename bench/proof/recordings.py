@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -26,7 +27,7 @@ from iort_contract.messages.analysis.findings import DriveKey, Estimate
 
 Array = NDArray[np.float64]
 
-FOLDER = ROOT.parent / "shared" / "data"
+FOLDER = Path(os.environ.get("IORT_RECORDINGS") or ROOT.parent / "shared" / "data")
 RIDE, F1TENTH_BAG = "vesc-tool-ride.csv", "f1tenth-motor-servo.bag"
 # Neither recording says on which day it was made.
 _FIRST_US = 1_700_000_000_000_000
