@@ -17,6 +17,7 @@ from iort_contract.archive import DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.catalog.environments import (
     AlertEnvironment,
     AnswerEnvironment,
+    EchoEnvironment,
     Environment,
     LaterEnvironment,
     LiveEnvironment,
@@ -236,7 +237,9 @@ class Processing(PlatformStack):
         return alert
 
     def _echo(self) -> lambda_.Function:
-        echo = self._plain("echo")
+        environment = EchoEnvironment(self.settings.namespace, self._rejected.queue_url)
+        echo = function(self, "Echo", environment)
+        invoked_by_rule(echo, self._rejected)
         allow(echo, ["iot:Publish"], self._answers(PONG, LAMBDA))
         return echo
 

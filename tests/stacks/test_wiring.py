@@ -77,6 +77,7 @@ def test_the_variables_have_the_values_that_the_functions_expect(functions, read
     assert given("Summarize", environments.SummarizeEnvironment) == environments.SummarizeEnvironment(
         **vars(later), put_off_queue="PutOff"
     )
+    assert given("Echo", environments.EchoEnvironment) == environments.EchoEnvironment(name, "Rejected")
     assert given("Upload", environments.UploadEnvironment) == files
     assert given("Query", environments.QueryEnvironment) == query
     assert given("Answer", environments.AnswerEnvironment) == answer

@@ -77,6 +77,13 @@ class QueryEnvironment(Environment):
 
 
 @dataclass(frozen=True)
+class EchoEnvironment(Environment):
+    """The function that answers pings."""
+
+    rejected_queue: str
+
+
+@dataclass(frozen=True)
 class UploadEnvironment(Environment):
     """The function that signs upload addresses."""
 
