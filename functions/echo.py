@@ -40,9 +40,11 @@ def serve(
     publish: Callable[[str, bytes], None],
     keep: Callable[[str], bool],
 ) -> None:
-    """Answer a ping by ``publish``. What is no ping goes to the quarantine's queue by ``keep``; the invocation
-    does not fail, so that the next ping finds this environment. Raises `ContractError` if the queue does not
-    take it, so that Lambda sends it there."""
+    """Answer a ping by ``publish``. What is no ping goes to the quarantine's queue by ``keep``.
+
+    The invocation does not fail then, so that the next ping finds this environment. Raises `ContractError` if
+    the queue does not take it, so that Lambda sends it there.
+    """
     try:
         topic, payload = pong(event)
     except ContractError as error:

@@ -98,9 +98,12 @@ def _impossible(forces: Mapping[str, Estimate], known_kg: float | None) -> str:
         estimate = forces.get(name)
         if estimate is None:
             continue
+        # Where the truth is the limit, one interval of 90 % in twenty lies beyond it by chance; of twice the
+        # width it is one in two thousand.
+        margin = (estimate.high - estimate.low) / 2
         if (
-            estimate.high < least
-            or estimate.low > most
+            estimate.high + margin < least
+            or estimate.low - margin > most
             or (name in _SHARES and estimate.value > most + _BEYOND_ONE)
         ):
             limit = f"at least {least:g}" if estimate.value < least else f"at most {most:g}"
