@@ -77,6 +77,26 @@ def test_a_link_in_place_of_a_written_file_is_replaced(folder, secret):
     assert watched(folder).next() is None
 
 
+def test_a_folder_is_looked_through_once_for_many_files(folder):
+    for name in ("b.jpg", "c.jpg", "d.jpg"):
+        (folder / name).write_bytes(b"1")
+    clock = ManualClock()
+    files = Folder(folder, clock=clock, settle_s=0, remove_after_s=None)
+    first = files.next()
+    # Older than all: only another look would see it.
+    (folder / "a.jpg").write_bytes(b"1")
+    os.utime(folder / "a.jpg", (1, 1))
+    assert files.next() == first
+    files.uploaded(first, files.local(first, threading.Event()), "key")
+    second = files.next()
+    assert second not in {None, first, PurePath("a.jpg")}
+    (folder / second).write_bytes(b"changed since the look")
+    third = files.next()
+    assert third not in {None, first, second, PurePath("a.jpg")}
+    clock.advance(60)
+    assert files.next() == PurePath("a.jpg"), "and looked at again while files wait"
+
+
 def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
     count = 300
     for number in range(count):

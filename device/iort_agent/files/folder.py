@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import threading
+from collections import deque
 from pathlib import Path, PurePath
 from typing import Any, Iterable, Iterator, NamedTuple
 
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 STATE = ".iort-uploads.jsonl"
 # The whole state in one object, as earlier agents wrote it.
 _OLD_STATE = ".iort-uploads.json"
+# While files wait, the folder is looked through this often: each look costs as much as it has files.
+_LOOK_S = 30.0
 # The lines that may be out of force, beside as many as are in force.
 _SPARE_LINES = 1000
 _DEPTH = 6
@@ -58,12 +61,34 @@ class Folder:
         self._done: dict[str, Any] = {}
         self._lines = 0
         self.waiting = 0
+        # What the newest look through the folder found ready, the oldest first.
+        self._ready: deque[Path] = deque()
+        self._looked: float | None = None
         self._load()
 
     def next(self) -> Path | None:
         """The oldest finished file that is not uploaded, as its path below the folder. Also removes the
-        uploaded files that are due."""
+        uploaded files that are due, at each look through the folder."""
         now = self._clock.monotonic()
+        while self._ready and self._looked is not None and now - self._looked < _LOOK_S:
+            if self._is_ready(self._ready[0], now):
+                return self._ready[0]
+            self._ready.popleft()
+        self._look(now)
+        return self._ready[0] if self._ready else None
+
+    def _is_ready(self, name: Path, now: float) -> bool:
+        """Whether a file is still what it was at the newest look, and neither uploaded nor held since."""
+        try:
+            look = look_at(self.path, name)
+        except (OSError, UploadError):
+            return False
+        seen, done, held = self._seen.get(name), self._done.get(str(name)), self._held.get(name)
+        unchanged = seen is not None and seen[0] == look
+        uploaded = done is not None and tuple(done["look"]) == look
+        return unchanged and not uploaded and (held is None or held.look != look or now >= held.until)
+
+    def _look(self, now: float) -> None:
         ready: list[tuple[int, Path]] = []
         waiting = 0
         found = dict(self._files())
@@ -80,8 +105,8 @@ class Folder:
             held = self._held.get(name)
             if now - seen[1] >= self._settle_s and (held is None or held.look != look or now >= held.until):
                 ready.append((look.mtime_ns, name))
-        self.waiting = waiting
-        return min(ready)[1] if ready else None
+        self.waiting, self._looked = waiting, now
+        self._ready = deque(name for _, name in sorted(ready))
 
     def local(self, name: Path, stop: threading.Event) -> LocalFile:
         """The file with its hashes, read now or before. Raises `UploadError`."""

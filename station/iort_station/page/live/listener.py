@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from types import TracebackType
@@ -20,6 +21,7 @@ from iort_contract.topics import check_namespace
 from iort_station.errors import StationError
 from iort_station.page.live.heard import Heard, OnUpdate, heard_of
 
+_log = logging.getLogger(__name__)
 _CONNECT_S = 15.0
 
 
@@ -114,11 +116,13 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
     def message(self, _pubnub: Any, message: Any) -> None:
         now_us = time.time_ns() // 1000
         update = message.message
-        if self._on_update is not None:
-            self._on_update(update, int(message.timetoken) // 10, now_us)
-            return
+        # The SDK's thread must go on, whatever the update is and whatever its taker does.
         try:
-            self.heard.append(heard_of(update, now_us))
-        except (KeyError, TypeError):
-            # The SDK's thread must go on.
+            if self._on_update is not None:
+                self._on_update(update, int(message.timetoken) // 10, now_us)
+            else:
+                self.heard.append(heard_of(update, now_us))
+        except (KeyError, TypeError, ValueError):
             self.malformed += 1
+        except Exception:  # noqa: BLE001 - a thread that ends in silence is worse
+            _log.exception("a live message could not be taken")
