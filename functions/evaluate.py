@@ -109,8 +109,11 @@ class Drives:
 
     def _read_plan(self, job: str, robot: str) -> list[PlannedDrive] | None:
         """The drives of a robot in a run; None if they could not be found."""
-        content = self._kept.json(plan_key(job, robot))
-        return None if content is None else [decode_planned(one) for one in content]
+        for drives in (True, False):
+            content = self._kept.json(plan_key(job, robot, drives=drives))
+            if content is not None:
+                return [decode_planned(one) for one in content]
+        return None
 
     def _read(self, robot: str) -> tuple[Measured, ...]:
         return tuple(_measured(one) for one in self._table.drives(robot, end_us=self._end_us, most=_OTHERS))

@@ -151,5 +151,6 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     if not request.again:
         drives = unknown_to(table, drives)
     kept = Kept(clients.s3(), given.files_bucket)
-    kept.put_json(plan_key(event["job"], robot), [encode_planned(one) for one in drives])
+    key = plan_key(event["job"], robot, drives=bool(drives))
+    kept.put_json(key, [encode_planned(one) for one in drives])
     return {"drives": len(drives)}

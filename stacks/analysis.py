@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 
-from aws_cdk import App, CfnOutput, Duration
+from aws_cdk import App, ArnFormat, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_scheduler as scheduler
@@ -167,7 +167,18 @@ class Analysis(PlatformStack):
         # for using Distributed Map states".
         children = iam.Policy(self, "MapPolicy", roles=[role])
         children.add_statements(
-            iam.PolicyStatement(actions=["states:StartExecution"], resources=[machine.state_machine_arn])
+            iam.PolicyStatement(actions=["states:StartExecution"], resources=[machine.state_machine_arn]),
+            iam.PolicyStatement(
+                actions=["states:DescribeExecution", "states:StopExecution"],
+                resources=[
+                    self.format_arn(
+                        service="states",
+                        resource="execution",
+                        resource_name=f"{machine.state_machine_name}:*",
+                        arn_format=ArnFormat.COLON_RESOURCE_NAME,
+                    )
+                ],
+            ),
         )
         return machine
 

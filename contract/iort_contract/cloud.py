@@ -11,6 +11,8 @@ RESULTS_PREFIX = "results/"
 # What the analysis keeps there: the results of drives, and for a week the drives of each of its runs.
 ANALYSIS_PREFIX = "analysis/"
 PLANS_PREFIX = f"{ANALYSIS_PREFIX}plans/"
+# The folder of a run's drives, all of which are analysed.
+DRIVES = "drives"
 # Ways of live messages to whoever looks: PubNub's servers, or AWS IoT's own WebSockets.
 PUBNUB, IOT = "pubnub", "iot"
 # Who else than robots connects to the broker, each as an IAM role.
@@ -48,9 +50,9 @@ def drive_prefix(drive: DriveKey) -> str:
     return f"{ANALYSIS_PREFIX}robot={check_robot(drive.robot)}/drive={drive}/"
 
 
-def plan_key(job: str, robot: str) -> str:
-    """The key of a robot's drives in a run of the analysis."""
-    return f"{PLANS_PREFIX}{job}/drives/{check_robot(robot)}.json"
+def plan_key(job: str, robot: str, *, drives: bool = True) -> str:
+    """The key of a robot's drives in a run of the analysis, or of the note that it has none."""
+    return f"{PLANS_PREFIX}{job}/{DRIVES if drives else 'none'}/{check_robot(robot)}.json"
 
 
 def findings_key(job: str) -> str:

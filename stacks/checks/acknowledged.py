@@ -126,6 +126,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
     """Stack and construct path to rules and reasons."""
     iot = "arn:<AWS::Partition>:iot:<AWS::Region>:<AWS::AccountId>"
     logs = "arn:<AWS::Partition>:logs:<AWS::Region>:<AWS::AccountId>"
+    states = "arn:<AWS::Partition>:states:<AWS::Region>:<AWS::AccountId>"
 
     def wide(resource: str) -> str:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
@@ -155,6 +156,9 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             **a_run,
         },
         "analysis/MachineRole/DefaultPolicy": {**a_run},
+        "analysis/MapPolicy": {
+            wide(f"{states}:execution:<MachineNAME>:*"): "Step Functions names the executions of the machine"
+        },
         "analysis/Machine": {
             "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role "
             "that may change every log's delivery",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iort_contract.cloud import PLANS_PREFIX
+from iort_contract.cloud import DRIVES, PLANS_PREFIX
 
 # The service's own errors, which pass; a new account's functions are throttled for as long as others run.
 _PASSING = {
@@ -60,6 +60,7 @@ def states(
         }
 
     payload = {"OutputPath": "$.Payload"}
+    drives = f"States.Format('{PLANS_PREFIX}{{}}/{DRIVES}/', $.job)"
     return {
         "StartAt": "Robots",
         "States": {
@@ -74,7 +75,21 @@ def states(
                     **or_failed("Plan", call("Plan", _PLAN), "$"),
                 },
                 "ResultPath": None,
-                "Next": "Drives",
+                "Next": "Listed",
+            },
+            # AWS documents no map over a prefix without objects ("ItemReader (Map)").
+            "Listed": {
+                "Type": "Task",
+                "Resource": f"arn:{partition}:states:::aws-sdk:s3:listObjectsV2",
+                "Parameters": {"Bucket": bucket, "Prefix.$": drives, "MaxKeys": 1},
+                "Retry": [_FAILING],
+                "ResultPath": "$.listed",
+                "Next": "AnyDrives",
+            },
+            "AnyDrives": {
+                "Type": "Choice",
+                "Choices": [{"Variable": "$.listed.Contents[0]", "IsPresent": True, "Next": "Drives"}],
+                "Default": "Evaluate",
             },
             "Drives": {
                 "Type": "Map",
@@ -84,7 +99,7 @@ def states(
                     "ReaderConfig": {"InputType": "JSON", "Transformation": "LOAD_AND_FLATTEN"},
                     "Parameters": {
                         "Bucket": bucket,
-                        "Prefix.$": f"States.Format('{PLANS_PREFIX}{{}}/drives/', $.job)",
+                        "Prefix.$": drives,
                     },
                 },
                 "ItemSelector": {"planned.$": "$$.Map.Item.Value", "job.$": "$.job"},

@@ -87,6 +87,23 @@ def test_the_nightly_schedule_analyses_the_fleet(embedded, bundle) -> None:
     assert analysed.samples == sum(len(block.times_us) for block in drive.values())
 
 
+def test_a_night_without_drives_passes_the_map_by(embedded, bundle, iort) -> None:
+    car, client = bundle().robot, embedded.cloud.client("stepfunctions")
+
+    done = iort("analyse", car, "--last", "1h", "--wait", "--json")
+
+    assert done.exit_code == 0, done.output
+    answer = json.loads(done.stdout)
+    assert (answer["drives"], answer["failed"]) == (0, 0)
+    machine = embedded.cloud.output("analysis", "AnalysisMachine")
+    run = f"{machine.replace(':stateMachine:', ':execution:')}:{answer['run']}"
+    pages = client.get_paginator("get_execution_history").paginate(executionArn=run)
+    details = [one.get("stateEnteredEventDetails") for page in pages for one in page["events"]]
+    entered = [one["name"] for one in details if one]
+    assert entered.index("AnyDrives") < entered.index("Evaluate")
+    assert "Drives" not in entered
+
+
 def test_two_drives_of_the_agent_are_analysed(embedded, bundle, iort) -> None:
     """The agent's car drives twice; between the runs it is off."""
     car = bundle(sources=[{"type": "sim", "duration_s": 20, "rate_hz": 50}])

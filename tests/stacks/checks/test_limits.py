@@ -186,6 +186,21 @@ def test_a_stack_over_a_limit_is_found(stack, template, found):
     assert len(list(too_much(stack, template))) == found
 
 
+def test_a_run_without_drives_maps_over_nothing() -> None:
+    """ "ItemReader (Map)" says nothing of a prefix without objects."""
+    arns = dict.fromkeys(("Plan", "Analyse", "Evaluate", "Present"), "arn")
+    machine = states("aws", arns, bucket="files", at_once=(1, 1))["States"]
+    assert [key for key, one in machine.items() if '"Next": "Drives"' in json.dumps(one)] == ["AnyDrives"]
+    choice = machine["AnyDrives"]
+    (listing,) = (one for one in machine.values() if one.get("Next") == "AnyDrives")
+    assert listing["Resource"] == "arn:aws:states:::aws-sdk:s3:listObjectsV2"
+    reader = machine["Drives"]["ItemReader"]["Parameters"]
+    assert reader.items() <= listing["Parameters"].items()
+    assert choice["Default"] == machine["Drives"]["Next"] == "Evaluate"
+    (rule,) = choice["Choices"]
+    assert rule == {"Variable": f"{listing['ResultPath']}.Contents[0]", "IsPresent": True, "Next": "Drives"}
+
+
 def test_a_drive_that_fails_as_slowly_as_it_can_is_still_a_finding(synthesized) -> None:
     """Express workflows end in silence after five minutes."""
     functions = synthesized.resources("AWS::Lambda::Function", "analysis").items()

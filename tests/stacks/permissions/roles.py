@@ -11,6 +11,7 @@ from iort_contract.topics import SHADOW
 from stacks.checks.invariants import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
+STATES = "arn:${AWS::Partition}:states:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
 GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
 # These actions of provisioning have no resource type, or only a certificate that does not exist yet.
@@ -275,7 +276,12 @@ ROLES = {
         | {
             ("s3:ListBucket", "Files.Arn"),
             ("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"),
+            # "IAM policies for using Distributed Map states".
             ("states:StartExecution", "Machine"),
+            *(
+                (f"states:{action}", f"{STATES}:execution:Machine.Name:*")
+                for action in ("DescribeExecution", "StopExecution")
+            ),
         },
     ),
     "NightlyRole": ("scheduler.amazonaws.com", {("states:StartExecution", "Machine")}),

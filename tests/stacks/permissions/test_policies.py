@@ -135,6 +135,7 @@ def test_wildcards_in_statements_are_listed_exceptions(synthesized, reader):
                 known = (
                     r":topic/(pong|answer)/iort/\*/\*?|:thing/\*/agent$"
                     r"|/(archive|robots|results|ask|plans|analysis)/\*$|/analysis/robot=\*$|:AWSIotLogsV2:\*$"
+                    r"|:execution:Machine.Name:\*$"
                 )
                 named = re.sub(known, "", resource).replace("/robots/*", "")
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}

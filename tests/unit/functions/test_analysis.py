@@ -86,8 +86,9 @@ class Deployed:
         run = plan.handler({"input": request, "job": JOB}, None)
         drives = []
         for robot in run["robots"]:
-            plan.handler({**run, "robot": robot}, None)
-            drives += self.json(plan_key(JOB, robot))
+            number = plan.handler({**run, "robot": robot}, None)["drives"]
+            # The map reads the whole folder, and the note of no drives is not in it.
+            drives += self.json(plan_key(JOB, robot)) if number else []
         for drive in drives:
             analyse.handler({"planned": drive, "job": JOB}, None)
         evaluate.handler(run, None)
@@ -512,6 +513,16 @@ def test_a_robot_that_records_and_never_moves_is_a_finding(cloud: Deployed) -> N
     # As soon as a drive is recorded, it alone counts.
     cloud.record(later({"vesc": vesc}, 600), first_seq=120)
     assert [(one["start_us"] - START_US) // S for one in cloud.run()] == [600]
+
+
+def test_a_robot_without_a_drive_leaves_no_file_for_the_map(cloud: Deployed) -> None:
+    cloud.register(CAR)
+
+    assert cloud.run() == []
+
+    keys = [one["Key"] for one in cloud.s3.list_objects_v2(Bucket=FILES)["Contents"]]
+    assert plan_key(JOB, CAR, drives=False) in keys
+    assert plan_key(JOB, CAR) not in keys
 
 
 def test_a_default_gain_that_nobody_has_touched_is_not_registered(cloud: Deployed) -> None:
