@@ -131,11 +131,11 @@ preflight: layer ## ask your AWS account what would make a deploy fail, and chan
 	@$(BIN)/python -m verify.preflight $(ARGS)
 
 deploy: layer ## deploy to the AWS account of your credentials: ARGS="-c key=value", SKIP_PREFLIGHT=1
-	@$(if $(SKIP_PREFLIGHT),:,$(BIN)/python -m verify.preflight $(ARGS))
-	@$(CDK) deploy --all $(ARGS)
+	@derived=$$($(if $(SKIP_PREFLIGHT),:,$(BIN)/python -m verify.preflight --derive $(ARGS))) && \
+		$(CDK) deploy --all $$derived $(ARGS)
 
 diff: layer ## what a deploy would change, resource by resource
-	@$(CDK) diff $(ARGS)
+	@derived=$$($(BIN)/python -m verify.preflight --derive $(ARGS)); $(CDK) diff $$derived $(ARGS)
 
 destroy: layer ## remove everything from it again, the data included
 	@$(BIN)/python scripts/destroy.py $(CDK) destroy --all $(ARGS)

@@ -35,10 +35,6 @@ _CORE_MB = 1769
 # A child of the map is an express workflow, which AWS ends after five minutes, without a finding: three
 # attempts, all pauses between them and the finding must fit.
 _ANALYSE_S, _PLAN_S, _EVALUATE_S = 70, 900, 900
-# Robots that are planned at once, and drives that are analysed at once. The embedded cloud's functions share
-# this machine's cores; and a new account on AWS has ten environments for all functions, also for those that
-# take the robots' samples: drives that are refused there must find a place within the retries of a minute.
-_ROBOTS, _DRIVES, _EMBEDDED = 8, 40, 2
 # Every night both days are looked at: a drive that went on at night is analysed whole the next time.
 _NIGHTLY_S = 2 * 86_400
 
@@ -154,7 +150,7 @@ class Analysis(PlatformStack):
             self.partition,
             {name: one.function_arn for name, one in functions.items()},
             bucket=self._storage.files.bucket_name,
-            at_once=(_EMBEDDED, _EMBEDDED) if self.settings.embedded else (_ROBOTS, _DRIVES),
+            at_once=self.settings.at_once,
         )
         machine = stepfunctions.StateMachine(
             self,

@@ -19,10 +19,6 @@ from stacks.storage import Storage
 
 # docs/reference/archive.md tells the times that these are for.
 _MEMORY_MB, _TIMEOUT_S, _SCRATCH_MB = 1769, 600, 4096
-# An hour of a thousand streams takes some minutes, and the account keeps environments for other functions.
-_AT_ONCE = 10
-# The least that a queue's mapping may have: there all functions share a machine's cores and memory.
-_EMBEDDED = 2
 
 
 class Archive(PlatformStack):
@@ -69,7 +65,7 @@ class Archive(PlatformStack):
             target=archive,
             event_source_arn=tasks.queue_arn,
             batch_size=1,
-            max_concurrency=_EMBEDDED if settings.embedded else _AT_ONCE,
+            max_concurrency=settings.at_once.tasks,
         )
         # Every hour at a quarter past, and at night.
         when = {

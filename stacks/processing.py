@@ -37,7 +37,7 @@ from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
 from stacks.parts.layers import arrays
 from stacks.parts.queue import queue
 from stacks.quarantine import Quarantine
-from stacks.settings import Settings
+from stacks.settings import LEAST_OF_A_QUEUE, Settings
 from stacks.storage import Storage
 
 _SUMMARIZE_S = 60
@@ -146,14 +146,14 @@ class Processing(PlatformStack):
         self._storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
         put_off.grant_consume_messages(later)
-        # AWS' minimum: waiting batches take no other function's environments.
+        # Waiting batches take no other function's environments.
         lambda_.EventSourceMapping(
             self,
             "PutOffs",
             target=later,
             event_source_arn=put_off.queue_arn,
             batch_size=1,
-            max_concurrency=2,
+            max_concurrency=LEAST_OF_A_QUEUE,
         )
 
     def _summarizing_environment(self) -> LaterEnvironment:

@@ -15,12 +15,10 @@ from iort_contract.catalog.environments import QuarantineEnvironment
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.parts.queue import queue
-from stacks.settings import Settings
+from stacks.settings import LEAST_OF_A_QUEUE, Settings
 from stacks.storage import Storage
 
 _TIMEOUT_S = 10
-# Concurrent batches of ten messages: a flood of refusals waits in the queue, which is cheaper than the table.
-_CONCURRENCY = 2
 
 
 class Quarantine(PlatformStack):
@@ -50,6 +48,7 @@ class Quarantine(PlatformStack):
             target=self.function,
             event_source_arn=self.rejected.queue_arn,
             batch_size=10,
-            max_concurrency=_CONCURRENCY,
+            # A flood of refusals waits in the queue, which is cheaper than the table.
+            max_concurrency=LEAST_OF_A_QUEUE,
             report_batch_item_failures=True,
         )

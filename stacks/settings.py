@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 from aws_cdk import App, RemovalPolicy
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -22,6 +22,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 DEV, PROD = "dev", "prod"
 _RESERVED_FOR_LIVE = 5
+# "PutFunctionConcurrency": a reservation must leave this many executions to all other functions.
+UNRESERVED = 100
+# A new account's executions: "Lambda quotas" says that they are fewer than 1,000, and new accounts report 10.
+# And the least that a queue's mapping takes: "Configuring scaling behavior for SQS event source mappings".
+NEW_ACCOUNT, LEAST_OF_A_QUEUE = 10, 2
 OWN_LOGS, ALL_LOGS = "own", "all"
 # AWS IoT ends a connection with more subscriptions.
 _MOST_SITE_ROBOTS = 50
@@ -117,6 +122,15 @@ Flag = Annotated[bool, BeforeValidator(_true_or_false)]
 Positive = Annotated[float, BeforeValidator(_above_zero)]
 
 
+class AtOnce(NamedTuple):
+    """How many executions work that nobody waits for has at most: of the archive's ``tasks``, and of the
+    analysis' ``robots`` or ``drives``, which never run at the same time in one run."""
+
+    tasks: int
+    robots: int
+    drives: int
+
+
 class Settings(BaseModel):
     """Settings that may differ between two deployments of the same stacks; each is a context key.
 
@@ -165,7 +179,14 @@ class Settings(BaseModel):
     live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
-        "in `prod`, nothing in `dev` ([why](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
+        "in `prod` where `account_concurrency` allows it, nothing in `dev` "
+        "([why](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
+    )
+    account_concurrency: Annotated[int, _whole(NEW_ACCOUNT, 100_000)] = Field(
+        default=NEW_ACCOUNT,
+        description="the executions that the account's functions may have at once, from which the limits of "
+        "all work follow that nobody waits for; `make deploy` asks Lambda, and without a value it is a new "
+        "account's ([how](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
     )
     customer_key: Flag = Field(
         default=False,
@@ -246,14 +267,23 @@ class Settings(BaseModel):
 
     @property
     def reserved_for_live(self) -> int:
-        """Reserved concurrency of Lambda 1, 0 for none.
-
-        Lambda rejects a reservation that leaves an account fewer than 100 unreserved executions
-        (PutFunctionConcurrency). New accounts have 10 in all, so their first deployment would fail.
-        """
+        """Reserved concurrency of Lambda 1, 0 for none: a small account has nothing to reserve from."""
         if self.live_concurrency is None:
-            return _RESERVED_FOR_LIVE if self.protected else 0
+            allowed = self.account_concurrency >= UNRESERVED + _RESERVED_FOR_LIVE
+            return _RESERVED_FOR_LIVE if self.protected and allowed else 0
         return self.live_concurrency
+
+    @property
+    def at_once(self) -> AtOnce:
+        """Hundredths of the account. Of a new one's ten executions, with two each for the queues of waiting
+        batches and of refused messages, three stay for whatever robots and people wait for.
+
+        The embedded cloud's functions share this machine's cores.
+        """
+        if self.embedded:
+            return AtOnce(LEAST_OF_A_QUEUE, 2, 2)
+        hundredth = self.account_concurrency // 100
+        return AtOnce(max(LEAST_OF_A_QUEUE, hundredth), max(1, hundredth), max(1, 4 * hundredth))
 
     @property
     def has_lambda_1(self) -> bool:

@@ -173,6 +173,7 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
     return _synthesize(
         tmp_path_factory,
         stage="prod",
+        account_concurrency=1000,
         customer_key=True,
         budget_usd=50,
         alarm_email="lab@example.org",

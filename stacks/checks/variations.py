@@ -27,6 +27,7 @@ FLIPS: dict[str, dict[str, Any]] = {
         "files_days": 30,
         "upload_gb_a_day": 5,
         "live_concurrency": 5,
+        "account_concurrency": 1000,
         "robot_metrics": True,
         "function_logs": ALL_LOGS,
         "tags": {"team": "lab"},

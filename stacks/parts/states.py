@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from iort_contract.cloud import DRIVES, PLANS_PREFIX
+from stacks.settings import AtOnce
 
 # The service's own errors, which pass; a new account's functions are throttled for as long as others run.
 _PASSING = {
@@ -32,9 +33,7 @@ _PLAN = {f"{name}.$": f"$.{name}" for name in ("robot", "start_us", "end_us", "a
 _ANALYSE = {f"{name}.$": f"$.{name}" for name in ("planned", "job")}
 
 
-def states(
-    partition: str, functions: Mapping[str, str], *, bucket: str, at_once: tuple[int, int]
-) -> dict[str, Any]:
+def states(partition: str, functions: Mapping[str, str], *, bucket: str, at_once: AtOnce) -> dict[str, Any]:
     """The machine's definition, by the functions' ARNs. ``at_once`` limits robots and drives."""
 
     def call(function: str, payload: Mapping[str, Any], **more: Any) -> dict[str, Any]:
@@ -69,7 +68,7 @@ def states(
                 "Type": "Map",
                 "ItemsPath": "$.robots",
                 "ItemSelector": {**_PLAN, "robot.$": "$$.Map.Item.Value"},
-                "MaxConcurrency": at_once[0],
+                "MaxConcurrency": at_once.robots,
                 "ItemProcessor": {
                     "ProcessorConfig": {"Mode": "INLINE"},
                     **or_failed("Plan", call("Plan", _PLAN), "$"),
@@ -103,7 +102,7 @@ def states(
                     },
                 },
                 "ItemSelector": {"planned.$": "$$.Map.Item.Value", "job.$": "$.job"},
-                "MaxConcurrency": at_once[1],
+                "MaxConcurrency": at_once.drives,
                 # A drive that fails is a finding; where even that fails, the night goes on.
                 "ToleratedFailurePercentage": 100,
                 "ItemProcessor": {

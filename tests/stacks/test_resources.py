@@ -132,6 +132,43 @@ def test_lambda_1_has_reserved_concurrency_only_in_prod(synthesized, production)
     assert reserved(production) == {"functions.live.handler": 5}
 
 
+@pytest.mark.parametrize(
+    ("account", "queues", "maps", "left"),
+    [
+        (10, {"Archive": 2, "Later": 2, "Quarantine": 2}, {"Plans": 1, "Drives": 1}, 3),
+        (1000, {"Archive": 10, "Later": 2, "Quarantine": 2}, {"Plans": 10, "Drives": 40}, 900),
+    ],
+)
+def test_what_nobody_waits_for_leaves_executions_to_what_robots_and_people_wait_for(
+    deployment, account, queues, maps, left
+):
+    """Of a queue's mapping AWS takes no limit under 2; the maps of a run follow each other."""
+    given = {} if account == 10 else {"account_concurrency": account}
+    resources = [
+        one for template in deployment(**given).templates.values() for one in template["Resources"].values()
+    ]
+
+    def of(kind):
+        return [one["Properties"] for one in resources if one["Type"] == kind]
+
+    limits = {
+        name(one["FunctionName"]["Ref"]): one["ScalingConfig"]["MaximumConcurrency"]
+        for one in of("AWS::Lambda::EventSourceMapping")
+        # Lambda 2 has as many as the table's stream has shards, and is one of those that stay.
+        if "StreamArn" not in str(one["EventSourceArn"]) and "StartingPosition" not in one
+    }
+    (machine,) = of("AWS::StepFunctions::StateMachine")
+    text = machine["DefinitionString"]
+    parts = text["Fn::Join"][1] if isinstance(text, dict) else [text]
+    states = json.loads("".join(one if isinstance(one, str) else "x" for one in parts))["States"]
+    at_once = {key: state["MaxConcurrency"] for key, state in states.items() if state["Type"] == "Map"}
+
+    assert (limits, at_once) == (queues, maps)
+    assert account - sum(limits.values()) - max(at_once.values()) >= left
+    reserved = [one for one in of("AWS::Lambda::Function") if "ReservedConcurrentExecutions" in one]
+    assert reserved == []
+
+
 BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present", "Archive"}
 
 

@@ -9,7 +9,7 @@ from iort_contract.topics import rule_name
 from iort_station.cost.scale import on_paper
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
-from stacks.settings import Settings
+from stacks.settings import UNRESERVED, Settings
 from verify.preflight.deployed import resources
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
@@ -17,8 +17,6 @@ from verify.preflight.finding import Clients, Found, code, fine, item, listed, s
 # manifest.
 BOOTSTRAP = 6
 BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
-# "PutFunctionConcurrency": a reservation must leave this many executions to all other functions.
-UNRESERVED = 100
 # The quotas should suffice for this fleet.
 ROBOTS = 100
 # Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/scale.py).
@@ -114,7 +112,10 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
             if one.kind == "AWS::Lambda::Function" and one.logical_id.startswith("Live"):
                 answer = lambda_.get_function_concurrency(FunctionName=one.physical_id)
                 held = answer.get("ReservedConcurrentExecutions", 0)
-    text = f"{total} concurrent executions, {unreserved} of them unreserved; {wanted} are to be reserved"
+    text = (
+        f"{total} concurrent executions, {unreserved} of them unreserved; {wanted} are to be reserved; "
+        f"at once {settings.at_once.tasks} archive, and {settings.at_once.drives} analyse"
+    )
     if wanted and unreserved + held - wanted < UNRESERVED:
         return stops(
             f"{text}, and Lambda requires {UNRESERVED} unreserved",

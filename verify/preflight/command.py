@@ -1,10 +1,11 @@
 """Checks an account for causes of a failed deployment, beforehand and read-only.
 
-    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json]
+    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json | --derive]
 
-It reads settings like app.py and ignores other options of the CDK. Exit status 1 means that the deployment
-would fail. `make deploy` runs it first (skip it with SKIP_PREFLIGHT=1); `make verify-aws` runs it for its
-report.
+It reads settings like app.py, takes from the account those that are not given, and ignores other options of
+the CDK. Exit status 1 means that the deployment would fail. `make deploy` runs it first (skip it with
+SKIP_PREFLIGHT=1), and hands to the CDK what --derive prints, the findings beside it on stderr; `make
+verify-aws` runs it for its report.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from iort_station.cli.console import Console
 from iort_station.cloud import Cloud
 from stacks.settings import ROOT, Settings, SettingsError
 from verify.preflight import account, deployed
+from verify.preflight.derived import derive
 from verify.preflight.finding import Clients, Finding, Verdict
 
 _STYLES = {Verdict.FINE: "green", Verdict.WARNING: "yellow", Verdict.STOPS: "red"}
@@ -50,6 +52,9 @@ def options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("-c", "--context", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--profile", help="profile of the AWS configuration")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.add_argument(
+        "--derive", action="store_true", help="print the CDK's arguments for what the account decides"
+    )
     known, _others = parser.parse_known_args(arguments)
     return known
 
@@ -81,14 +86,19 @@ def show(findings: Sequence[Finding], console: Console) -> None:
 def main() -> None:
     """Check, print, and exit with 1 if the deployment would fail."""
     asked = options(sys.argv[1:])
+    given = context(asked.context)
     try:
-        settings = Settings.read(context(asked.context).get)
+        clients = Cloud(namespace=Settings.read(given.get).namespace, profile=asked.profile)
+        answers = derive(clients, given)
+        settings = Settings.read({**given, **answers}.get)
     except SettingsError as error:
         sys.exit(f"preflight: {error}")
-    findings = look(Cloud(namespace=settings.namespace, profile=asked.profile), settings)
+    findings = look(clients, settings)
     if asked.json:
         sys.stdout.write(json.dumps(as_json(findings), indent=2) + "\n")
     else:
-        show(findings, Console())
+        show(findings, Console(file=sys.stderr if asked.derive else sys.stdout))
+    if asked.derive:
+        sys.stdout.write(" ".join(f"-c {key}={value}" for key, value in answers.items()) + "\n")
     if stopped(findings):
         sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys anyway")

@@ -13,6 +13,7 @@ from iort_contract.limits import ContractError
 from iort_contract.topics import check_namespace
 from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
 from stacks.parts.states import states
+from stacks.settings import AtOnce
 from tests.stacks.cloudformation import has_schema, names, schema
 from tests.stacks.templates import name
 
@@ -206,7 +207,7 @@ def test_a_drive_that_fails_as_slowly_as_it_can_is_still_a_finding(synthesized) 
     functions = synthesized.resources("AWS::Lambda::Function", "analysis").items()
     (timeout_s,) = [one["Timeout"] for key, one in functions if name(key) == "Analyse"]
     arns = dict.fromkeys(("Plan", "Analyse", "Evaluate", "Present"), "arn")
-    machine = states("aws", arns, bucket="files", at_once=(1, 1))
+    machine = states("aws", arns, bucket="files", at_once=AtOnce(2, 1, 1))
     retries = machine["States"]["Drives"]["ItemProcessor"]["States"]["Analyse"]["Retry"]
     (failing,) = [one for one in retries if one["ErrorEquals"] == ["States.ALL"]]
     pauses_s = sum(

@@ -11,9 +11,10 @@ from botocore.exceptions import NoCredentialsError
 from iort_station.cli.console import Console
 from iort_station.errors import StationError
 from stacks.settings import Settings, SettingsError
-from tests.unit.verify.account import NEW, Account, Refused, denied, settings
+from tests.unit.verify.account import NEW, Account, Refused, denied, limits, settings
 from verify.preflight import account
 from verify.preflight import command as preflight
+from verify.preflight.derived import derive
 from verify.preflight.finding import Verdict
 
 WARNING, STOPS = Verdict.WARNING, Verdict.STOPS
@@ -112,3 +113,31 @@ def test_the_cdks_arguments_are_read_as_app_py_reads_them(tmp_path):
     assert (made.stage, made.budget_usd, made.alarm_email) == ("prod", 50, "a@b.org")
     with pytest.raises(SettingsError, match="stage must be"):
         Settings.read(preflight.context(["stage=test"]).get)
+
+
+@pytest.mark.parametrize(
+    ("given", "answer", "derived"),
+    [
+        ({}, limits(10, 10), {"account_concurrency": "10"}),
+        ({}, limits(), {"account_concurrency": "1000"}),
+        ({"account_concurrency": "50"}, limits(), {}),
+        # The item about it says what is missing; the deployment has the limits of a new account.
+        ({}, denied("lambda:GetAccountSettings"), {}),
+    ],
+)
+def test_what_is_not_given_follows_from_the_account(tmp_path, given, answer, derived):
+    layers = {"layer": tmp_path, "analysis_layer": tmp_path}
+    assert derive(Account(GetAccountSettings=answer), {**given, **layers}) == derived
+
+
+def test_a_deployment_gets_what_the_account_decides(tmp_path, monkeypatch, capsys):
+    """The findings do not come between the CDK's arguments."""
+    monkeypatch.setattr(preflight, "Cloud", lambda **_: Account(GetAccountSettings=limits()))
+    context = [f"--context={key}={tmp_path}" for key in ("layer", "analysis_layer")]
+    monkeypatch.setattr(sys, "argv", ["preflight", "--derive", *context])
+
+    preflight.main()
+
+    printed = capsys.readouterr()
+    assert printed.out == "-c account_concurrency=1000\n"
+    assert "1000 concurrent executions" in printed.err

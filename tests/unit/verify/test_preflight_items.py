@@ -73,21 +73,21 @@ CASES = [
     ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 concurrent executions"),
     (
         "concurrency",
-        {"stage": "prod"},
+        {"stage": "prod", "account_concurrency": 105},
         {"GetAccountSettings": limits(105, 105)},
         FINE,
         "5 are to be reserved",
     ),
     (
         "concurrency",
-        {"stage": "prod"},
+        {"stage": "prod", "account_concurrency": 105},
         {"GetAccountSettings": limits(104, 104)},
         STOPS,
         "requires 100 unreserved",
     ),
     (
         "concurrency",
-        {"stage": "prod"},
+        {"stage": "prod", "account_concurrency": 105},
         {
             "GetAccountSettings": limits(105, 100),
             "GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5},
@@ -95,6 +95,13 @@ CASES = [
         | stack_answers(ALL, resources={"processing": [LIVE]}),
         FINE,
         "100 of them unreserved",
+    ),
+    (
+        "concurrency",
+        {"stage": "prod", "account_concurrency": 104},
+        {"GetAccountSettings": limits(104, 104)},
+        FINE,
+        "0 are to be reserved",
     ),
     ("cloudfront", {}, {"ListDistributions": denied("cloudfront:ListDistributions")}, FINE, "not wanted"),
     ("cloudfront", {"site": True}, {}, WARNING, "cannot be read"),
