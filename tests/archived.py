@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
@@ -11,7 +13,7 @@ from botocore.exceptions import ClientError
 
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import write_day, write_hour
-from iort_contract.archive import ArchivedHour, Hour, day_key, hour_key, hour_of, refused_key
+from iort_contract.archive import ArchivedHour, Hour, archived_hour, day_key, hour_key, hour_of, refused_key
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import parse_topic
 from tests.fakes import ARCHIVE, SUMMARY, TELEMETRY, FakeDynamoDB
@@ -61,7 +63,7 @@ def archive(table: FakeDynamoDB, bucket: FakeS3, *, expires_s: int = PAST_S) -> 
             samples=done.samples,
             refused=sum(done.refused.values()),
             content=done.content,
-            sha256="",
+            sha256=hashlib.sha256(into.getvalue()).hexdigest(),
             size_bytes=len(into.getvalue()),
             archived_ms=1,
             first_expires_s=expires_s,
@@ -83,8 +85,9 @@ def compact(table: FakeDynamoDB, bucket: FakeS3) -> None:
         key = day_key(topic, min(hours))
         bucket.objects[key] = into.getvalue()
         for item in day:
-            size = {"N": str(len(into.getvalue()))}
-            table.put(ARCHIVE, item | {"key": {"S": key}, "size_bytes": size})
+            row = archived_hour(item)
+            sha256, size = hashlib.sha256(into.getvalue()).hexdigest(), len(into.getvalue())
+            table.put(ARCHIVE, replace(row, key=key, sha256=sha256, size_bytes=size).item())
 
 
 def expire(table: FakeDynamoDB, *, every: Callable[[int], bool] = lambda _number: True) -> None:

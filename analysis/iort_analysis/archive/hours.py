@@ -47,7 +47,7 @@ _AT_ONCE_BYTES = 8_000_000
 _END_BYTES = 256 * 1024
 _GONE = frozenset({"404", "NoSuchKey", "412", "PreconditionFailed"})
 # What reading a damaged file raises: pyarrow's errors are of these. Those of the network are none of them.
-_DAMAGED = (
+DAMAGED = (
     ArithmeticError,
     AttributeError,
     EOFError,
@@ -108,12 +108,12 @@ class Archive:
             try:
                 return use(HourFile(self._stores, row))
             except Exception as error:  # noqa: PERF203 - it is tried twice, whatever S3's client is
-                if not isinstance(error, _DAMAGED) and _code(error) not in _GONE:
+                if not isinstance(error, DAMAGED) and _code(error) not in _GONE:
                     raise
                 problem = error
                 hour = parse_hour(row.hour)
                 row = next(self.rows(hour.start_us, hour.start_us), row)
-        what = "is damaged" if isinstance(problem, _DAMAGED) else "is missing"
+        what = "is damaged" if isinstance(problem, DAMAGED) else "is missing"
         raise ArchiveError(
             f"the archive's {row.key or row.hour} of {self._topic} {what}: run `iort archive verify`"
         ) from problem

@@ -44,13 +44,14 @@ class StoredFile:
 
 
 def listed(
-    cloud: Cloud, robot: str, *, start_us: int | None = None, end_us: int | None = None
+    cloud: Cloud, robot: str | None, *, start_us: int | None = None, end_us: int | None = None
 ) -> Iterator[StoredFile]:
-    """A robot's files that it last wrote in the range, in order of time. The end is exclusive.
+    """A robot's files that it last wrote in the range, in order of time. The end is exclusive. None gives the
+    files of all robots, also of removed ones, and has no range.
 
     Raises `UsageError` for an invalid name.
     """
-    prefix = f"{FILES_PREFIX}{registry.checked(robot)}/"
+    prefix = FILES_PREFIX if robot is None else f"{FILES_PREFIX}{registry.checked(robot)}/"
     # The key begins with the time, so only the range is listed.
     after = prefix if start_us is None else prefix + _day(start_us)
     pages = cloud.client("s3").get_paginator("list_objects_v2")
@@ -110,6 +111,22 @@ def download(
         raise StationError(f"{file.key}: SHA-256 must be {said}, got {digest.hexdigest()}")
     part.replace(path)
     return path
+
+
+def damage(cloud: Cloud, file: StoredFile, progress: CountProgress = lambda _bytes: None) -> str:
+    """Read a file; returns why it is not the one that the robot sent, empty if it is."""
+    digest = hashlib.sha256()
+    try:
+        answer = cloud.client("s3").get_object(Bucket=_bucket(cloud), Key=file.key)
+    except ClientError as error:
+        return f"cannot be read: {error.response['Error']['Code']}"
+    for chunk in _chunks(answer["Body"], file.key):
+        digest.update(chunk)
+        progress(len(chunk))
+    said = answer["Metadata"].get("sha256")
+    return (
+        f"SHA-256 must be {said}, got {digest.hexdigest()}" if said not in {None, digest.hexdigest()} else ""
+    )
 
 
 def content(cloud: Cloud, key: str) -> bytes | None:

@@ -5,34 +5,38 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import groupby, islice
 from typing import Literal
 
 from botocore.exceptions import ClientError
 
+from iort_analysis.archive.hours import DAMAGED, Archive, key_of
 from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.samples.batches import Item, RefusedItems, part
 from iort_contract.archive import (
     ALL,
     HOUR_REST_MS,
     HOUR_US,
+    PENDING,
     SWEEP,
     TASK,
     ArchivedHour,
+    Hour,
     content_hash,
+    hour_of,
     item_hash,
     parse_hour,
     refused_key,
-    stored_hours,
 )
-from iort_contract.dynamodb import starting_between
-from iort_contract.tables import BATCH, SAMPLES, TOPIC
+from iort_contract.tables import TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.stored.batches import telemetry_table, topic_of
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data.stored.recorded import stores
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 
@@ -40,15 +44,24 @@ from iort_station.fleet import registry
 _DUE_US = 2 * HOUR_US
 # A task takes at most ten minutes.
 _STALLED_S, _POLL_S = 660.0, 1.0
+# So many items are decoded together.
+_TOGETHER = 200
 
 
 @dataclass
 class Verified:
-    """A stream's archive: its hours and samples, and by hour what is wrong."""
+    """What a stream has stored: its archive's hours and samples, and the ``items`` of its table.
+
+    By hour, ``lacking`` has the number of batches that are not archived, though they should be, and
+    ``damaged`` what is wrong with what is. ``refused`` counts and names what no reader can decode.
+    """
 
     hours: int = 0
     samples: int = 0
-    problems: dict[str, str] = field(default_factory=dict)
+    items: int = 0
+    lacking: dict[str, int] = field(default_factory=dict)
+    damaged: dict[str, str] = field(default_factory=dict)
+    refused: RefusedItems = field(default_factory=RefusedItems)
 
 
 def topics(cloud: Cloud, robot: str | None, stream: str | None) -> list[str]:
@@ -59,6 +72,20 @@ def topics(cloud: Cloud, robot: str | None, stream: str | None) -> list[str]:
         for one in robots
         for name in ([stream] if stream else inventory.known(cloud, one))
     ]
+
+
+def archived_topics(cloud: Cloud) -> set[str]:
+    """The topics in the manifest, also those of robots that were removed."""
+    pages = (
+        cloud.client("dynamodb")
+        .get_paginator("scan")
+        .paginate(
+            TableName=cloud.output("storage", "ArchiveTable"),
+            ProjectionExpression="#topic",
+            ExpressionAttributeNames={"#topic": TOPIC},
+        )
+    )
+    return {item[TOPIC]["S"] for page in pages for item in page["Items"]} - set(PENDING)
 
 
 def run(cloud: Cloud, topic: str) -> int:
@@ -93,31 +120,78 @@ def wait(cloud: Cloud, progress: Callable[[int], None]) -> None:
             time.sleep(_POLL_S)
 
 
-def verify(cloud: Cloud, topic: str) -> Verified:
-    """Compare a stream's table, manifest and objects; everything in the archive is read."""
-    found = Verified()
-    table = telemetry_table(cloud)
+def verify(cloud: Cloud, topic: str, progress: Callable[[int], None] = lambda _items: None) -> Verified:
+    """Read and decode all that is stored of a stream, and compare its table, manifest and objects.
+
+    ``progress`` gets the number of further items read.
+    """
+    found = Verified(refused=RefusedItems(topic))
     objects = _Objects(cloud)
-    archived = {row.hour: row for row in archive_of(cloud, topic).rows()}
-    until_us = time.time_ns() // 1000 - HOUR_REST_MS * 1000
-    stored = [str(hour) for hour in stored_hours(table, topic, until_us)]
-    for name in sorted({*archived, *stored}):
-        hour, known = parse_hour(name), dict[str, str]()
-        if (row := archived.get(name)) is not None:
-            found.hours += 1
-            found.samples += row.samples
-            try:
-                known = objects.hashes(row)
-            except StationError as error:
-                found.problems[name] = str(error)
-                continue
-        if name in stored:
-            keys = starting_between(hour.start_us, hour.end_us - 1)
-            items = (item for page in table.pages(topic, keys) for item in page.items)
-            missing = sum(known.get(item[BATCH]["S"]) != item_hash(item) for item in items)
-            if missing and hour.end_us + _DUE_US < until_us:
-                found.problems[name] = f"{missing} batches are not archived"
+    rows = {row.hour: row for row in Archive(stores(cloud), topic, found.refused).rows()}
+    due_us = time.time_ns() // 1000 - HOUR_REST_MS * 1000 - _DUE_US
+    pages = telemetry_table(cloud).pages(topic)
+    for hour, items in groupby((item for page in pages for item in page.items), key=_hour_of):
+        archived = _archived(objects, rows.pop(str(hour), None), found, progress)
+        there: set[str] = set()
+        lacking, other = 0, list[str]()
+        while some := list(islice(items, _TOGETHER)):
+            part(some, found.refused)
+            for item in some:
+                key = key_of(item)
+                there.add(key)
+                if archived is not None:
+                    lacking += key not in archived.hashes
+                    if archived.hashes.get(key) not in {None, item_hash(dict(item))}:
+                        other.append(key)
+            found.items += len(some)
+            progress(len(some))
+        if hour is not None and hour.end_us < due_us and lacking:
+            found.lacking[str(hour)] = lacking
+        if other:
+            found.damaged[str(hour)] = (
+                f"{len(other)} batches in the table are not as they were archived; the first is {other[0]}"
+            )
+        _refused(archived, there, found)
+    for row in rows.values():
+        _refused(_archived(objects, row, found, progress), set(), found)
     return found
+
+
+def _hour_of(item: Item) -> Hour | None:
+    """The hour of an item's key; None if a key begins with no time, which the archive passes over."""
+    start = key_of(item)[:16]
+    return hour_of(int(start)) if len(start) == 16 and start.isascii() and start.isdigit() else None
+
+
+@dataclass
+class _Archived:
+    """What the archive has of an hour: the hashes of its items by their ids, and what was no batch."""
+
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    refused: Sequence[Item] = ()
+
+
+def _archived(
+    objects: _Objects, row: ArchivedHour | None, found: Verified, progress: Callable[[int], None]
+) -> _Archived | None:
+    """None if the hour's object is not what the manifest says, which is said then."""
+    if row is None:
+        return _Archived()
+    found.hours += 1
+    found.samples += row.samples
+    try:
+        return objects.archived(row)
+    except StationError as error:
+        found.damaged[row.hour] = str(error)
+        return None
+    finally:
+        progress(row.batches + row.refused)
+
+
+def _refused(archived: _Archived | None, there: set[str], found: Verified) -> None:
+    """Name what was archived without being a batch, and is not in the table any more."""
+    if archived is not None:
+        part([item for item in archived.refused if key_of(item) not in there], found.refused)
 
 
 class _Objects:
@@ -127,22 +201,30 @@ class _Objects:
         self._client, self._bucket = cloud.client("s3"), cloud.output("storage", "FilesBucket")
         self._file = lru_cache(maxsize=1)(self._read)
 
-    def hashes(self, row: ArchivedHour) -> dict[str, str]:
-        """The hashes of an hour's items by their ids; raises `StationError` if the row says otherwise."""
+    def archived(self, row: ArchivedHour) -> _Archived:
+        """Decode an hour; raises `StationError` if it is damaged, or is not what the row says."""
+        what = row.key or row.hour
+        try:
+            return self._decoded(row, what)
+        except DAMAGED as error:
+            raise StationError(f"{what} is damaged: {error}") from error
+
+    def _decoded(self, row: ArchivedHour, what: str) -> _Archived:
         hour = parse_hour(row.hour)
         hashes: dict[str, str] = {}
-        samples = 0
+        samples, refused = 0, list[Item]()
         if row.key:
             file = self._file(row.key, row.sha256)
             hashes = dict(file.hashes(hour))
-            samples = sum(int(item[SAMPLES]["N"]) for item in file.headers(hour))
+            samples = sum(len(one.block.times_us) for one in file.pages(hour))
         counts = (len(hashes), samples)
         if row.refused:
             lines = self._get(refused_key(parse_topic(row.topic), hour)).splitlines()
-            hashes.update({item[BATCH]["S"]: item_hash(item) for item in map(json.loads, lines)})
+            refused = [json.loads(line) for line in lines]
+            hashes.update({key_of(item): item_hash(dict(item)) for item in refused})
         if content_hash(sorted(hashes.items())) != row.content or counts != (row.batches, row.samples):
-            raise StationError(f"{row.key or row.hour} does not hold what the manifest says")
-        return hashes
+            raise StationError(f"{what} does not hold what the manifest says")
+        return _Archived(hashes, refused)
 
     def _read(self, key: str, sha256: str) -> ArchiveFile:
         content = self._get(key)

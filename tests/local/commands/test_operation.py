@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCServer
@@ -17,6 +18,8 @@ import pytest
 from iort_agent.sources import OK, Finding
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
+from iort_contract.messages.requests.files import File, file_key
+from iort_station.data.stored.batches import topic_of
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until
@@ -88,6 +91,38 @@ def test_the_doctor_of_a_cloud_that_is_thrown_away(iort):
     assert found["machine"]["level"] == "warn"
     assert "`make up`" in found["machine"]["todo"]
     assert "are connected" in found["robots"]["text"]
+
+
+def test_the_deep_look_names_a_damaged_item_and_a_damaged_file(embedded, bundle, iort):
+    car, cloud = bundle(), embedded.cloud
+    files = {name: File(name, "log", "text/plain", 5, sha256(b"hello").hexdigest(), 1) for name in "ab"}
+    keys = {name: file_key(car.robot, file) for name, file in files.items()}
+    for name, content in (("a", b"hello"), ("b", b"hallo")):
+        where = {"Bucket": cloud.output("storage", "FilesBucket"), "Key": keys[name]}
+        cloud.client("s3").put_object(**where, Body=content, Metadata={"sha256": files[name].sha256})
+    batch = f"{1_750_000_000_000_000}-0badcafe-7"
+    item = {"topic": topic_of(cloud, car.robot, "vesc"), "batch": batch, "codec": "steps", "samples": "x"}
+    cloud.client("dynamodb").put_item(
+        TableName=cloud.output("storage", "TelemetryTable"),
+        Item={name: {"S": text} for name, text in item.items()} | {"v": {"N": "2"}, "n": {"N": "50"}},
+    )
+
+    def failed() -> tuple[int, dict[str, str]]:
+        asked = iort("doctor", "--deep", "--json")
+        lines = [one for one in json.loads(asked.stdout) if one["level"] == "fail"]
+        # Other tests may have damaged what they have stored.
+        return asked.exit_code, {
+            one["what"]: one["text"] for one in lines if one["what"].startswith(f"{car.robot} ")
+        }
+
+    status, found = failed()
+    assert (status, set(found)) == (1, {f"{car.robot} vesc", f"{car.robot} b"})
+    assert f"2025-06-15T15:06:40.000000Z ({batch}): " in found[f"{car.robot} vesc"]
+    assert f"{keys['b']}: SHA-256 must be {files['b'].sha256}" in found[f"{car.robot} b"]
+    key = {name: {"S": item[name]} for name in ("topic", "batch")}
+    cloud.client("dynamodb").delete_item(TableName=cloud.output("storage", "TelemetryTable"), Key=key)
+    cloud.client("s3").delete_object(Bucket=cloud.output("storage", "FilesBucket"), Key=keys["b"])
+    assert failed()[1] == {}
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
 import json
 import random
@@ -33,9 +35,11 @@ from iort_station.operations.delivery import accounts, audit
 from iort_station.page.answers.downloads import downloads
 from iort_station.page.answers.index import answers
 from iort_station.recordings import tabular
+from iort_station.upkeep import deep
+from iort_station.upkeep.finding import FAIL
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
-from tests.fakes import ARCHIVE, TELEMETRY, item_of, item_of_message
+from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_message
 from tests.unit.contract.ros1.ros1_messages import text, u32
 from tests.unit.functions.summary.summarizing import Stream
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
@@ -374,6 +378,111 @@ def test_a_damaged_row_of_the_manifest_is_passed_over_and_named(before):
     found = data.query(cloud, "car", "vesc")
     assert 0 < len(found) < len(data.query(before, "car", "vesc"))
     assert "batches must be an integer, got 'many'" in found.reason
+
+
+def changed(cloud, name, at):
+    """Change a byte of what the batches of some key have stored; returns their keys."""
+    items = cloud.table.items[TELEMETRY]
+    keys = [key for key in sorted(items) if name in key[1]]
+    for key in keys:
+        text = bytearray(base64.b64decode(items[key]["samples"]["S"]))
+        text[at % len(text)] ^= 4
+        items[key] = items[key] | {"samples": {"S": base64.b64encode(bytes(text)).decode()}}
+    return [key[1] for key in keys]
+
+
+@pytest.mark.parametrize("at", [0, 7, 30, -1])
+def test_a_changed_byte_of_a_stored_batch_is_named_by_every_verb(monkeypatch, before, at):
+    cloud = lab()
+    # The item that never was a batch.
+    del cloud.table.items[TELEMETRY][CAR["vesc"], "1700002660000000-0badcafe-9999"]
+    (key,) = changed(cloud, "-0badcafe-100", at)
+    named = f"{CAR['vesc']} at 2023-11-14T22:58:40.000000Z ({key}): "
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _: cloud)
+    audited = CliRunner().invoke(app, ["audit", "car", "--stream", "vesc", "--json"])
+    assert audited.exit_code == 1
+    (stream,) = json.loads(audited.stdout)["streams"]
+    ((reason,), refused) = stream["named"], stream["refused"]
+    assert (reason.startswith(named), refused) == (True, 1)
+    whole = audit.audit("vesc", audit.headers(before, "car", "vesc")).runs[0]
+    run = next(run for run in stream["runs"] if run["boot"] == whole.boot)
+    assert (run["batches"], run["samples"]) == (whole.batches - 1, whole.samples - 10)
+    queried = CliRunner().invoke(app, ["query", "car", "vesc", "--last", "all", "--format", "csv"])
+    assert named in queried.stderr
+    ((what, text),) = deeply(cloud)[0]
+    assert (what, named.removeprefix(f"{CAR['vesc']} ") in text) == ("car vesc", True)
+
+
+def deeply(cloud):
+    """What the doctor's deep look says is damaged, and how many items it has read."""
+    items = []
+    found = deep.of_recordings(cloud, deep.topics(cloud), items.append)
+    return [(one.what, one.text) for one in found if one.level == FAIL], sum(items)
+
+
+def test_the_deep_look_reads_everything_wherever_it_is(cloud):
+    damaged, items = deeply(cloud)
+    ((what, text),) = damaged
+    assert (what, "1700002660000000-0badcafe-9999" in text) == ("car vesc", True)
+    assert items >= len(ITEMS)
+    # Also of a robot that was removed.
+    if cloud.state == "expired":
+        rows, cloud.table.items[ROBOTS] = cloud.table.items[ROBOTS], {}
+        assert deeply(cloud) == (damaged, items)
+        cloud.table.items[ROBOTS] = rows
+
+
+def _no_digest(cloud):
+    key = rows_of(cloud)[1]["key"]["S"]
+    content = cloud.bucket.objects[key]
+    cloud.bucket.objects[key] = content[:200] + bytes([content[200] ^ 1]) + content[201:]
+    return f"{key} is not the object that was written"
+
+
+def _no_object(cloud):
+    key = rows_of(cloud)[1]["key"]["S"]
+    del cloud.bucket.objects[key]
+    return f"{key} cannot be read: NoSuchKey"
+
+
+def _no_parquet(cloud):
+    row = rows_of(cloud)[1]
+    content = cloud.bucket.objects[row["key"]["S"]] = b"PAR1" * 100
+    row["sha256"] = {"S": hashlib.sha256(content).hexdigest()}
+    return f"{row['key']['S']} is damaged: "
+
+
+def _other_count(cloud):
+    rows_of(cloud)[1]["samples"] = {"N": "5"}
+    return "does not hold what the manifest says"
+
+
+def _no_row(cloud):
+    rows_of(cloud)[1]["batches"] = {"S": "many"}
+    return "the archive's row 2023-11-14T23: batches must be an integer"
+
+
+def _no_lines(cloud):
+    (key,) = [key for key in cloud.bucket.objects if key.endswith(".jsonl")]
+    cloud.bucket.objects[key] = b"{\n"
+    return "is damaged: Expecting property name"
+
+
+def _another_byte(cloud):
+    (key,) = changed(cloud, "-0badcafe-100", 20)
+    return f"are not as they were archived; the first is {key}"
+
+
+@pytest.mark.parametrize(
+    "damage", [_no_digest, _no_object, _no_parquet, _other_count, _no_row, _no_lines, _another_byte]
+)
+def test_the_deep_look_names_what_is_damaged_in_the_archive(damage):
+    cloud = later("archived" if damage is _another_byte else "expired")
+    before, _ = deeply(cloud)
+    said = damage(cloud)
+    now, _ = deeply(cloud)
+    assert any(what == "car vesc" and said in text for what, text in now)
+    assert len(now) in {len(before), len(before) + 1, len(before) + 2}
 
 
 @pytest.mark.parametrize("summary", [False, True])

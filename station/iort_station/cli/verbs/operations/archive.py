@@ -97,20 +97,25 @@ def run(
 def verify(
     context: typer.Context, robot: _Robot = None, stream: _Stream = None, as_json: AsJson = False
 ) -> None:
-    """Prove that the archive holds every batch: compare table, manifest and objects. It reads all objects.
+    """Prove that the archive holds every batch: compare table, manifest and objects. All of it is read.
 
-    Fails if anything is missing.
+    Fails if anything is missing. `iort doctor --deep` looks at every stream, and at files.
     """
     cloud = context.obj.cloud()
     wrong, streams = 0, []
     for topic in archive.topics(cloud, robot, stream):
         name, found = parse_topic(topic), archive.verify(cloud, topic)
-        wrong += len(found.problems)
-        if not found.hours and not found.problems:
+        problems = {hour: f"{count} batches are not archived" for hour, count in found.lacking.items()}
+        problems |= found.damaged
+        wrong += len(problems)
+        if not found.hours and not problems:
             continue
-        streams.append({"robot": name.robot, "stream": name.name, **vars(found)})
+        facts = {"hours": found.hours, "samples": found.samples, "problems": problems}
+        facts |= {"refused": found.refused.count, "named": found.refused.named}
+        streams.append({"robot": name.robot, "stream": name.name, **facts})
         lines = [f"{name.robot} {name.name}: {found.hours:,} hours, {found.samples:,} samples"]
-        lines += [f"    {hour}: {problem}" for hour, problem in found.problems.items()]
+        lines += [f"    {hour}: {problem}" for hour, problem in problems.items()]
+        lines += [f"    cannot be decoded: {line}" for line in found.refused.named]
         if not as_json:
             console.out.print("\n".join(map(one_line, lines)), soft_wrap=True, lines=True)
     if as_json:
