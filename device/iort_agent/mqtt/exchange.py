@@ -7,6 +7,7 @@ import uuid
 from typing import Any, Mapping
 
 from iort_agent.errors import IdentityError, RefusedError
+from iort_agent.identity.certificate import check_pair
 from iort_agent.identity.claim import Claim
 from iort_contract.cloud import claim_name, fleet_name
 
@@ -66,6 +67,12 @@ class Exchange:
     """The connection with a claim, open within a `with`."""
 
     def __init__(self, claim: Claim) -> None:
+        """Raises `IdentityError`, which says which of the claim's files does not fit."""
+        try:
+            # The library's own error names no file.
+            check_pair(claim.certificate, claim.private_key)
+        except IdentityError as error:
+            raise IdentityError(f"the claim: {error}") from error
         self._claim = claim
         self._template = fleet_name(claim.namespace)
         self._connection = _Connection(
