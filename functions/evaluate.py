@@ -1,4 +1,4 @@
-"""Evaluate: compares the drives of a run with each robot's earlier ones, and with the fleet's.
+"""Evaluate: compares a robot's drives of a run with its earlier ones, and with other robots'.
 
 The findings go to the bucket, for `present`.
 """
@@ -11,16 +11,15 @@ from itertools import chain
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.analysis.failures import failed_plans, failure
+from functions.shared.analysis.failures import failed_plans, failure, waits
 from functions.shared.analysis.kept import Kept
-from functions.shared.analysis.recordings import robots_of
 from functions.shared.environment import variables
 from iort_analysis.drives.finding import LONGEST_US
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.results import DriveResult, Measured, decode_result
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.catalog.environments import EvaluateEnvironment
-from iort_contract.cloud import drive_prefix, findings_key, plan_key
+from iort_contract.cloud import drive_prefix, findings_key, plan_key, waiting_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import DriveKey, Finding, encode_finding
 from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned, encode_planned
@@ -32,11 +31,10 @@ _NO_ANSWER = {"Cause": "they ended without an answer"}
 
 
 class Drives:
-    """The analysed drives of all robots, up to the end of the run's range."""
+    """The analysed drives of a robot and of ``others``, up to the end of the run's range."""
 
-    def __init__(self, table: FindingsTable, kept: Kept, robots: Sequence[str], end_us: int) -> None:
-        self._table, self._kept, self._robots, self._end_us = table, kept, robots, end_us
-        self._newest = cache(self._read)
+    def __init__(self, table: FindingsTable, kept: Kept, others: Sequence[str], end_us: int) -> None:
+        self._table, self._kept, self._others, self._end_us = table, kept, others, end_us
         self._plan = cache(self._read_plan)
 
     def of_run(self, job: str, robot: str, began_us: int) -> list[DriveResult]:
@@ -103,9 +101,13 @@ class Drives:
         before = self._table.drives(robot, end_us=first_us, most=_OWN)
         return [_measured(one) for one in chain(among, before) if one.drive not in replaced]
 
-    def fleet(self, robot: str) -> list[Measured]:
+    def fleet(self) -> list[Measured]:
         """The newest drives of the other robots."""
-        return [one for other in self._robots if other != robot for one in self._newest(other)]
+        return [
+            _measured(one)
+            for other in self._others
+            for one in self._table.drives(other, end_us=self._end_us, most=_OTHERS)
+        ]
 
     def _read_plan(self, job: str, robot: str) -> list[PlannedDrive] | None:
         """The drives of a robot in a run; None if they could not be found."""
@@ -114,9 +116,6 @@ class Drives:
             if content is not None:
                 return [decode_planned(one) for one in content]
         return None
-
-    def _read(self, robot: str) -> tuple[Measured, ...]:
-        return tuple(_measured(one) for one in self._table.drives(robot, end_us=self._end_us, most=_OTHERS))
 
 
 def evaluated(
@@ -127,7 +126,7 @@ def evaluated(
     if not results:
         return {}, []
     replaced = drives.replaced(job, robot, results)
-    found = evaluate(results, drives.history(robot, results, replaced), drives.fleet(robot))
+    found = evaluate(results, drives.history(robot, results, replaced), drives.fleet())
     of_drives = {result.drive: [one for one in found if one.drive == result.drive] for result in results}
     return of_drives, replaced
 
@@ -139,23 +138,23 @@ def _measured(analysed: AnalysedDrive) -> Measured:
 def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the state Evaluate."""
     given = variables(EvaluateEnvironment)
-    dynamodb, kept = clients.dynamodb(), Kept(clients.s3(), given.files_bucket)
-    drives = Drives(
-        FindingsTable(dynamodb, given.findings_table),
-        kept,
-        robots_of(dynamodb, given.robots_table),
-        event["end_us"],
-    )
-    job, made, gone = event["job"], [], []
-    for robot in event["robots"]:
-        found, replaced = evaluated(drives, job, robot, event["began_us"])
-        made += [
+    job, robot = event["job"], event["robot"]
+    kept = Kept(clients.s3(), given.files_bucket)
+    table = FindingsTable(clients.dynamodb(), given.findings_table)
+    drives = Drives(table, kept, event["others"], event["end_us"])
+    found, replaced = evaluated(drives, job, robot, event["began_us"])
+    of_drives = [*found.items(), *drives.lost(job, robot, found.keys())]
+    waiting = kept.json(waiting_key(job, robot))
+    if waiting is not None:
+        finding = waits(robot, waiting)
+        of_drives.append((finding.drive, [finding]))
+    gone = [*replaced, *drives.made_good(job, robot, event["start_us"], again=event["again"])]
+    content = {
+        "drives": [
             {"drive": vars(drive), "findings": [encode_finding(one) for one in some]}
-            for drive, some in chain(found.items(), drives.lost(job, robot, found.keys()))
-        ]
-        gone += [vars(drive) for drive in replaced]
-        gone += [
-            vars(drive) for drive in drives.made_good(job, robot, event["start_us"], again=event["again"])
-        ]
-    kept.put_json(findings_key(job), {"drives": made, "gone": gone})
-    return {"drives": len(made), "findings": sum(len(one["findings"]) for one in made)}
+            for drive, some in of_drives
+        ],
+        "gone": list(map(vars, gone)),
+    }
+    kept.put_json(findings_key(job, robot), content)
+    return {"drives": len(of_drives), "findings": sum(len(some) for _, some in of_drives)}

@@ -1,24 +1,26 @@
 """Plan: finds the drives to analyse, first step of the state machine `analysis`.
 
-Without a robot it names the robots of the run; with one it writes the robot's drives to the bucket, an item a
-drive.
+Without a robot it writes the run's robots to the bucket, an item a robot; with one the robot's drives, an
+item a drive.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 
 from functions.shared import clients
 from functions.shared.analysis import recordings
-from functions.shared.analysis.failures import failed_plans
+from functions.shared.analysis.failures import NOT_COMPARED, failed_plans
 from functions.shared.analysis.kept import Kept
 from functions.shared.analysis.recordings import Recordings
 from functions.shared.environment import variables
@@ -26,10 +28,10 @@ from iort_analysis.drives.finding import STAND_US, Found, Heard, find
 from iort_analysis.drives.motion import Motion, motion_among
 from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_contract.catalog.environments import PlanEnvironment
-from iort_contract.cloud import plan_key
+from iort_contract.cloud import plan_key, robots_key, waiting_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis.findings import DriveKey, Finding
 from iort_contract.messages.analysis.run import (
     AnalysisRequest,
     PlannedDrive,
@@ -42,14 +44,21 @@ from iort_contract.tables import BATCH
 
 _log = logging.getLogger(__name__)
 _END_US = 2**53
+# A robot is compared with so many others: the whole fleet, up to a size that is read in some megabytes.
+OTHERS = 50
 # A drive may have begun so long before the range.
 _BEFORE_US = tuple(seconds * 1_000_000 for seconds in (120, 1_800, 28_800))
 
 
-def selected(request: AnalysisRequest, recordings: Recordings, job: str, began_us: int) -> dict[str, Any]:
-    """The run with the names of its robots."""
-    robots = list(request.robots) or recordings.robots()
-    return {**encode_request(request), "robots": robots, "job": job, "began_us": began_us}
+def selected(request: AnalysisRequest, fleet: Sequence[str]) -> list[dict[str, Any]]:
+    """The robots of a run, each with those of the ``fleet`` that it is compared with: the next ones by name,
+    around."""
+    items = []
+    for robot in request.robots or fleet:
+        place = bisect_right(fleet, robot)
+        around = chain(fleet[place:], fleet[:place])
+        items.append({"robot": robot, "others": list(islice((o for o in around if o != robot), OTHERS))})
+    return items
 
 
 def planned(robot: str, request: AnalysisRequest, recordings: Recordings) -> list[PlannedDrive]:
@@ -126,31 +135,48 @@ class _Heard:
         return False
 
 
-def unknown_to(table: FindingsTable, drives: list[PlannedDrive]) -> list[PlannedDrive]:
-    """The drives that have not been analysed up to their end."""
+def unknown_to(
+    table: FindingsTable, drives: list[PlannedDrive], failed: Sequence[Finding]
+) -> list[PlannedDrive]:
+    """The drives that have not been analysed up to their end, or whose comparison has ``failed``."""
     if not drives:
         return []
     # Runs at the same time are in the order of their ends.
     starts_us = [one.drive.start_us for one in drives]
     rows = table.drives(drives[0].drive.robot, min(starts_us), max(starts_us) + 1)
     done = {(one.drive, one.end_us) for one in rows}
-    return [one for one in drives if (one.drive, one.end_us) not in done]
+    ranges = [(one.from_us, one.to_us) for one in failed if one.subject == NOT_COMPARED]
+    return [
+        one
+        for one in drives
+        if (one.drive, one.end_us) not in done or any(a <= one.drive.start_us < b for a, b in ranges)
+    ]
 
 
 def handler(event: Mapping[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the states Robots, with an ``input``, and Plan, with a ``robot``."""
     now_us = time.time_ns() // 1000
+    given = variables(PlanEnvironment)
+    kept = Kept(clients.s3(), given.files_bucket)
     if "robot" not in event:
-        request = decode_request(event["input"], now_us)
-        return selected(request, recordings.deployed(), event["job"], now_us)
-    given, request = variables(PlanEnvironment), decode_request(event, now_us)
+        request, job = decode_request(event["input"], now_us), event["job"]
+        robots = selected(request, recordings.deployed().robots())
+        kept.put_json(robots_key(job), robots)
+        return {**encode_request(request), "robots": len(robots), "job": job, "began_us": now_us}
+    request, job = decode_request({**event, "robots": []}, now_us), event["job"]
     robot, table = event["robot"], FindingsTable(clients.dynamodb(), given.findings_table)
     failed = failed_plans(table, robot, request.start_us, request.end_us, again=request.again)
     start_us = min([request.start_us, *(one.from_us for one in failed)])
     drives = planned(robot, replace(request, start_us=start_us), recordings.deployed())
     if not request.again:
-        drives = unknown_to(table, drives)
-    kept = Kept(clients.s3(), given.files_bucket)
-    key = plan_key(event["job"], robot, drives=bool(drives))
+        drives = unknown_to(table, drives, failed)
+    if request.most and len(drives) > request.most:
+        # The first ones: the next run goes on where this one ends.
+        drives.sort(key=lambda one: str(one.drive))
+        rest = drives[request.most :]
+        drives = drives[: request.most]
+        waiting = {"drives": len(rest), "start_us": rest[0].drive.start_us, "end_us": request.end_us}
+        kept.put_json(waiting_key(job, robot), waiting)
+    key = plan_key(job, robot, drives=bool(drives))
     kept.put_json(key, [encode_planned(one) for one in drives])
     return {"drives": len(drives)}

@@ -1,6 +1,6 @@
-"""Present: keeps the findings of a run in their table, and mails the serious ones.
+"""Present: keeps a robot's findings of a run in their table, and mails the serious ones.
 
-The state machine also calls it for a drive that could not be analysed, which becomes a finding too.
+The state machine also calls it for what failed, a drive or a robot's step, which becomes a finding too.
 """
 
 from __future__ import annotations
@@ -83,10 +83,10 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:
     given = variables(PresentEnvironment)
     table = FindingsTable(clients.dynamodb(), given.findings_table)
     if "failed" in event:
-        table.put_finding(failure(event["failed"], event["error"]))
+        table.put_finding(failure(event["failed"], event["error"], event.get("state", "")))
         return {"findings": 1, "mails": 0}
     kept = Kept(clients.s3(), given.files_bucket)
-    content = kept.json(findings_key(event["job"]))
+    content = kept.json(findings_key(event["job"], event["robot"]))
     for drive in (DriveKey(**one) for one in content["gone"]):
         remove(drive, table, kept)
     drives = (

@@ -1,7 +1,7 @@
 """The analysis of drives: the state machine `analysis`, its four functions, and its nightly start.
 
-Robots and Plan find the drives, Drives is a distributed map with one function call for each, Evaluate
-compares them, and Present keeps and mails what was found: docs/explanation/analysis.md.
+Robots and Plans find the drives, Drives analyses each one, and Findings compares a robot's, keeps what was
+found and mails it; all three are distributed maps: docs/explanation/analysis.md.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 from aws_cdk import App, ArnFormat, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_logs as logs
 from aws_cdk import aws_scheduler as scheduler
 from aws_cdk import aws_sns as sns
 from aws_cdk import aws_stepfunctions as stepfunctions
@@ -26,17 +27,18 @@ from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import allow, function
 from stacks.parts.layers import arrays
-from stacks.parts.states import states
+from stacks.parts.states import LONGEST_S, states
 from stacks.settings import Settings
 from stacks.storage import Storage
 
 # Lambda gives a whole core at 1769 MB, and these functions compute. A robot-hour takes two seconds.
 _CORE_MB = 1769
-# A child of the map is an express workflow, which AWS ends after five minutes, without a finding: three
-# attempts, all pauses between them and the finding must fit.
 _ANALYSE_S, _PLAN_S, _EVALUATE_S = 70, 900, 900
 # Every night both days are looked at: a drive that went on at night is analysed whole the next time.
 _NIGHTLY_S = 2 * 86_400
+# Drives of a robot that a night takes; the rest waits for the next one. A car in a lab makes fifty a day.
+# If all of them fail as slowly as they can, that is under six hours of one execution.
+_MOST_DRIVES = 100
 
 
 class Analysis(PlatformStack):
@@ -75,12 +77,10 @@ class Analysis(PlatformStack):
     def _evaluate(self) -> lambda_.Function:
         environment = EvaluateEnvironment(
             namespace=self.settings.namespace,
-            robots_table=self._storage.robots.table_name,
             findings_table=self._storage.findings.table_name,
             files_bucket=self._storage.files.bucket_name,
         )
         evaluate = self._computing("Evaluate", environment, _EVALUATE_S)
-        self._storage.robots.grant(evaluate, "dynamodb:Scan")
         self._storage.findings.grant(evaluate, "dynamodb:Query")
         allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))
         # Without it S3 refuses (403) instead of saying that a robot has no plan, because that failed.
@@ -157,7 +157,19 @@ class Analysis(PlatformStack):
             "Machine",
             role=role,
             definition_body=stepfunctions.DefinitionBody.from_string(json.dumps(definition)),
-            timeout=Duration.hours(12),
+            timeout=Duration.seconds(LONGEST_S),
+            logs=stepfunctions.LogOptions(
+                destination=logs.LogGroup(
+                    self,
+                    "MachineLog",
+                    retention=logs.RetentionDays.ONE_MONTH,
+                    removal_policy=self.settings.removal_policy,
+                    **self.encryption.log,
+                ),
+                # With the errors of every child, and without what it was given.
+                level=stepfunctions.LogLevel.ERROR,
+                include_execution_data=False,
+            ),
         )
         # The map's children are executions of the machine itself, which is made after its role: "IAM policies
         # for using Distributed Map states".
@@ -189,7 +201,7 @@ class Analysis(PlatformStack):
             target=scheduler.CfnSchedule.TargetProperty(
                 arn=self.machine.state_machine_arn,
                 role_arn=role.role_arn,
-                input=json.dumps({"robots": [], "last_s": _NIGHTLY_S}),
+                input=json.dumps({"robots": [], "last_s": _NIGHTLY_S, "most": _MOST_DRIVES}),
             ),
         )
 

@@ -55,6 +55,16 @@ def plan_key(job: str, robot: str, *, drives: bool = True) -> str:
     return f"{PLANS_PREFIX}{job}/{DRIVES if drives else 'none'}/{check_robot(robot)}.json"
 
 
-def findings_key(job: str) -> str:
-    """The key of the findings of a run of the analysis."""
-    return f"{PLANS_PREFIX}{job}/findings.json"
+def robots_key(job: str) -> str:
+    """The key of the robots of a run of the analysis, an item a robot with others to compare it with."""
+    return f"{PLANS_PREFIX}{job}/robots.json"
+
+
+def waiting_key(job: str, robot: str) -> str:
+    """The key of what a run of the analysis leaves of a robot's drives to the next one."""
+    return f"{PLANS_PREFIX}{job}/waiting/{check_robot(robot)}.json"
+
+
+def findings_key(job: str, robot: str) -> str:
+    """The key of a robot's findings in a run of the analysis."""
+    return f"{PLANS_PREFIX}{job}/findings/{check_robot(robot)}.json"

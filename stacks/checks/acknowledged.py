@@ -155,13 +155,15 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{files}/analysis/robot=*"): "it removes the results of drives that others replace",
             **a_run,
         },
-        "analysis/MachineRole/DefaultPolicy": {**a_run},
+        "analysis/MachineRole/DefaultPolicy": {
+            **a_run,
+            wide("*"): "a delivery of logs takes no resource",
+        },
         "analysis/MapPolicy": {
             wide(f"{states}:execution:<MachineNAME>:*"): "Step Functions names the executions of the machine"
         },
         "analysis/Machine": {
-            "AwsSolutions-SF1": "Step Functions keeps an execution's history for 90 days; a log needs a role "
-            "that may change every log's delivery",
+            "AwsSolutions-SF1": "its log has every error; the history of executions stays for 90 days",
             "AwsSolutions-SF2": "as Serverless-LambdaTracing of the functions",
             "Serverless-StepFunctionStateMachineXray": "as AwsSolutions-SF2",
             "W3005": "the CDK writes the dependency, and Step Functions tests the role's policy",

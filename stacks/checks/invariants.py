@@ -13,7 +13,19 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 # Role and action of each statement about every resource, with the reason.
+# "Using CloudWatch Logs to log execution history in Step Functions": a delivery of logs takes no resource.
+LOG_DELIVERY = {
+    f"logs:{action}"
+    for action in (
+        *(f"{verb}LogDelivery" for verb in ("Create", "Delete", "Get", "Update")),
+        "ListLogDeliveries",
+        "PutResourcePolicy",
+        "DescribeResourcePolicies",
+        "DescribeLogGroups",
+    )
+}
 EVERY_RESOURCE = {
+    *(("MachineRole", action) for action in LOG_DELIVERY),
     # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
     ("SummarizeRole", "dynamodb:ListStreams"),
     # "Actions defined by AWS IoT": these have no resource type.

@@ -6,20 +6,28 @@ cloud evaluates no JSONata in a map's ItemSelector: decision 59.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from iort_contract.cloud import DRIVES, PLANS_PREFIX
 from stacks.settings import AtOnce
 
-# The service's own errors, which pass; a new account's functions are throttled for as long as others run.
+# A run takes no longer: a night ends before the next one begins.
+LONGEST_S = 12 * 3600
+# A refused call has failed nothing, so it is repeated until the run ends, and is no failure of its item.
+_MOST_PAUSE_S = 60
+_REFUSED = {
+    "ErrorEquals": ["Lambda.TooManyRequestsException"],
+    "IntervalSeconds": 2,
+    "BackoffRate": 2,
+    "MaxDelaySeconds": _MOST_PAUSE_S,
+    # Pauses are half as long on average. At three events each, a history's 25,000 last far longer.
+    "MaxAttempts": 4 * LONGEST_S // _MOST_PAUSE_S,
+    "JitterStrategy": "FULL",
+}
+# The service's own errors, which pass.
 _PASSING = {
-    "ErrorEquals": [
-        "Lambda.ServiceException",
-        "Lambda.AWSLambdaException",
-        "Lambda.SdkClientException",
-        "Lambda.TooManyRequestsException",
-    ],
+    "ErrorEquals": ["Lambda.ServiceException", "Lambda.AWSLambdaException", "Lambda.SdkClientException"],
     "IntervalSeconds": 2,
     "BackoffRate": 2,
     "MaxAttempts": 5,
@@ -29,8 +37,9 @@ _PASSING = {
 _FAILING = {"ErrorEquals": ["States.ALL"], "IntervalSeconds": 1, "BackoffRate": 3, "MaxAttempts": 2}
 
 # What the functions get of one item.
-_PLAN = {f"{name}.$": f"$.{name}" for name in ("robot", "start_us", "end_us", "again", "job")}
-_ANALYSE = {f"{name}.$": f"$.{name}" for name in ("planned", "job")}
+_PLAN = ("robot", "start_us", "end_us", "again", "most", "job")
+_ANALYSE = ("planned", "job")
+_EVALUATE = ("robot", "others", "start_us", "end_us", "again", "job", "began_us")
 
 
 def states(partition: str, functions: Mapping[str, str], *, bucket: str, at_once: AtOnce) -> dict[str, Any]:
@@ -41,42 +50,79 @@ def states(partition: str, functions: Mapping[str, str], *, bucket: str, at_once
             "Type": "Task",
             "Resource": f"arn:{partition}:states:::lambda:invoke",
             "Parameters": {"FunctionName": functions[function], "Payload": payload},
-            "Retry": [_PASSING, _FAILING],
+            "Retry": [_REFUSED, _PASSING, _FAILING],
             **more,
         }
 
-    def or_failed(name: str, task: Mapping[str, Any], what: str) -> dict[str, Any]:
-        """The states of one item, whose failure becomes a finding, so that the others go on."""
-        # The results of thousands of items would not fit in a state.
-        end = {"ResultPath": None, "OutputPath": None, "End": True}
-        caught = {"ErrorEquals": ["States.ALL"], "ResultPath": "$.error", "Next": "Failed"}
+    def each(label: str, reader: Mapping[str, Any], at_once: int, **item: Any) -> dict[str, Any]:
+        """A distributed map: each item is an execution with a history of its own. What fails in it, even the
+        finding about it, ends no other one."""
         return {
-            "StartAt": name,
-            "States": {
-                name: {**task, "Catch": [caught], **end},
-                "Failed": call("Present", {"failed.$": what, "error.$": "$.error"}, **end),
-            },
+            "Type": "Map",
+            "Label": label,
+            "ItemReader": reader,
+            "MaxConcurrency": at_once,
+            "ToleratedFailurePercentage": 100,
+            **item,
         }
 
-    payload = {"OutputPath": "$.Payload"}
+    def workflow(name: str, what: str, end: Mapping[str, Any], **more: dict[str, Any]) -> dict[str, Any]:
+        """The states of an item, from ``name`` on; if that one fails, ``what`` becomes a finding. They may
+        take as long as the run: AWS ends express executions after five minutes, in silence."""
+        failed = {"failed.$": what, "error.$": "$.error", "state": name}
+        caught = {"ErrorEquals": ["States.ALL"], "ResultPath": "$.error", "Next": "Failed"}
+        first = {**next(iter(more.values())), "Catch": [caught]}
+        return {
+            "ProcessorConfig": {"Mode": "DISTRIBUTED", "ExecutionType": "STANDARD"},
+            "StartAt": name,
+            "States": {**more, name: first, "Failed": call("Present", failed, **end)},
+        }
+
+    def given(names: Sequence[str]) -> dict[str, str]:
+        return {f"{name}.$": f"$.{name}" for name in names}
+
+    def of_robot(names: Sequence[str]) -> dict[str, str]:
+        """The input of an item that is a robot, with its own values before those of the run."""
+        item = {f"{name}.$": f"$$.Map.Item.Value.{name}" for name in ("robot", "others") if name in names}
+        return {**given(names), **item}
+
+    robots = {
+        "Resource": f"arn:{partition}:states:::s3:getObject",
+        "ReaderConfig": {"InputType": "JSON"},
+        "Parameters": {
+            "Bucket": bucket,
+            "Key.$": f"States.Format('{PLANS_PREFIX}{{}}/robots.json', $.job)",
+        },
+    }
     drives = f"States.Format('{PLANS_PREFIX}{{}}/{DRIVES}/', $.job)"
+    # The results of thousands of items would not fit in a state; a number of findings does.
+    nothing = {"ResultPath": None, "OutputPath": None, "End": True}
+    findings = {"OutputPath": "$.Payload.findings", "End": True}
     return {
         "StartAt": "Robots",
         "States": {
-            "Robots": call("Plan", {"input.$": "$", "job.$": "$$.Execution.Name"}, **payload, Next="Plans"),
-            "Plans": {
-                "Type": "Map",
-                "ItemsPath": "$.robots",
-                "ItemSelector": {**_PLAN, "robot.$": "$$.Map.Item.Value"},
-                "MaxConcurrency": at_once.robots,
-                "ItemProcessor": {
-                    "ProcessorConfig": {"Mode": "INLINE"},
-                    **or_failed("Plan", call("Plan", _PLAN), "$"),
-                },
-                "ResultPath": None,
-                "Next": "Listed",
+            "Robots": call(
+                "Plan",
+                {"input.$": "$", "job.$": "$$.Execution.Name"},
+                OutputPath="$.Payload",
+                Next="AnyRobots",
+            ),
+            # AWS documents no map over nothing ("ItemReader (Map)").
+            "AnyRobots": {
+                "Type": "Choice",
+                "Choices": [{"Variable": "$.robots", "NumericGreaterThan": 0, "Next": "Plans"}],
+                "Default": "Nobody",
             },
-            # AWS documents no map over a prefix without objects ("ItemReader (Map)").
+            "Nobody": {"Type": "Pass", "Result": {"findings": []}, "End": True},
+            "Plans": each(
+                "Plans",
+                robots,
+                at_once.robots,
+                ItemSelector=of_robot(_PLAN),
+                ItemProcessor=workflow("Plan", "$", nothing, Plan=call("Plan", given(_PLAN), **nothing)),
+                ResultPath=None,
+                Next="Listed",
+            ),
             "Listed": {
                 "Type": "Task",
                 "Resource": f"arn:{partition}:states:::aws-sdk:s3:listObjectsV2",
@@ -88,39 +134,37 @@ def states(partition: str, functions: Mapping[str, str], *, bucket: str, at_once
             "AnyDrives": {
                 "Type": "Choice",
                 "Choices": [{"Variable": "$.listed.Contents[0]", "IsPresent": True, "Next": "Drives"}],
-                "Default": "Evaluate",
+                "Default": "Findings",
             },
-            "Drives": {
-                "Type": "Map",
-                "Label": "Drives",
-                "ItemReader": {
+            "Drives": each(
+                "Drives",
+                {
                     "Resource": f"arn:{partition}:states:::s3:listObjectsV2",
                     "ReaderConfig": {"InputType": "JSON", "Transformation": "LOAD_AND_FLATTEN"},
-                    "Parameters": {
-                        "Bucket": bucket,
-                        "Prefix.$": drives,
-                    },
+                    "Parameters": {"Bucket": bucket, "Prefix.$": drives},
                 },
-                "ItemSelector": {"planned.$": "$$.Map.Item.Value", "job.$": "$.job"},
-                "MaxConcurrency": at_once.drives,
-                # A drive that fails is a finding; where even that fails, the night goes on.
-                "ToleratedFailurePercentage": 100,
-                "ItemProcessor": {
-                    "ProcessorConfig": {"Mode": "DISTRIBUTED", "ExecutionType": "EXPRESS"},
-                    **or_failed("Analyse", call("Analyse", _ANALYSE), "$.planned"),
-                },
-                "ResultPath": None,
-                "Next": "Evaluate",
-            },
-            "Evaluate": call(
-                "Evaluate",
-                {
-                    f"{name}.$": f"$.{name}"
-                    for name in ("job", "began_us", "robots", "start_us", "end_us", "again")
-                },
+                at_once.drives,
+                ItemSelector={"planned.$": "$$.Map.Item.Value", "job.$": "$.job"},
+                ItemProcessor=workflow(
+                    "Analyse", "$.planned", nothing, Analyse=call("Analyse", given(_ANALYSE), **nothing)
+                ),
                 ResultPath=None,
-                Next="Present",
+                Next="Findings",
             ),
-            "Present": call("Present", {"job.$": "$.job"}, **payload, End=True),
+            "Findings": each(
+                "Findings",
+                robots,
+                at_once.robots,
+                ItemSelector=of_robot(_EVALUATE),
+                ItemProcessor=workflow(
+                    "Evaluate",
+                    "$",
+                    findings,
+                    Evaluate=call("Evaluate", given(_EVALUATE), ResultPath=None, Next="Present"),
+                    Present=call("Present", given(("job", "robot")), **findings),
+                ),
+                ResultSelector={"findings.$": "$"},
+                End=True,
+            ),
         },
     }

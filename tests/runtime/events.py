@@ -53,7 +53,8 @@ def events() -> dict[str, dict[str, Any]]:
         "evaluate": {
             "job": "night",
             "began_us": now_us,
-            "robots": [ROBOT],
+            "robot": ROBOT,
+            "others": [],
             "start_us": 0,
             "end_us": 2**53,
             "again": False,

@@ -29,7 +29,7 @@ ANSWERS: dict[str, tuple[Any, set[str]]] = {
     "alert": (None, {"UpdateItem", "Mail"}),
     "archive": ({}, {"Query"}),
     "echo": (None, {"Topic"}),
-    "evaluate": ({"drives": 0, "findings": 0}, {"Scan", "Object", "Write"}),
+    "evaluate": ({"drives": 0, "findings": 0}, {"Object", "Write"}),
     "later": (None, {"GetItem"}),
     "live": (None, {"GetParameter", "PubNub"}),
     "plan": ({"drives": 0}, {"GetItem", "Query", "Write"}),

@@ -135,8 +135,13 @@ def test_lambda_1_has_reserved_concurrency_only_in_prod(synthesized, production)
 @pytest.mark.parametrize(
     ("account", "queues", "maps", "left"),
     [
-        (10, {"Archive": 2, "Later": 2, "Quarantine": 2}, {"Plans": 1, "Drives": 1}, 3),
-        (1000, {"Archive": 10, "Later": 2, "Quarantine": 2}, {"Plans": 10, "Drives": 40}, 900),
+        (10, {"Archive": 2, "Later": 2, "Quarantine": 2}, {"Plans": 1, "Drives": 1, "Findings": 1}, 3),
+        (
+            1000,
+            {"Archive": 10, "Later": 2, "Quarantine": 2},
+            {"Plans": 10, "Drives": 40, "Findings": 10},
+            900,
+        ),
     ],
 )
 def test_what_nobody_waits_for_leaves_executions_to_what_robots_and_people_wait_for(
@@ -174,7 +179,7 @@ BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present", "Archive"}
 
 def test_functions_share_one_runtime_and_have_logs_with_a_retention(synthesized, functions, reader):
     logs = {name(k): v for k, v in synthesized.resources("AWS::Logs::LogGroup").items()}
-    assert logs.keys() == {f"{noun}Log" for noun in functions}
+    assert logs.keys() == {f"{noun}Log" for noun in functions} | {"MachineLog"}
     assert {v["RetentionInDays"] for v in logs.values()} == {30}
     for noun, function in functions.items():
         assert reader.text(function["LoggingConfig"]["LogGroup"]) == f"{noun}Log"

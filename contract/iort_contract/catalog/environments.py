@@ -142,7 +142,6 @@ class PlanEnvironment(Environment):
 class EvaluateEnvironment(Environment):
     """The function that compares drives with earlier ones, and with the fleet's."""
 
-    robots_table: str
     findings_table: str
     files_bucket: str
 

@@ -1,4 +1,4 @@
-"""Findings about what failed: a drive, or the plan of a robot's range."""
+"""Findings about what failed or waits: a drive, or the plan or the comparison of a robot's range."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, DRIVES_WAIT, KINDS
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding
 
 # A night plans what failed in the nights before it, up to a week.
 _PLANNED_AGAIN_US = 7 * 86_400 * 1_000_000
 _MOST_REASON = 500
+# The subject of a failed comparison, whose drives are analysed again; and the state that compares.
+NOT_COMPARED, COMPARES = "not_compared", "Evaluate"
 
 
 def failed_plans(
@@ -29,20 +31,37 @@ def failed_plans(
     return [one for one in found if one.drive.run == NO_RUN and one.to_us <= end_us]
 
 
-def failure(about: Mapping[str, Any], error: Mapping[str, str]) -> Finding:
-    """The finding about a drive that could not be analysed, or a robot whose drives could not be found."""
-    drive = DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN))
+def failure(about: Mapping[str, Any], error: Mapping[str, str], state: str = "") -> Finding:
+    """The finding about a drive that could not be analysed, or a robot whose drives could not be found or
+    compared, by the ``state`` of the machine that failed."""
     what = "the drive could not be analysed" if "run" in about else "the drives could not be found"
+    if state == COMPARES:
+        what = "the drives could not be compared"
     return Finding(
-        drive=drive,
+        drive=DriveKey(about["robot"], about["start_us"], about.get("run", NO_RUN)),
         kind=ANALYSIS_FAILED,
         severity=KINDS[ANALYSIS_FAILED].severity,
-        subject=ANALYSIS_FAILED,
+        subject=NOT_COMPARED if state == COMPARES else ANALYSIS_FAILED,
         from_us=about["start_us"],
         to_us=about["end_us"],
         stream=about.get("motion", ""),
         fields=(),
         text=f"{what} in three attempts: {_reason(error)}",
+    )
+
+
+def waits(robot: str, waiting: Mapping[str, int]) -> Finding:
+    """The finding about drives that a run has left to the next one, which begins at the first of them."""
+    return Finding(
+        drive=DriveKey(robot, waiting["start_us"], NO_RUN),
+        kind=DRIVES_WAIT,
+        severity=KINDS[DRIVES_WAIT].severity,
+        subject=DRIVES_WAIT,
+        from_us=waiting["start_us"],
+        to_us=waiting["end_us"],
+        stream="",
+        fields=(),
+        text=f"{waiting['drives']:,} drives from here on are more than a run takes, and wait for another",
     )
 
 

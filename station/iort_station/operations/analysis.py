@@ -71,13 +71,21 @@ def look(cloud: Cloud, run: str) -> Progress:
     if state != SUCCEEDED:
         reason = described.get("cause") or described.get("error") or state
         raise StationError(f"the analysis has ended: {state.lower()}: {reason}")
-    return Progress(state, *counts, findings=int(json.loads(described["output"])["findings"]))
+    return Progress(state, *counts, findings=_sum(json.loads(described["output"])["findings"]))
+
+
+def _sum(findings: Any) -> int:
+    """The findings of a run: a number a robot. A robot whose step failed for good may have none."""
+    numbers = findings if isinstance(findings, list) else [findings]
+    return sum(one for one in numbers if isinstance(one, int))
 
 
 def _counts(client: Any, run: str) -> tuple[int | None, int]:
     """The drives of a run, and how many are done."""
-    maps = client.list_map_runs(executionArn=run)["mapRuns"]
-    if not maps:
+    runs = (one["mapRunArn"] for one in client.list_map_runs(executionArn=run)["mapRuns"])
+    # The ARN of a map's run has its label ("Map Run").
+    drives = next((arn for arn in runs if "/Drives:" in arn), None)
+    if drives is None:
         return None, 0
-    counts = client.describe_map_run(mapRunArn=maps[0]["mapRunArn"])["itemCounts"]
+    counts = client.describe_map_run(mapRunArn=drives)["itemCounts"]
     return int(counts["total"]), int(counts["succeeded"] + counts["failed"])

@@ -78,6 +78,7 @@ def test_the_nightly_schedule_analyses_the_fleet(embedded, bundle) -> None:
     assert json.loads(client.describe_execution(executionArn=run)["input"]) == {
         "robots": [],
         "last_s": 2 * 86_400,
+        "most": 100,
     }
     # It raises an error if the run fails.
     *_, last = analysis.watch(cloud, run)
@@ -100,7 +101,7 @@ def test_a_night_without_drives_passes_the_map_by(embedded, bundle, iort) -> Non
     pages = client.get_paginator("get_execution_history").paginate(executionArn=run)
     details = [one.get("stateEnteredEventDetails") for page in pages for one in page["events"]]
     entered = [one["name"] for one in details if one]
-    assert entered.index("AnyDrives") < entered.index("Evaluate")
+    assert entered.index("AnyDrives") < entered.index("Findings")
     assert "Drives" not in entered
 
 

@@ -12,17 +12,14 @@ import pytest
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_namespace
 from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
-from stacks.parts.states import states
+from stacks.parts.states import LONGEST_S, states
 from stacks.settings import AtOnce
 from tests.stacks.cloudformation import has_schema, names, schema
-from tests.stacks.templates import name
 
 # "CloudFormation quotas". The CDK passes every template through S3; a request may hold only 51,200 bytes.
 TEMPLATE_BYTES = 1_000_000
 SECTIONS = {"Resources": 500, "Outputs": 200, "Parameters": 200, "Mappings": 200}
 LOGICAL_ID, EXPORT_NAME, STACK_NAME = 255, 255, r"[A-Za-z][A-Za-z0-9-]{0,127}"
-# "Choosing workflow type in Step Functions": how long an express workflow lasts at most.
-EXPRESS_S = 300
 # "IAM and AWS STS quotas": the policies within a role, white space not counted.
 ROLE_POLICIES_CHARACTERS = 10_240
 
@@ -189,31 +186,62 @@ def test_a_stack_over_a_limit_is_found(stack, template, found):
 
 def test_a_run_without_drives_maps_over_nothing() -> None:
     """ "ItemReader (Map)" says nothing of a prefix without objects."""
-    arns = dict.fromkeys(("Plan", "Analyse", "Evaluate", "Present"), "arn")
-    machine = states("aws", arns, bucket="files", at_once=(1, 1))["States"]
-    assert [key for key, one in machine.items() if '"Next": "Drives"' in json.dumps(one)] == ["AnyDrives"]
-    choice = machine["AnyDrives"]
-    (listing,) = (one for one in machine.values() if one.get("Next") == "AnyDrives")
+    top = machine()
+    assert [key for key, one in top.items() if '"Next": "Drives"' in json.dumps(one)] == ["AnyDrives"]
+    choice = top["AnyDrives"]
+    (listing,) = (one for one in top.values() if one.get("Next") == "AnyDrives")
     assert listing["Resource"] == "arn:aws:states:::aws-sdk:s3:listObjectsV2"
-    reader = machine["Drives"]["ItemReader"]["Parameters"]
+    reader = top["Drives"]["ItemReader"]["Parameters"]
     assert reader.items() <= listing["Parameters"].items()
-    assert choice["Default"] == machine["Drives"]["Next"] == "Evaluate"
+    assert choice["Default"] == top["Drives"]["Next"] == "Findings"
     (rule,) = choice["Choices"]
     assert rule == {"Variable": f"{listing['ResultPath']}.Contents[0]", "IsPresent": True, "Next": "Drives"}
+    # The maps over robots have one.
+    assert top["Robots"]["Next"] == "AnyRobots"
+    assert top["AnyRobots"]["Choices"] == [{"Variable": "$.robots", "NumericGreaterThan": 0, "Next": "Plans"}]
+    assert top[top["AnyRobots"]["Default"]]["Result"] == {"findings": []}
 
 
-def test_a_drive_that_fails_as_slowly_as_it_can_is_still_a_finding(synthesized) -> None:
-    """Express workflows end in silence after five minutes."""
-    functions = synthesized.resources("AWS::Lambda::Function", "analysis").items()
-    (timeout_s,) = [one["Timeout"] for key, one in functions if name(key) == "Analyse"]
+def tasks(states):
+    """All tasks of a machine, also those of its maps' items."""
+    for name_, state in states.items():
+        if state["Type"] == "Task":
+            yield name_, state
+        yield from tasks(state.get("ItemProcessor", {}).get("States", {}))
+
+
+def machine():
     arns = dict.fromkeys(("Plan", "Analyse", "Evaluate", "Present"), "arn")
-    machine = states("aws", arns, bucket="files", at_once=AtOnce(2, 1, 1))
-    retries = machine["States"]["Drives"]["ItemProcessor"]["States"]["Analyse"]["Retry"]
-    (failing,) = [one for one in retries if one["ErrorEquals"] == ["States.ALL"]]
-    pauses_s = sum(
-        one["IntervalSeconds"] * one["BackoffRate"] ** number
-        for one in retries
-        for number in range(one["MaxAttempts"])
-    )
-    # The finding takes a cold start and a write.
-    assert timeout_s * (1 + failing["MaxAttempts"]) + pauses_s + 20 <= EXPRESS_S
+    return states("aws", arns, bucket="files", at_once=AtOnce(2, 1, 1))["States"]
+
+
+def test_a_call_that_lambda_refuses_is_repeated_until_the_run_ends() -> None:
+    """So no catch sees it, and it is no failed drive. Pauses with full jitter are half as long on average."""
+    calls = [(key, task) for key, task in tasks(machine()) if "lambda" in task["Resource"]]
+    assert {key for key, _ in calls} == {"Robots", "Plan", "Analyse", "Evaluate", "Present", "Failed"}
+    for _, task in calls:
+        first = next(
+            one
+            for one in task["Retry"]
+            if {"Lambda.TooManyRequestsException", "States.ALL"} & set(one["ErrorEquals"])
+        )
+        assert first["ErrorEquals"] == ["Lambda.TooManyRequestsException"]
+        assert first["MaxAttempts"] * first["MaxDelaySeconds"] / 2 >= 2 * LONGEST_S
+        # "Step Functions service quotas": an execution ends at 25,000 events, an attempt has three.
+        assert 3 * LONGEST_S / (first["MaxDelaySeconds"] / 2) < 25_000
+        assert first["MaxDelaySeconds"] * 5 < LONGEST_S
+
+
+def test_no_item_of_a_run_ends_another_one() -> None:
+    """Nor do they share a history, a payload, or the five minutes of an express workflow."""
+    maps = {key: state for key, state in machine().items() if state["Type"] == "Map"}
+    assert maps.keys() == {"Plans", "Drives", "Findings"}
+    for state in maps.values():
+        assert state["ItemProcessor"]["ProcessorConfig"] == {
+            "Mode": "DISTRIBUTED",
+            "ExecutionType": "STANDARD",
+        }
+        assert state["ToleratedFailurePercentage"] == 100
+        assert "ItemsPath" not in state
+        first = state["ItemProcessor"]["States"][state["ItemProcessor"]["StartAt"]]
+        assert [(one["ErrorEquals"], one["Next"]) for one in first["Catch"]] == [(["States.ALL"], "Failed")]

@@ -8,7 +8,7 @@ from iort_contract.messages.requests.ask import ASK_FOLDER
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, EXPIRES_S, PRESENCE, PUT_OFF_TO_S, STREAMS, TOPIC
 from iort_contract.topics import SHADOW
-from stacks.checks.invariants import EVERY_RESOURCE
+from stacks.checks.invariants import EVERY_RESOURCE, LOG_DELIVERY
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 STATES = "arn:${AWS::Partition}:states:${AWS::Region}:${AWS::AccountId}"
@@ -256,7 +256,6 @@ ROLES = {
         "lambda.amazonaws.com",
         {(action, "EvaluateLog.Arn") for action in LOG}
         | {
-            ("dynamodb:Scan", "Robots.Arn"),
             ("dynamodb:Query", "Findings.Arn"),
             ("s3:ListBucket", "Files.Arn"),
             ("s3:GetObject", f"Files.Arn/{ANALYSIS_PREFIX}*"),
@@ -273,6 +272,7 @@ ROLES = {
     "MachineRole": (
         "states.amazonaws.com",
         {("lambda:InvokeFunction", f"{name}.Arn") for name in ("Plan", "Analyse", "Evaluate", "Present")}
+        | {(action, "*") for action in LOG_DELIVERY}
         | {
             ("s3:ListBucket", "Files.Arn"),
             ("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"),

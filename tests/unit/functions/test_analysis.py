@@ -6,6 +6,7 @@ import io
 import json
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -21,15 +22,16 @@ from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.archive import ArchivedHour, hour_of
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, SERIOUS
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, DRIVES_WAIT, SERIOUS
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.cloud import drive_prefix, plan_key
+from iort_contract.cloud import PLANS_PREFIX, drive_prefix, plan_key, robots_key
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
 from iort_contract.messages.analysis.run import (
     AnalysedDrive,
+    AnalysisRequest,
     PlannedDrive,
     encode_analysed,
     encode_planned,
@@ -83,17 +85,37 @@ class Deployed:
     def run(self, **asked: object) -> list[dict]:
         """Run the states in order; return the planned drives."""
         request = {"robots": [], "start_us": START_US, "end_us": START_US + 3600 * S, **asked}
-        run = plan.handler({"input": request, "job": JOB}, None)
+        run = self.plan(request)
         drives = []
-        for robot in run["robots"]:
-            number = plan.handler({**run, "robot": robot}, None)["drives"]
-            # The map reads the whole folder, and the note of no drives is not in it.
-            drives += self.json(plan_key(JOB, robot)) if number else []
+        for robot in self.robots():
+            for folder in (True, False):
+                with suppress(self.s3.exceptions.NoSuchKey):
+                    drives += self.json(plan_key(JOB, robot["robot"], drives=folder))
         for drive in drives:
             analyse.handler({"planned": drive, "job": JOB}, None)
-        evaluate.handler(run, None)
-        present.handler({"job": JOB}, None)
+        self.compare(run)
         return drives
+
+    def plan(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Run the states Robots and Plans; return the run."""
+        for folder in ("drives", "none", "waiting"):
+            Kept(self.s3, FILES).remove(f"{PLANS_PREFIX}{JOB}/{folder}/")
+        run = plan.handler({"input": request, "job": JOB}, None)
+        for robot in self.robots():
+            plan.handler({**run, **robot}, None)
+        return run
+
+    def compare(self, run: dict[str, Any]) -> list[dict[str, int]]:
+        """Run the map Findings; return what Evaluate answers for each robot."""
+        answers = []
+        for robot in self.robots():
+            answers.append(evaluate.handler({**run, **robot}, None))
+            present.handler({"job": run["job"], "robot": robot["robot"]}, None)
+        return answers
+
+    def robots(self) -> list[dict[str, Any]]:
+        """The items of the maps over robots."""
+        return self.json(robots_key(JOB))
 
     def json(self, key: str) -> object:
         return json.loads(self.s3.get_object(Bucket=FILES, Key=key)["Body"].read())
@@ -291,9 +313,9 @@ def test_a_worn_part_is_found_against_earlier_drives(cloud: Deployed) -> None:
     kept.put_json(plan_key(JOB, CAR), [encode_planned(planned)])
     kept.put_json(f"{drive_prefix(worn.drive)}result.json", encode_result(result))
 
-    run = {"job": JOB, "began_us": time.time_ns() // 1000, "robots": [CAR], "again": False}
+    run = {"job": JOB, "robot": CAR, "others": [], "began_us": time.time_ns() // 1000, "again": False}
     evaluate.handler({**run, "start_us": START_US, "end_us": START_US + 1}, None)
-    present.handler({"job": JOB}, None)
+    present.handler({"job": JOB, "robot": CAR}, None)
 
     (found,) = cloud.table.findings(CAR)
     assert (found.kind, found.drive) == ("battery_worn", worn.drive)
@@ -393,14 +415,10 @@ def test_a_drive_that_ends_without_an_answer_is_a_finding_too(cloud: Deployed) -
     """Its workflow took too long, or could not write the finding."""
     cloud.register(CAR)
     cloud.record(streams(30))
-    run = plan.handler(
-        {"input": {"robots": [], "start_us": START_US, "end_us": START_US + S}, "job": JOB}, None
-    )
-    plan.handler({**run, "robot": CAR}, None)
+    run = cloud.plan({"robots": [], "start_us": START_US, "end_us": START_US + S})
     cloud.table.put_finding(finding())
 
-    evaluate.handler(run, None)
-    present.handler({"job": JOB}, None)
+    cloud.compare(run)
 
     failed, earlier = sorted(cloud.table.findings(CAR), key=lambda one: one.kind)
     assert failed.text == "the drive could not be analysed in three attempts: they ended without an answer"
@@ -412,17 +430,65 @@ def test_two_runs_at_the_same_time_both_have_the_drive(cloud: Deployed) -> None:
     cloud.register(CAR)
     cloud.record(streams(30))
     request = {"robots": [], "start_us": START_US, "end_us": START_US + S, "again": True}
-    run = plan.handler({"input": request, "job": JOB}, None)
-    plan.handler({**run, "robot": CAR}, None)
+    run = cloud.plan(request)
     (drive,) = cloud.json(plan_key(JOB, CAR))
     for job in (JOB, "the other"):
         analyse.handler({"planned": drive, "job": job}, None)
 
-    assert evaluate.handler(run, None) == {"drives": 1, "findings": 0}
+    assert cloud.compare(run) == [{"drives": 1, "findings": 0}]
     # A result from before the run is no answer of it.
     late = {**run, "job": "late", "began_us": time.time_ns() // 1000}
     plan.handler({**late, "robot": CAR}, None)
-    assert evaluate.handler(late, None) == {"drives": 1, "findings": 1}
+    assert evaluate.handler({**late, "robot": CAR, "others": []}, None) == {"drives": 1, "findings": 1}
+
+
+def test_a_robot_that_invents_drives_has_so_many_a_night_and_loses_none(cloud: Deployed) -> None:
+    """Each run of the agent is a drive, and its name is the robot's choice."""
+    cloud.register(CAR)
+    cloud.register("other")
+    cloud.record({"vesc": streams(20)["vesc"]}, robot="other")
+    for number in range(5):
+        cloud.record(later({"vesc": streams(20)["vesc"]}, number * 30), run=f"{number:08x}")
+
+    for done, left in ((2, 3), (4, 1)):
+        cloud.run(most=2)
+        assert len(list(cloud.table.drives(CAR))) == done
+        (waits,) = [one for one in cloud.table.findings(CAR) if one.kind == DRIVES_WAIT]
+        assert waits.text == f"{left} drives from here on are more than a run takes, and wait for another"
+        assert waits.from_us == START_US + done * 30 * S
+    assert len(list(cloud.table.drives("other"))) == 1
+    # The range of a later night begins after the last of them.
+    cloud.run(most=2, start_us=START_US + 3000 * S)
+
+    assert len(list(cloud.table.drives(CAR))) == 5
+    assert list(cloud.table.findings(CAR)) == []
+
+
+def test_drives_that_could_not_be_compared_are_compared_in_the_next_night(cloud: Deployed) -> None:
+    """They are analysed already, so they count as new once more."""
+    cloud.register(CAR)
+    cloud.record(streams(30))
+    (drive,) = cloud.run()
+    failed = {"robot": CAR, "others": [], "start_us": START_US, "end_us": START_US + 60 * S}
+    present.handler({"failed": failed, "error": {"Cause": "no answer"}, "state": "Evaluate"}, None)
+    (found,) = cloud.table.findings(CAR)
+    assert found.text == "the drives could not be compared in three attempts: no answer"
+
+    assert cloud.run() == [drive]
+    assert list(cloud.table.findings(CAR)) == []
+    assert cloud.run() == []
+
+
+def test_a_robot_is_compared_with_some_of_a_large_fleet() -> None:
+    fleet = [f"car{number:04}" for number in range(5000)]
+    night = plan.selected(AnalysisRequest((), 0, 1), fleet)
+
+    assert [one["robot"] for one in night] == fleet
+    assert {len(set(one["others"]) - {one["robot"]}) for one in night} == {plan.OTHERS}
+    assert night[-1]["others"][:2] == ["car0000", "car0001"]
+    # A small fleet is compared as a whole; a robot that was removed is in none.
+    small = plan.selected(AnalysisRequest(("b", "gone"), 0, 1), ["a", "b", "c"])
+    assert [sorted(one["others"]) for one in small] == [["a", "c"], ["a", "b", "c"]]
 
 
 def test_the_next_night_looks_for_the_drives_of_a_failed_plan(cloud: Deployed) -> None:
@@ -567,4 +633,4 @@ def test_the_schedule_asks_for_the_last_days(cloud: Deployed) -> None:
     found = plan.handler({"input": {"robots": [], "last_s": 86_400}, "job": JOB}, None)
 
     assert found["end_us"] - found["start_us"] == 86_400 * S
-    assert found["robots"] == [CAR]
+    assert cloud.robots() == [{"robot": CAR, "others": []}]

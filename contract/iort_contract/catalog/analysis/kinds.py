@@ -7,6 +7,8 @@ from typing import Literal
 
 # The severity that a person gets a mail for, and the kind of a drive that has no result.
 SERIOUS, ANALYSIS_FAILED = "serious", "analysis_failed"
+# The kind of a robot's drives beyond those that a night takes of it.
+DRIVES_WAIT = "drives_wait"
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,13 @@ KINDS = {
             ANALYSIS_FAILED,
             "a drive could not be analysed",
             "the text has the reason; the samples are kept, so `iort analyse` can try it again",
+        ),
+        Kind(
+            DRIVES_WAIT,
+            "a robot has more drives than a night takes of it",
+            "the next nights take the rest, for a week; `iort analyse` takes all at once. A robot that "
+            "begins so many runs restarts all the time, or is not what it says",
+            severity="info",
         ),
     )
 }

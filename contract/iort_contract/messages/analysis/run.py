@@ -16,13 +16,15 @@ from iort_contract.topics import check_robot, check_stream
 class AnalysisRequest:
     """The drives of ``robots`` that begin from ``start_us`` to ``end_us`` (exclusive).
 
-    No robots means all. With ``again`` also those that have been analysed.
+    No robots means all. With ``again`` also those that have been analysed. Of each robot at most ``most``
+    drives are analysed, and the rest waits; 0 is no limit.
     """
 
     robots: tuple[str, ...]
     start_us: int
     end_us: int
     again: bool = False
+    most: int = 0
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ def encode_request(request: AnalysisRequest) -> dict[str, Any]:
         "start_us": request.start_us,
         "end_us": request.end_us,
         "again": request.again,
+        "most": request.most,
     }
 
 
@@ -83,7 +86,10 @@ def decode_request(content: Mapping[str, Any], now_us: int) -> AnalysisRequest:
     again = content.get("again", False)
     if not isinstance(again, bool):
         raise ContractError(f"again must be true or false, got {shown(again)}")
-    return AnalysisRequest(tuple(map(check_robot, robots)), max(0, start_us), end_us, again)
+    most = integer(content, "most") if "most" in content else 0
+    if most < 0:
+        raise ContractError(f"most must be 0 or more, got {most}")
+    return AnalysisRequest(tuple(map(check_robot, robots)), max(0, start_us), end_us, again, most)
 
 
 def encode_planned(planned: PlannedDrive) -> dict[str, Any]:

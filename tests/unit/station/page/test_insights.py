@@ -104,10 +104,10 @@ class StepFunctions:
 
     def describe_execution(self, executionArn):
         assert executionArn.startswith("arn:aws:states:eu-west-1:1:execution:iort-analysis:iort-")
-        return {"status": self.status, "output": '{"findings": 2}', "cause": "the plan has failed"}
+        return {"status": self.status, "output": '{"findings": [0, 2, null]}', "cause": "the plan has failed"}
 
     def list_map_runs(self, **_given):
-        return {"mapRuns": [{"mapRunArn": "map"}]}
+        return {"mapRuns": [{"mapRunArn": f"mapRun:iort/{label}:1"} for label in ("Plans", "Drives")]}
 
     def describe_map_run(self, **_given):
         return {"itemCounts": {"total": 3, "succeeded": 1, "failed": 1}}
