@@ -26,11 +26,12 @@ def write(
     file: Recording,
     *,
     origin: Origin | None = None,
+    refused: RefusedItems | None = None,
     say: Say = lambda _line: None,
     progress: PageProgress = lambda _more, _last_us: None,
 ) -> int:
-    """Write the messages of a selection and return their number; ``say`` takes lines about the result, and
-    ``origin`` grows by what comes from the archive.
+    """Write the messages of a selection and return their number; ``say`` takes lines about the result,
+    ``origin`` grows by what comes from the archive, and ``refused`` counts what cannot be exported.
 
     ROS messages are written as they were published, and those of ROS 2 in its form if ``file`` can hold it.
     Other samples become messages of the type that their source gave, or of their fields.
@@ -56,6 +57,8 @@ def write(
         say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, {form}")
         if name not in known:
             say("  its definition is not stored, so topic, comments and constants are not the publisher's")
+    if refused is not None:
+        refused.count += export.refused.count
     if export.refused.count:
         say(f"{export.refused.count:,} stored items cannot be exported; the first: {export.refused.reason}")
     if export.empty:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+from iort_analysis.samples.batches import RefusedItems
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Result, Selection
@@ -47,7 +48,7 @@ def _table(
     )
     if not len(found):
         raise StationError("no samples in this range")
-    path = folder / _name(selection, suffix)
+    path = folder / _name(selection, suffix, found.refused)
     write(found, path)
     return path
 
@@ -64,11 +65,11 @@ def _parquet(found: Result, path: Path) -> None:
 
 def _mcap(cloud: Cloud, asked: Mapping[str, str], folder: Path) -> Path:
     selection = _selection(asked)
-    path = folder / _name(selection, ".mcap")
+    path, refused = folder / "export.mcap", RefusedItems()
     with recordings.mcap(path) as file:
-        if not export.write(cloud, selection, _Bounded(file)):
+        if not export.write(cloud, selection, _Bounded(file), refused=refused):
             raise StationError("no samples in this range")
-    return path
+    return path.rename(folder / _name(selection, ".mcap", refused.count))
 
 
 class _Bounded:
@@ -97,7 +98,11 @@ def _selection(asked: Mapping[str, str]) -> Selection:
     return data.select(text(asked, "robot"), text(asked, "stream"), start_us, end_us)
 
 
-def _name(selection: Selection, suffix: str) -> str:
-    """car7-vesc-20260504T100000Z.csv: every file system takes it."""
+def _name(selection: Selection, suffix: str, refused: int) -> str:
+    """car7-vesc-20260504T100000Z.csv, or ...Z-2-left-out.csv, which says so wherever it goes.
+
+    Every file system takes these names.
+    """
     start = iso_s(selection.start_us or 0).replace("-", "").replace(":", "")
-    return f"{selection.robot}-{selection.stream}-{start}{suffix}"
+    left_out = f"-{refused}-left-out" if refused else ""
+    return f"{selection.robot}-{selection.stream}-{start}{left_out}{suffix}"

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import random
+from pathlib import Path
 
 import pytest
 from hypothesis import Phase, given, settings
@@ -392,7 +393,7 @@ def changed(cloud, name, at):
 
 
 @pytest.mark.parametrize("at", [0, 7, 30, -1])
-def test_a_changed_byte_of_a_stored_batch_is_named_by_every_verb(monkeypatch, before, at):
+def test_a_changed_byte_of_a_stored_batch_is_named_by_every_verb(monkeypatch, before, at, tmp_path):
     cloud = lab()
     # The item that never was a batch.
     del cloud.table.items[TELEMETRY][CAR["vesc"], "1700002660000000-0badcafe-9999"]
@@ -409,6 +410,10 @@ def test_a_changed_byte_of_a_stored_batch_is_named_by_every_verb(monkeypatch, be
     assert (run["batches"], run["samples"]) == (whole.batches - 1, whole.samples - 10)
     queried = CliRunner().invoke(app, ["query", "car", "vesc", "--last", "all", "--format", "csv"])
     assert named in queried.stderr
+    wanted = {"robot": "car", "stream": "vesc", "from_us": str(START), "to_us": str(START + 3 * HOUR)}
+    for name, download in downloads(cloud).items():
+        path = download(wanted, tmp_path)
+        assert path.name.endswith(f"-1-left-out{Path(name).suffix}")
     ((what, text),) = deeply(cloud)[0]
     assert (what, named.removeprefix(f"{CAR['vesc']} ") in text) == ("car vesc", True)
 
