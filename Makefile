@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed prove-damaged wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -58,9 +58,6 @@ wheels: setup ## build the wheels of contract, agent and station into dist/
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
 	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
-
-prove-damaged: setup ## send damaged stored items through every reader: ITEMS=60000
-	@IORT_MUTATED=$(or $(ITEMS),60000) $(BIN)/python -m pytest -rA -m slow tests/unit/station/test_damaged.py
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
 	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

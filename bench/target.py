@@ -31,6 +31,7 @@ class Target:
     """A deployment, with robots that are registered for the bench and removed after it.
 
     In an account, every name of this run ends with ``run``, so that items of an earlier run are not counted.
+    ``destroy`` takes a deployment down that was made for this run, and returns what is left over of it.
     """
 
     kind: str
@@ -38,6 +39,7 @@ class Target:
     folder: Path
     embedded: EmbeddedCloud | None = None
     run: str = ""
+    destroy: Callable[[], list[str]] | None = None
     _robots: list[str] = field(default_factory=list)
 
     def name(self, base: str) -> str:

@@ -39,7 +39,17 @@ _OF_ITS_OWN = {
     "device_defender": "false",
     "iot_log_level": "off",
     "budget_usd": "0",
+    "drivers": "true",
 }
+# The second deployment: a key of the account's own, and everybody's identity, which the page on the web has.
+CHANGES = {
+    "customer_key": "true",
+    "site": "true",
+    "live_transport": "iot",
+    "site_robots": "verify-public",
+}
+# The page itself is left out: a new account has to wait for its first CloudFront distribution.
+_ALL_BUT_THE_PAGE = "!(site)"
 
 Say = Callable[[str], None]
 
@@ -139,7 +149,8 @@ class Deployment:
                 f"cdk {step}",
                 [
                     *[sys.executable, "scripts/destroy.py"] * (arguments[0] == "destroy"),
-                    *[node, "node_modules/aws-cdk/bin/cdk", arguments[0], "--all", "--no-color"],
+                    *[node, "node_modules/aws-cdk/bin/cdk", arguments[0], "--no-color"],
+                    f"{self._cloud.namespace}-{_ALL_BUT_THE_PAGE}",
                     *arguments[1:],
                     *[part for key, value in context.items() for part in ("-c", f"{key}={value}")],
                 ],

@@ -13,8 +13,8 @@ from verify.errors import CannotAskError
 
 # Prefix of notes beside the answer, such as a version: they are reported, but not compared.
 NOTE = "note_"
-# Phases: the first deployment, and the same after a change to a key of the account's own.
-FIRST, WITH_KEY = "first deployment", "with customer_key"
+# Phases: the first deployment, its change (a key of the account's own, everybody's identity), and its end.
+FIRST, CHANGED, ENDED = "first deployment", "changed deployment", "end of the deployment"
 
 Seen = Mapping[str, Any]
 Ask = Callable[[Target], Seen]
@@ -63,6 +63,7 @@ def question(
     expected: Seen,
     relied_on_by: tuple[str, ...],
     source: str = "",
+    phase: str = FIRST,
     not_embedded: str = "",
 ) -> Callable[[Ask], Question]:
     """Make a question of the function that asks it; the function's docstring is the assumption."""
@@ -75,6 +76,7 @@ def question(
             relied_on_by=relied_on_by,
             ask=ask,
             source=source,
+            phase=phase,
             not_embedded=not_embedded,
         )
 

@@ -3,9 +3,9 @@
     python -m verify.run [--target aws|embedded] [--only rules,files] [--yes] [--out build/verify] [--keep]
 
 It checks the account, prints the costs and asks for confirmation. It creates the stacks under a namespace of
-their own, asks the questions, changes to a key of the account's own, and asks the questions about that. It
-removes everything at the end, also after Ctrl-C. It writes report.json and report.md. Exit status 1 if an
-answer differs, 2 if a question failed or something was left over.
+their own, asks the questions, changes to a key of the account's own and to a page that anybody may see, and
+asks the questions about that. It removes everything at the end, also after Ctrl-C. It writes report.json and
+report.md. Exit status 1 if an answer differs, 2 if a question failed or something was left over.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from local.deployment import ROOT
 from local.errors import LocalError
 from stacks.settings import Settings
 from verify import price, report
-from verify.deployment import Deployment
+from verify.deployment import CHANGES, Deployment
 from verify.errors import VerifyError
 from verify.preflight import command as preflight
-from verify.question import FIRST, WITH_KEY, Answer, Question, Verdict, ask
+from verify.question import CHANGED, ENDED, FIRST, Answer, Question, Verdict, ask
 from verify.questions import ALL
 from verify.questions.messages.live import keys_lent
 
@@ -100,9 +100,12 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                 region = target.cloud.client("iot").meta.region_name
                 # One by one, so that the report has all answers before an interrupt.
                 answers.extend(_asked(options.only, FIRST, target, console))
-                if deployment and any(question.phase == WITH_KEY for question in options.only):
-                    deployment.deploy({"customer_key": "true"})
-                answers.extend(_asked(options.only, WITH_KEY, target, console))
+                if deployment and any(question.phase == CHANGED for question in options.only):
+                    deployment.deploy(CHANGES)
+                answers.extend(_asked(options.only, CHANGED, target, console))
+                if deployment:
+                    target.destroy = deployment.destroy
+                answers.extend(_asked(options.only, ENDED, target, console))
         finally:
             putting_back()
             if deployment:
@@ -165,7 +168,7 @@ def _looked(cloud: Cloud, console: Console) -> list[str]:
 
 def _announced(cloud: Cloud) -> str:
     return (
-        f"This takes about half an hour and costs {price.told(price.estimate())} at the list prices of "
+        f"This takes about an hour and costs {price.told(price.estimate())} at the list prices of "
         f"{AS_OF}. It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with "
         "all their data. A key of the account's own is scheduled for deletion, which AWS does not charge for."
     )

@@ -1,21 +1,26 @@
-"""A bare MQTT 5 client with a robot's certificate; it reports the broker's answers."""
+"""Bare MQTT 5 clients, a robot's and a person's, that report the broker's answers."""
 
 from __future__ import annotations
 
 import queue
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import yaml
-from awscrt import mqtt5
+from awscrt import auth, mqtt5
 from awsiot import mqtt5_client_builder
+from botocore.credentials import ReadOnlyCredentials
 from typing_extensions import Self
 
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE
+from iort_station.cloud import Cloud
 from verify.errors import VerifyError
 from verify.tools.waiting import until
 
@@ -31,33 +36,23 @@ def payload_for(topic: str) -> bytes:
     return STALE if f"{LIVE}/" in topic else b"{}"
 
 
-class Robot:
-    """Connects as `name`, or as another client id, with the bundle of a registered robot.
+class Client:
+    """A client of the broker, by its name for errors.
 
-    With ``paced``, the library respects AWS' quotas of a connection. `reason` is the name of the reason code
-    with which the broker refused or ended the connection; "" if it gave none.
+    ``build`` makes the library's client from the options that all have. `reason` is the name of the reason
+    code with which the broker refused or ended the connection; "" if it gave none.
     """
 
-    def __init__(self, folder: Path, *, client_id: str | None = None, paced: bool = True) -> None:
-        config: dict[str, Any] = yaml.safe_load((folder / "car.yaml").read_text())
-        self.name = config["robot"]
+    def __init__(self, name: str, build: Callable[..., mqtt5.Client]) -> None:
+        self.name = name
         self.messages: queue.Queue[tuple[str, bytes]] = queue.Queue()
         self.connected, self.refused, self.lost = threading.Event(), threading.Event(), threading.Event()
         self.reason = ""
         self._stopped = threading.Event()
-        flow = mqtt5.ExtendedValidationAndFlowControlOptions
-        self._client = mqtt5_client_builder.mtls_from_path(
-            str(folder / "certificate.pem"),
-            str(folder / "private.key"),
-            endpoint=config["endpoint"],
-            port=config["port"],
-            # AWS' own root is in the system's store.
-            ca_filepath=str(folder / config["root_ca"]) if "root_ca" in config else None,
-            client_id=client_id or self.name,
+        self._client = build(
             ack_timeout_sec=60,
             min_reconnect_delay_ms=60_000,
             max_reconnect_delay_ms=60_000,
-            extended_validation_and_flow_control_options=(flow.AWS_IOT_CORE_DEFAULTS if paced else flow.NONE),
             on_publish_received=lambda data: self.messages.put(
                 (data.publish_packet.topic, data.publish_packet.payload)
             ),
@@ -76,7 +71,7 @@ class Robot:
         if not self._stopped.wait(WAIT_S):
             raise VerifyError(f"{self.name}: the client did not stop")
 
-    def online(self) -> Robot:
+    def online(self) -> Self:
         """Wait until the broker has accepted the connection; raises `VerifyError` if it does not."""
         if not self.connected.wait(WAIT_S):
             raise VerifyError(f"{self.name}: the broker did not accept the connection")
@@ -126,6 +121,56 @@ class Robot:
         if packet is not None:
             self.reason = str(packet.reason_code.name)
         what.set()
+
+
+class Robot(Client):
+    """Connects as `name`, or as another client id, with the bundle of a registered robot.
+
+    With ``paced``, the library respects AWS' quotas of a connection.
+    """
+
+    def __init__(self, folder: Path, *, client_id: str | None = None, paced: bool = True) -> None:
+        config: dict[str, Any] = yaml.safe_load((folder / "car.yaml").read_text())
+        flow = mqtt5.ExtendedValidationAndFlowControlOptions
+        super().__init__(
+            config["robot"],
+            partial(
+                mqtt5_client_builder.mtls_from_path,
+                str(folder / "certificate.pem"),
+                str(folder / "private.key"),
+                endpoint=config["endpoint"],
+                port=config["port"],
+                # AWS' own root is in the system's store.
+                ca_filepath=str(folder / config["root_ca"]) if "root_ca" in config else None,
+                client_id=client_id or config["robot"],
+                extended_validation_and_flow_control_options=(
+                    flow.AWS_IOT_CORE_DEFAULTS if paced else flow.NONE
+                ),
+            ),
+        )
+
+
+class Person(Client):
+    """Connects over a signed WebSocket, as a page does, with these credentials of an IAM role."""
+
+    def __init__(self, cloud: Cloud, credentials: ReadOnlyCredentials, client_id: str) -> None:
+        gateway = urlsplit(cloud.endpoint_url or "")
+        where = (
+            {"endpoint": gateway.hostname, "port": gateway.port, "ca_filepath": cloud.ca_bundle}
+            if gateway.hostname
+            else {"endpoint": cloud.mqtt_endpoint}
+        )
+        keys = (credentials.access_key, credentials.secret_key, credentials.token)
+        super().__init__(
+            client_id,
+            partial(
+                mqtt5_client_builder.websockets_with_default_aws_signing,
+                cloud.region_name or "",
+                auth.AwsCredentialsProvider.new_static(*keys),
+                **where,
+                client_id=client_id,
+            ),
+        )
 
 
 def refusal(folder: Path, *, client_id: str | None = None) -> str | None:

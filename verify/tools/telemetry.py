@@ -9,7 +9,9 @@ from typing import Any
 from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import STREAMS
 from iort_contract.topics import RECORD, build_topic, record_topic
+from iort_station.fleet import registry
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
@@ -48,6 +50,15 @@ def items(target: Target, robot: str) -> list[dict[str, Any]]:
         ExpressionAttributeValues={":topic": {"S": topic(target, robot)}},
     )
     return list(answer["Items"])
+
+
+def stored(target: Target, robot: str, batches: int) -> None:
+    """Wait until the table has so many of the robot's batches, and its row names their stream."""
+    until(lambda: len(items(target, robot)) == batches, "the batches in the telemetry table")
+    until(
+        lambda: VESC_STREAM in (registry.find(target.cloud, robot) or {}).get(STREAMS, ()),
+        "the batches' stream in the robot's row",
+    )
 
 
 def listed(target: Target, robot: str) -> list[DeadLetter]:

@@ -21,8 +21,9 @@ from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.page import keys
 from verify import price, report, run
+from verify.deployment import CHANGES
 from verify.errors import VerifyError
-from verify.question import WITH_KEY, Question, Verdict, ask
+from verify.question import CHANGED, ENDED, Question, Verdict, ask
 from verify.questions import ALL
 from verify.questions.messages import live
 
@@ -108,10 +109,10 @@ def test_a_failed_run_is_destroyed_and_its_answers_are_reported(embedded, tmp_pa
                 raise VerifyError("cdk deploy failed")
 
     recorder, first = Failing(), RULES[0]
-    with_key = replace(first, name="a.question", phase=WITH_KEY)
+    with_key = replace(first, name="a.question", phase=CHANGED)
     with pytest.raises(VerifyError, match="cdk deploy failed"):
         run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
-    assert recorder.told == [{}, {"customer_key": "true"}, "destroyed"]
+    assert recorder.told == [{}, CHANGES, "destroyed"]
     assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
 
 
@@ -138,6 +139,16 @@ def test_a_run_lends_pubnub_keys_to_every_question(embedded, tmp_path):
     assert run.run(options(tmp_path, only=(lent,)), cloud, Recorder()) == 0
     with pytest.raises(StationError, match="not stored yet"):
         keys.load(cloud)
+
+
+def test_the_last_questions_may_take_the_deployment_down(embedded, tmp_path):
+    last = replace(
+        question("a.question", {"left": []}, lambda target: {"left": target.destroy()}), phase=ENDED
+    )
+    recorder = Recorder()
+    assert run.run(options(tmp_path, only=(RULES[0], last)), embedded.cloud, recorder) == 0
+    # Once more, for what another run could have left.
+    assert recorder.told == [{}, "destroyed", "destroyed"]
 
 
 class ClosedTerminal(io.StringIO):

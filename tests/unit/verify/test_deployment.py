@@ -10,7 +10,8 @@ from rich.console import Console
 
 from bench.command import wound_up
 from local.errors import LocalError
-from verify.deployment import Deployment
+from stacks.settings import Settings
+from verify.deployment import CHANGES, Deployment
 from verify.preflight.deployed import STACKS
 
 
@@ -70,6 +71,18 @@ def test_remaining_stacks_are_reported_and_the_rest_is_removed(tmp_path):
     one, _ = deployment(account, tmp_path, fails="the stack stays")
     assert one.destroy() == ["stacks: the stack stays"]
     assert account.deleted == ["verify1-verify-policy-3f"]
+
+
+def test_the_second_deployment_has_everybodys_identity_and_no_page(tmp_path):
+    one, commands = deployment(Account(), tmp_path)
+    one.deploy(CHANGES)
+    ((_, command, _),) = commands.said
+    assert "--all" not in command
+    assert "verify1-!(site)" in command
+    given = dict(pair.split("=", 1) for pair in command if "=" in pair)
+    made = Settings(**{name: given[name] for name in ("site", "live_transport", "site_robots", "drivers")})
+    assert made.public
+    assert made.drivers
 
 
 def test_the_options_of_cdk_json_are_overridden(tmp_path):

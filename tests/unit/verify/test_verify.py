@@ -9,8 +9,9 @@ import pytest
 
 from bench.target import AWS, EMBEDDED, Target
 from iort_station.cloud import Cloud
+from iort_station.cost.prices import PRICES
 from local.deployment import ROOT
-from verify import page, report
+from verify import page, price, report
 from verify.errors import CannotAskError, VerifyError
 from verify.question import Question, Verdict, ask
 from verify.questions import ALL
@@ -116,6 +117,12 @@ def test_names_are_unique_and_every_named_file_exists():
         assert relied_on_by
         assert all((ROOT / path).is_file() for path in relied_on_by.split(", ")), name
         assert basis == "assumed" or basis.startswith(("documented: https://", "measured (")), name
+
+
+def test_the_price_names_questions_and_meters():
+    assert price.BESIDE.keys() <= {one.name for one in ALL}
+    assert {meter for used in price.BESIDE.values() for meter in used} <= PRICES.keys()
+    assert price.estimate()["single questions"] > 0
 
 
 def test_every_gap_of_the_emulator_is_an_assumption():

@@ -15,7 +15,7 @@ from iort_contract.messages.page import AlarmEntry
 from iort_contract.topics import LIVE, build_topic
 from iort_station.operations.monitoring import alarms
 from verify.errors import VerifyError
-from verify.question import WITH_KEY, Seen, question
+from verify.question import CHANGED, Seen, question
 from verify.tools.inbox import inbox
 from verify.tools.robot import Robot
 from verify.tools.telemetry import RUN
@@ -127,7 +127,7 @@ set_state_with_key = replace(
     expected={**_NOTIFIED, "topic_has_key": True},
     source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
     relied_on_by=("stacks/parts/encryption.py",),
-    phase=WITH_KEY,
+    phase=CHANGED,
     not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
 )
 

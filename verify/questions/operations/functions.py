@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import json
 import time
+from typing import Any
 
 from bench.target import Target, temporary_function
 from iort_contract.messages.event import rule_event
 from iort_contract.tables import BY_FUNCTION, TOPIC
 from iort_contract.topics import LAMBDA, PING, build_topic
-from verify.errors import VerifyError
+from verify.errors import CannotAskError, VerifyError
 from verify.question import Seen, question
+from verify.tools.logs import lines
 from verify.tools.telemetry import only_entry
+from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256
@@ -22,6 +26,19 @@ _PARAMETERS = {
     "PutObject": ["ChecksumSHA256", "IfNoneMatch"],
     "UploadPart": ["ChecksumSHA256"],
 }
+# AWS keeps so many executions for functions that reserve none.
+_LIMIT, _CALLS, _UNRESERVED = 10, 20, 100
+_EVENT = "verify: an event ran"
+_HOLDING = f"""
+import time
+
+def handler(event, context):
+    if "event" in event:
+        print("{_EVENT}", flush=True)
+    began = time.time()
+    time.sleep(1 if "event" in event else 4)
+    return [began, time.time()]
+"""
 _ENVIRONMENT = ("AWS_LAMBDA_FUNCTION_MEMORY_SIZE", "AWS_LAMBDA_FUNCTION_NAME", "AWS_REGION")
 _RUNTIME = f"""
 import os, sys
@@ -98,6 +115,59 @@ def python(target: Target) -> Seen:
         named = client.get_function_configuration(FunctionName=name)["Runtime"]
         runs = json.loads(client.invoke(FunctionName=name, Payload=b"{}")["Payload"].read())
     return {"runs_as_named": runs == named, "note_python": runs}
+
+
+def _limit(client: Any, name: str) -> None:
+    """Give a function ten executions; a new account has no more for all.
+
+    Raises `CannotAskError` if the account has more than ten, and too few to reserve ten.
+    """
+    account = client.get_account_settings()["AccountLimit"]
+    if account["UnreservedConcurrentExecutions"] >= _UNRESERVED + _LIMIT:
+        client.put_function_concurrency(FunctionName=name, ReservedConcurrentExecutions=_LIMIT)
+    elif account["ConcurrentExecutions"] > _LIMIT:
+        raise CannotAskError(f"no ten of the account's {account['ConcurrentExecutions']} can be reserved")
+
+
+@question(
+    "functions.ten_at_once",
+    expected={"more_than_ten_at_once": False, "throttled": True, "events_run": _CALLS},
+    source=f"{_GUIDE}/lambda-concurrency.html and {_GUIDE}/invocation-async-error-handling.html",
+    relied_on_by=("stacks/settings.py", "stacks/parts/states.py", "stacks/processing.py"),
+)
+def ten_at_once(target: Target) -> Seen:
+    """Of twenty calls at a limit of ten executions, which is a new account's, ten run at once, and the others
+    are refused with 429 (TooManyRequestsException). Twenty events all run: Lambda tries them again."""
+    client, echo = target.cloud.client("lambda"), target.cloud.output("processing", "EchoFunction")
+    since_ms = int(time.time() * 1000)
+
+    def call(name: str) -> tuple[list[float], bool]:
+        """When a call ran, and whether it was refused before, so that botocore tried again."""
+        try:
+            answer = client.invoke(FunctionName=name, Payload=b"{}")
+        except client.exceptions.TooManyRequestsException:
+            return [], True
+        return json.loads(answer["Payload"].read()), answer["ResponseMetadata"]["RetryAttempts"] > 0
+
+    def events() -> int:
+        return sum(_EVENT in line for line in lines(target, echo, since_ms))
+
+    with temporary_function(target, "ten", _HOLDING, memory_mb=128, timeout_s=30) as name:
+        _limit(client, name)
+        with concurrent.futures.ThreadPoolExecutor(_CALLS) as pool:
+            calls = list(pool.map(call, [name] * _CALLS))
+        for _ in range(_CALLS):
+            client.invoke(FunctionName=name, InvocationType="Event", Payload=b'{"event": true}')
+        until(lambda: events() >= _CALLS, "twenty events at a limit of ten", within_s=_WITHIN_S)
+    ran = [times for times, _ in calls if times]
+    most = max(sum(begin <= at < end for begin, end in ran) for at, _ in ran)
+    return {
+        "more_than_ten_at_once": most > _LIMIT,
+        "throttled": any(refused for _, refused in calls),
+        "events_run": events(),
+        "note_most_at_once": most,
+        "note_answered": len(ran),
+    }
 
 
 @question(

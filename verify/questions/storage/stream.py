@@ -8,15 +8,21 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from bench.load.worst_case import worst_batches
 from bench.target import Target, temporary_function
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
+from iort_station.data.stored.batches import summary_table
+from iort_station.fleet.control import shadow
 from iort_station.operations.replay import replay
 from verify.question import Seen, question
+from verify.tools.logs import lines
 from verify.tools.telemetry import batch, entries, items, listed, send, topic
 from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
+# So many at once are beyond a robot's share on every machine.
+_EXPENSIVE = 20
 _COUNT, _POISONED, _REPORTED = 5, 2, 3
 _WITHIN_S = 170.0
 _SAID = "verify: "
@@ -84,14 +90,9 @@ def _read(
 
 def _said(target: Target, like: str, began_ms: int) -> list[Mapping[str, Any]]:
     """The reader's events, in order, by its lines in Lambda 2's log."""
-    configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=like)
-    pages = (
-        target.cloud.client("logs")
-        .get_paginator("filter_log_events")
-        .paginate(logGroupName=configuration["LoggingConfig"]["LogGroup"], startTime=began_ms)
-    )
-    lines = [event["message"].strip() for page in pages for event in page["events"]]
-    return [json.loads(line[len(_SAID) :]) for line in lines if line.startswith(_SAID)]
+    return [
+        json.loads(line[len(_SAID) :]) for line in lines(target, like, began_ms) if line.startswith(_SAID)
+    ]
 
 
 @question(
@@ -141,6 +142,32 @@ def bisected(target: Target) -> Seen:
         "replayed": [outcome.fate.value for outcome in outcomes],
         "left": len(listed(target, robot)),
         "note_events": [event["numbers"] for event in events],
+    }
+
+
+@question(
+    "stream.put_off",
+    expected={"told": True, "stored": _EXPENSIVE, "summarised": _EXPENSIVE},
+    source=f"{_GUIDE}/with-sqs.html and "
+    "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-fair-queues.html",
+    relied_on_by=("functions/later.py", "functions/shared/summary/share.py", "stacks/processing.py"),
+)
+def put_off(target: Target) -> Seen:
+    """Expensive batches of a robot that is over its share of Lambda 2 wait in a queue of their own, in the
+    robot's group. The function later summarises them all, and the robot is told in its shadow."""
+    bundle, cloud = target.robot("verify-put-off"), target.cloud
+    send(target, bundle, *worst_batches(_EXPENSIVE, first_us=int(time.time() - _EXPENSIVE) * 1_000_000))
+    over = until(lambda: shadow.over_share(cloud, bundle.robot), "the notice in the robot's shadow")
+
+    def seconds() -> int:
+        pages = summary_table(cloud).pages(topic(target, bundle.robot))
+        return sum(len(page.items) for page in pages)
+
+    until(lambda: seconds() == _EXPENSIVE, "the seconds of batches that were put off", within_s=600)
+    return {
+        "told": over.batches > 0,
+        "stored": len(items(target, bundle.robot)),
+        "summarised": seconds(),
     }
 
 
