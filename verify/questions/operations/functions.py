@@ -39,6 +39,7 @@ def handler(event, context):
     time.sleep(1 if "event" in event else 4)
     return [began, time.time()]
 """
+_RAISING = "def handler(event, context):\n    raise ValueError('not JSON')\n"
 _ENVIRONMENT = ("AWS_LAMBDA_FUNCTION_MEMORY_SIZE", "AWS_LAMBDA_FUNCTION_NAME", "AWS_REGION")
 _RUNTIME = f"""
 import os, sys
@@ -185,14 +186,22 @@ def ten_at_once(target: Target) -> Seen:
 def failed_invocation(target: Target) -> Seen:
     """A failed asynchronous invocation without retries reaches the destination with its event, the
     function's ARN, the condition RetriesExhausted and the error's message."""
-    # The function echo is invoked asynchronously with a message that is not a ping.
-    bundle, cloud = target.robot("verify-failure"), target.cloud
-    name, message = cloud.output("processing", "EchoFunction"), b"\xff no ping"
-    event = rule_event(
-        message, build_topic(PING, bundle.robot, LAMBDA, cloud.namespace), int(time.time() * 1000)
-    )
-    cloud.client("lambda").invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
-    entry = only_entry(target, bundle.robot, within_s=_WITHIN_S)
+    # No function of ours fails by a message; this one has the destination of one that a rule calls.
+    bundle, client = target.robot("verify-failure"), target.cloud.client("lambda")
+    message = b"\xff no ping"
+    topic = build_topic(PING, bundle.robot, LAMBDA, target.cloud.namespace)
+    event = rule_event(message, topic, int(time.time() * 1000))
+    with temporary_function(target, "raising", _RAISING, memory_mb=128) as name:
+        ours = client.get_function_event_invoke_config(
+            FunctionName=target.cloud.output("processing", "EchoFunction"), Qualifier="$LATEST"
+        )
+        client.put_function_event_invoke_config(
+            FunctionName=name,
+            MaximumRetryAttempts=ours["MaximumRetryAttempts"],
+            DestinationConfig=ours["DestinationConfig"],
+        )
+        client.invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
+        entry = only_entry(target, bundle.robot, within_s=_WITHIN_S)
     return {
         "source": entry.source == f"{BY_FUNCTION} {name}",
         "topic": entry.topic == event[TOPIC],
