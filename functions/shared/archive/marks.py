@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from functions.shared.rate_limiter import RateLimiter
 from iort_contract.archive import (
     DUE_MS,
     FIRST_DUE_MS,
@@ -22,6 +23,7 @@ from iort_contract.archive import (
     parse_pending,
 )
 from iort_contract.dynamodb import Item
+from iort_contract.topics import parse_topic
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # How many hours an environment remembers to have marked.
 _KNOWN = 50_000
+# Marks of a robot: at once, and a day. A car with 200 streams makes 4,800 a day; one that invents hours, by
+# the times of its batches, has no more. The daily sweep finds what has no mark, before it expires.
+MARKS, MARKS_A_DAY = 5_000, 5_000
 
 
 class Marks:
@@ -37,6 +42,7 @@ class Marks:
     def __init__(self, client: DynamoDBClient, table: str) -> None:
         self._client, self._table = client, table
         self._known: dict[Pending, int] = {}
+        self._limiter = RateLimiter(burst=MARKS, a_second=MARKS_A_DAY / 86_400)
 
     def note(self, topic: str, times_us: Iterable[int], now_ms: int) -> None:
         """Mark the hours of batches that start at these times. A mark covers all batches that follow before
@@ -44,10 +50,15 @@ class Marks:
 
         A failure is logged: the next batch tries again, and the daily sweep finds what has no mark.
         """
+        robot, beyond = parse_topic(topic).robot, 0
         for hour in {hour_of(t_us) for t_us in times_us}:
             pending = Pending(topic, str(hour))
             if now_ms < self._known.get(pending, 0):
                 continue
+            if self._limiter.left(robot, now_ms / 1000) < 1:
+                beyond += 1
+                continue
+            self._limiter.spend(robot, now_ms / 1000, 1)
             try:
                 due_ms = self.add(pending, now_ms)
             except (BotoCoreError, ClientError) as error:
@@ -56,6 +67,8 @@ class Marks:
             if len(self._known) >= _KNOWN:
                 self._known.clear()
             self._known[pending] = due_ms
+        if beyond:
+            _log.warning("%d hours of %s are beyond its marks a day: a sweep archives them", beyond, topic)
 
     def add(self, pending: Pending, now_ms: int) -> int:
         """Mark one, or move its mark to a later time; returns when it is due."""

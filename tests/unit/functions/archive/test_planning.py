@@ -6,11 +6,15 @@ import json
 
 from functions import archive as function
 from functions.quarantine import entries
+from functions.shared.archive.marks import MARKS, MARKS_A_DAY, Marks
+from functions.shared.archive.planning import MOST_OF_A_ROBOT
 from iort_contract.archive import ARCHIVE, DUE, HOUR, HOUR_REST_MS, TASK, Hour, Pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic
 from tests.fakes import TOPIC_OF_CAR
 from tests.unit.functions.archive.archiving import HOUR_0, NOW_MS, PENDING, kill
+
+TOPIC_OF_OTHER = build_topic(RECORD, "other", "vesc")
 
 
 def test_a_live_stream_is_marked_once_an_hour_and_is_due_when_it_is_over(cloud, monkeypatch):
@@ -22,8 +26,8 @@ def test_a_live_stream_is_marked_once_an_hour_and_is_due_when_it_is_over(cloud, 
     for second in range(0, 3600, 600):
         cloud.store(second, [1, 1, 1], seq=second)
     assert len(writes) == 1
-    assert function.perform({TASK: DUE}, NOW_MS - 2) == {"tasks": 0, "overdue": 0}
-    assert function.perform({TASK: DUE}, NOW_MS) == {"tasks": 1, "overdue": 0}
+    assert function.perform({TASK: DUE}, NOW_MS - 2) == {"tasks": 0, "overdue": 0, "waiting": 0}
+    assert function.perform({TASK: DUE}, NOW_MS) == {"tasks": 1, "overdue": 0, "waiting": 0}
     (task,) = cloud.tasks()
     function.handler({"Records": [{"body": json.dumps(task)}]}, None)
     assert cloud.row().batches == 6
@@ -70,3 +74,50 @@ def test_the_marks_of_a_fleet_are_in_many_partitions_and_come_oldest_first(cloud
     assert len(partitions) == 8
     assert {pending.topic for pending in found} == set(topics)
     assert [pending.period for pending in found] == sorted(pending.period for pending in found)
+
+
+def test_a_robot_that_invents_hours_has_so_many_marks_and_the_others_have_theirs(dynamodb):
+    written = []
+
+    class Client:
+        exceptions = dynamodb.exceptions
+
+        def update_item(self, **update):
+            written.append(update["Key"][HOUR]["S"])
+
+    marks = Marks(Client(), "archive")
+    marks.note(TOPIC_OF_CAR, [Hour(number).start_us for number in range(20_000)], NOW_MS)
+    marks.note(TOPIC_OF_OTHER, [HOUR_0.start_us], NOW_MS)
+
+    assert len(written) == MARKS + 1
+    assert written[-1].endswith(TOPIC_OF_OTHER)
+    marks.note(TOPIC_OF_CAR, [Hour(number).start_us for number in range(20_000)], NOW_MS + 86_400_000)
+    assert len(written) <= 1 + MARKS + MARKS_A_DAY
+
+
+def test_a_plan_takes_so_many_hours_of_a_robot_and_forgets_none(cloud):
+    hours = [Hour(HOUR_0.number - number) for number in range(MOST_OF_A_ROBOT + 5)]
+    cloud.marks.note(TOPIC_OF_CAR, [hour.start_us for hour in hours], hours[-1].end_us // 1000)
+    cloud.marks.note(TOPIC_OF_OTHER, [HOUR_0.start_us], HOUR_0.end_us // 1000)
+
+    planned = function.perform({TASK: DUE}, NOW_MS)
+
+    tasks = [task for task in cloud.tasks() if task[TASK] == ARCHIVE]
+    assert planned["waiting"] == 5
+    assert [task[TOPIC] for task in tasks].count(TOPIC_OF_CAR) == MOST_OF_A_ROBOT
+    assert [task[TOPIC] for task in tasks].count(TOPIC_OF_OTHER) == 1
+    # Their marks stay until they are done.
+    assert len(cloud.pending()) == MOST_OF_A_ROBOT + 5 + 1
+
+
+def test_a_task_names_its_robot_so_that_a_queue_can_be_fair(cloud, monkeypatch):
+    sent = []
+    real = cloud.archive.queue.send_message_batch
+    monkeypatch.setattr(
+        cloud.archive.queue, "send_message_batch", lambda **call: sent.extend(call["Entries"]) or real(**call)
+    )
+    cloud.marks.note(TOPIC_OF_CAR, [HOUR_0.start_us], HOUR_0.start_us // 1000)
+
+    function.perform({TASK: DUE}, NOW_MS)
+
+    assert [entry["MessageGroupId"] for entry in sent] == ["car"]
