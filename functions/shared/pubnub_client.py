@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import quote
 
 import boto3
 import urllib3
+from botocore.exceptions import BotoCoreError, ClientError
 from pubnub.enums import PNStatusCategory
 from pubnub.exceptions import PubNubException
 from pubnub.pnconfiguration import PNConfiguration
@@ -18,6 +20,8 @@ from pubnub.request_handlers.base import BaseRequestHandler
 from pubnub.structures import Envelope, PlatformOptions, RequestOptions
 
 from iort_contract.limits import MAX_PUBNUB_BYTES
+
+_log = logging.getLogger(__name__)
 
 # These loggers log request paths, which contain PubNub's keys.
 for _logger in ("httpx", "httpcore", "urllib3", "pubnub"):
@@ -28,8 +32,16 @@ _TIMEOUT_S = 1
 _IDLE_S = 5
 
 
+# Keys that come later are seen within this time. Every message would be a call to Parameter Store otherwise.
+_LOOK_AGAIN_S = 10.0
+
+
 class PublishError(Exception):
     """PubNub did not take the message, or the request failed; the text says why, without keys."""
+
+
+class NotConfiguredError(PublishError):
+    """PubNub's keys are not stored, so there is nowhere to publish."""
 
 
 class _Requests(BaseRequestHandler):  # type: ignore[misc]  # the SDK has no types
@@ -94,15 +106,30 @@ class PubNubPublisher:
 
     @classmethod
     def from_parameter(cls, name: str) -> PubNubPublisher:
-        """Read the keys from Parameter Store; see `pubnub_parameter` for their form."""
-        answer = boto3.client("ssm").get_parameter(Name=name, WithDecryption=True)
-        keys: dict[str, Any] = json.loads(answer["Parameter"]["Value"])
-        return cls(
-            publish_key=keys["publish_key"],
-            subscribe_key=keys["subscribe_key"],
-            origin=keys.get("origin", ""),
-            tls=keys.get("tls", True),
-        )
+        """Read the keys from Parameter Store; see `pubnub_parameter` for their form.
+
+        Raises `NotConfiguredError` if there are none, and `PublishError` if they cannot be read.
+        """
+        ssm = boto3.client("ssm")
+        try:
+            answer = ssm.get_parameter(Name=name, WithDecryption=True)
+        except ssm.exceptions.ParameterNotFound as error:
+            raise NotConfiguredError(f"no PubNub keys in {name}: `iort pubnub` stores them") from error
+        except (BotoCoreError, ClientError) as error:
+            raise PublishError(f"PubNub's keys cannot be read from {name}: {error}") from error
+        try:
+            keys: dict[str, Any] = json.loads(answer["Parameter"]["Value"])
+            return cls(
+                publish_key=keys["publish_key"],
+                subscribe_key=keys["subscribe_key"],
+                origin=keys.get("origin", ""),
+                tls=keys.get("tls", True),
+            )
+        except (KeyError, TypeError, ValueError):
+            # The error's own text may have a part of the value.
+            raise NotConfiguredError(
+                f"{name} does not hold PubNub's keys: `iort pubnub` stores them"
+            ) from None
 
     def publish(self, channel: str, message: dict[str, Any]) -> None:
         """Publish without storing; raises `PublishError` if PubNub does not confirm it."""
@@ -120,3 +147,34 @@ class PubNubPublisher:
             # The SDK does not wrap the errors of its libraries, for example on an answer that is not JSON.
             status = getattr(error, "_status_code", 0)
             raise PublishError(f"{type(error).__name__}, status {status}") from error
+
+
+class StoredPublisher:
+    """Publishes with the keys in Parameter Store's ``parameter``, which it reads at the first message.
+    Without keys it looks again after `_LOOK_AGAIN_S`."""
+
+    def __init__(self, parameter: str, clock: Callable[[], float] = time.time) -> None:
+        self._parameter, self._clock = parameter, clock
+        self._publisher: PubNubPublisher | None = None
+        self._missing: PublishError | None = None
+        self._looked_s = 0.0
+
+    def publish(self, channel: str, message: dict[str, Any]) -> None:
+        """Publish as `PubNubPublisher.publish`; raises `NotConfiguredError` while there are no keys."""
+        if self._publisher is None:
+            self._publisher = self._look()
+        self._publisher.publish(channel, message)
+
+    def _look(self) -> PubNubPublisher:
+        now_s = self._clock()
+        if self._missing is not None and 0 <= now_s - self._looked_s < _LOOK_AGAIN_S:
+            raise self._missing
+        self._looked_s = now_s
+        try:
+            return PubNubPublisher.from_parameter(self._parameter)
+        except PublishError as error:
+            # Once: a line for each message of each robot would cost more than it says.
+            if self._missing is None:
+                _log.warning("%s", error)
+            self._missing = error
+            raise

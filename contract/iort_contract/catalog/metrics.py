@@ -102,6 +102,8 @@ METRICS = {
                 within=5,
             ),
         ),
+        # Without PubNub's keys there is nothing to be alarmed at.
+        Metric("LiveNotConfigured", "live", LIVE_CHART, right=True),
         Metric("LiveStale", "live", LIVE_CHART, right=True),
         Metric("LiveRefused", "live", LIVE_CHART, right=True),
         Metric("LiveCutOff", "live", LIVE_CHART, right=True),

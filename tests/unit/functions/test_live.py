@@ -16,7 +16,7 @@ from functions import live
 from functions.live import REFUSALS, Lane, RefusedError, age_ms
 from functions.quarantine import entries
 from functions.shared.delay_estimator import DelayEstimator
-from functions.shared.pubnub_client import PublishError, PubNubPublisher
+from functions.shared.pubnub_client import PublishError, PubNubPublisher, StoredPublisher
 from iort_contract.catalog.environments import LiveEnvironment
 from iort_contract.catalog.metrics import metrics_of
 from iort_contract.cloud import channel as channel_of
@@ -383,6 +383,60 @@ def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
     assert (config.publish_key, config.subscribe_key) == tuple(KEYS.values())
     assert (config.origin, config.ssl) == (origin, tls)
     assert config.connect_timeout == config.non_subscribe_request_timeout == 1
+
+
+@pytest.mark.parametrize("stored", [None, "no JSON", "[]", '{"publish_key": "pub-c-secret"}'])
+def test_without_keys_messages_are_counted_and_nothing_fails(aws, monkeypatch, caplog, counted, stored):
+    ssm, sqs, name = boto3.client("ssm"), boto3.client("sqs"), pubnub_parameter("lab3")
+    if stored is not None:
+        ssm.put_parameter(Name=name, Type="SecureString", Value=stored)
+    queue = sqs.create_queue(QueueName="rejected")["QueueUrl"]
+    for key, value in LiveEnvironment("lab3", name, {}, queue).variables().items():
+        monkeypatch.setenv(key, value)
+    # An environment of its own: the cached one is another test's.
+    lane = live.lane.__wrapped__()
+    for number in range(30):
+        lane.serve(event(seq=number), NOW_US + number, ARN)
+    lane.counted.add(NOW_US / 1e6 + 60, LiveStale=1)
+    assert counted()["LiveNotConfigured"] == 30
+    assert "Messages" not in sqs.receive_message(QueueUrl=queue)
+    # The reason once, and no key in it.
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "iort pubnub" in caplog.text
+    assert "secret" not in caplog.text
+
+
+def test_keys_that_are_stored_later_are_found_without_a_call_for_every_message(aws):
+    name, now_s = pubnub_parameter(), [1000.0]
+    publisher = StoredPublisher(name, lambda: now_s[0])
+
+    def attempt():
+        # Too long for PubNub, so that nothing is sent.
+        with pytest.raises(PublishError) as caught:
+            publisher.publish("iort.car", {"text": "x" * MAX_PUBNUB_BYTES})
+        return str(caught.value)
+
+    assert "iort pubnub" in attempt()
+    boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=json.dumps(KEYS))
+    now_s[0] += 9
+    assert "iort pubnub" in attempt()
+    now_s[0] += 1
+    assert "URL encoding" in attempt()
+    boto3.client("ssm").delete_parameter(Name=name)
+    assert "URL encoding" in attempt()
+
+
+def test_keys_that_cannot_be_read_are_a_failure_of_the_dashboard_alone(monkeypatch, counted):
+    for name, value in {
+        "ENDPOINT_URL_SSM": "http://127.0.0.1:9",
+        "MAX_ATTEMPTS": "1",
+        "ACCESS_KEY_ID": "a",
+        "SECRET_ACCESS_KEY": "b",
+        "DEFAULT_REGION": "eu-west-1",
+    }.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    show(event(), StoredPublisher(pubnub_parameter()).publish)
+    assert counted() == {"PubNubFailed": 1}
 
 
 def test_a_message_over_the_size_limit_is_refused_before_sending():
