@@ -131,14 +131,15 @@ preflight: layer ## ask your AWS account what would make a deploy fail, and chan
 	@$(BIN)/python -m verify.preflight $(ARGS)
 
 deploy: layer ## deploy to the AWS account of your credentials: ARGS="-c key=value", SKIP_PREFLIGHT=1
-	@derived=$$($(if $(SKIP_PREFLIGHT),:,$(BIN)/python -m verify.preflight --derive $(ARGS))) && \
+	@derived=$$($(BIN)/python -m verify.preflight --derive $(if $(SKIP_PREFLIGHT),--unchecked) $(ARGS)) && \
 		$(CDK) deploy --all $$derived $(ARGS)
 
 diff: layer ## what a deploy would change, resource by resource
-	@derived=$$($(BIN)/python -m verify.preflight --derive $(ARGS)); $(CDK) diff $$derived $(ARGS)
+	@derived=$$($(BIN)/python -m verify.preflight --derive --unchecked $(ARGS)) && $(CDK) diff $$derived $(ARGS)
 
 destroy: layer ## remove everything from it again, the data included
-	@$(BIN)/python scripts/destroy.py $(CDK) destroy --all $(ARGS)
+	@derived=$$($(BIN)/python -m verify.preflight --derive --unchecked $(ARGS)) && \
+		$(BIN)/python scripts/destroy.py $(CDK) destroy --all $$derived $(ARGS)
 
 lock: setup ## compile requirements/*.in to the locked *.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \

@@ -37,8 +37,9 @@ def deploy(
         "namespace": cloud.namespace,
         "layer": "build/layer/local",
         "live_transport": live,
-        # It is on loopback, as the page that drives is.
+        # They are on loopback, as the page that drives is, and the identity of a page for everybody.
         "drivers": "true",
+        "site_robots": "*",
     }
     context = [f"{key}={value}" for key, value in settings.items()]
 

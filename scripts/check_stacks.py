@@ -50,6 +50,7 @@ STAGES: dict[str, dict[str, Any]] = {
         "alarm_email": "lab@example.org",
         "tags": {"team": "lab"},
         "site": True,
+        "site_robots": ["car1"],
         "device_defender": True,
         "iot_log_level": "error",
     },

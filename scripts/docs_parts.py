@@ -11,6 +11,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,13 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
+from iort_contract.cloud import PUBNUB
 from iort_contract.messages.control.driving import REFUSALS
 from iort_contract.messages.requests.ask import REASONS
 from iort_station.cli.main import app
 from iort_station.cost import report
+from iort_station.cost.bill import line_items, model
+from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 from scripts import agent_reference, cloud_tables
@@ -247,18 +251,36 @@ def cost(name: str) -> None:
         rows = fleets(usage)
     else:
         print(f"List prices of {AS_OF}, {REGION}, in US dollars; one robot, {usage.rate_hz:g} Hz.\n")
-        rows = {"hour": report.robot_hour, "whatif": report.what_if, "year": report.robot_year}[name](usage)
+        tables = {
+            "hour": report.robot_hour,
+            "month": report.month,
+            "whatif": report.what_if,
+            "year": report.robot_year,
+        }
+        rows = tables[name](usage)
     _table(rows.head, rows.body)
 
 
 def month() -> None:
-    """What a small deployment costs a month, in a sentence."""
-    rows = {row[0]: row[1] for row in report.month(Usage(hours_per_day=2)).body}
-    aws = {name: float(dollars) for name, dollars in rows.items() if name.startswith("AWS, ")}
-    del aws["AWS, the same driving a message a sample"]
-    driving = aws.pop("AWS, the driving")
-    print(f"A robot that drives two hours a day costs ${driving:.0f} a month on AWS, at list prices.")
-    print(f"The deployment itself costs up to ${sum(aws.values()):.0f} more, mostly for metrics and alarms.")
+    """What the default deployment costs a month with a robot, all in, and what PubNub adds."""
+    usage = Usage(robots=1, hours_per_day=2.0)
+    driving, fixed = _month(usage)
+    by_pubnub = replace(usage, live_transport=PUBNUB)
+    plan = model.pubnub_mau_dollars_per_month(by_pubnub) or 0.0
+    more = sum(_month(by_pubnub)) + plan - driving - fixed
+    total = f"${driving + fixed:.0f} a month"
+    print(f"With one robot that drives two hours a day, watched live, the default deployment costs {total}")
+    print(
+        f"on AWS at most, all in, at list prices: ${driving:.0f} for the driving with archive and analysis,"
+    )
+    print("the rest for itself, mostly for metrics and alarms.")
+    print(f"Live over PubNub instead of AWS IoT adds ${more:.0f}, with PubNub's smallest plan.")
+
+
+def _month(usage: Usage) -> tuple[float, float]:
+    """AWS' dollars a month for the driving, and for the deployment itself."""
+    driving = line_items.dollars_per_month(model.bill(usage), usage)
+    return driving, sum(deployment_dollars_per_month(usage).values())
 
 
 def headline() -> None:
@@ -285,7 +307,7 @@ def measured() -> None:
         ("car to dashboard, with the thesis' ping of 50 ms", f"{delay_ms:.0f} ms", "250-300 ms"),
         ("the car's node, processor time of a sample", f"{cycle_ms:.3f} ms", "2 ms"),
         ("a query of 14,368 points, processor time", f"1/{query:.0f}", "1"),
-        ("AWS for a robot-hour, live lane at 10 Hz", f"1/{cost:.1f}", "1"),
+        ("AWS for a robot-hour, live lane at 10 Hz by PubNub", f"1/{cost:.1f}", "1"),
         ("samples lost over 60 s without a broker", f"{lost:g}", "not measured"),
     ]
     _table((f"measured on {kept['machine']['date'][:10]}", "iort", "thesis"), rows)

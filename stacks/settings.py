@@ -28,6 +28,8 @@ UNRESERVED = 100
 # And the least that a queue's mapping takes: "Configuring scaling behavior for SQS event source mappings".
 NEW_ACCOUNT, LEAST_OF_A_QUEUE = 10, 2
 OWN_LOGS, ALL_LOGS = "own", "all"
+# The robots of a public page, if it shows all.
+ALL_ROBOTS = ["*"]
 # AWS IoT ends a connection with more subscriptions.
 _MOST_SITE_ROBOTS = 50
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
@@ -86,10 +88,13 @@ def _email(value: Any) -> str | None:
 
 
 def _robots(value: Any) -> list[str]:
-    """Parse robots: an array in cdk.json, ``car1,car2`` on the command line."""
+    """Parse robots: an array in cdk.json, ``car1,car2`` on the command line; `ALL_ROBOTS` alone is all of
+    them."""
     names = value.split(",") if isinstance(value, str) else value
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError("must be robots as car1,car2")
+        raise ValueError("must be robots as car1,car2, or *")
+    if names == ALL_ROBOTS:
+        return names
     if len(set(names)) > _MOST_SITE_ROBOTS:
         raise ValueError(f"must be at most {_MOST_SITE_ROBOTS} robots")
     return sorted({check_robot(name) for name in names})
@@ -167,9 +172,12 @@ class Settings(BaseModel):
         default=50, description="a robot's daily upload limit, in 1e9 bytes"
     )
     live_transport: Annotated[str, _one_of(PUBNUB, IOT)] = Field(
-        default=PUBNUB,
-        description="how live messages reach the page: `pubnub` by Lambda 1 and PubNub, `iot` by AWS IoT's "
-        "own WebSockets, so that Lambda 1 has nothing to do ([the difference](page.md#two-ways-to-the-page))",
+        default=IOT,
+        description="how live messages reach the page: `iot` by AWS IoT's own WebSockets, so that Lambda 1 "
+        "has nothing to do, or `pubnub` by Lambda 1 and PubNub "
+        "([the difference](page.md#two-ways-to-the-page)). "
+        "Without a value `make deploy` takes PubNub if its keys are stored, and AWS IoT otherwise; a plain "
+        "`cdk deploy` takes AWS IoT",
     )
     drivers: Flag = Field(
         default=False,
@@ -179,7 +187,7 @@ class Settings(BaseModel):
     live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
-        "in `prod` where `account_concurrency` allows it, nothing in `dev` "
+        "in `prod` with PubNub where `account_concurrency` allows it, otherwise nothing "
         "([why](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
     )
     account_concurrency: Annotated[int, _whole(NEW_ACCOUNT, 100_000)] = Field(
@@ -243,8 +251,8 @@ class Settings(BaseModel):
     site: Flag = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
     site_robots: Annotated[list[str], BeforeValidator(_robots)] = Field(
         default=[],
-        description="the robots that the page on the web shows with `live_transport=iot`, as `car1,car2`; "
-        "at most 50; without a value all of them. With PubNub, its access token says which",
+        description="the robots that everybody sees on the page on the web, as `car1,car2`, at most 50, or "
+        "`*` for all. Needed with `site` and `live_transport=iot`; with PubNub, its access token says which",
     )
     embedded: Flag = Field(
         default=False, description="for the embedded cloud, with the caller's own credentials"
@@ -267,10 +275,12 @@ class Settings(BaseModel):
 
     @property
     def reserved_for_live(self) -> int:
-        """Reserved concurrency of Lambda 1, 0 for none: a small account has nothing to reserve from."""
+        """Reserved concurrency of Lambda 1, 0 for none: a small account has nothing to reserve from, and
+        without PubNub nothing calls it."""
         if self.live_concurrency is None:
             allowed = self.account_concurrency >= UNRESERVED + _RESERVED_FOR_LIVE
-            return _RESERVED_FOR_LIVE if self.protected and allowed else 0
+            called = self.live_transport == PUBNUB
+            return _RESERVED_FOR_LIVE if self.protected and allowed and called else 0
         return self.live_concurrency
 
     @property
@@ -338,6 +348,11 @@ class Settings(BaseModel):
         if settings.site and settings.embedded:
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
+            )
+        if settings.public and not settings.site_robots:
+            raise SettingsError(
+                "context site_robots must name the robots that anybody may see, as car1,car2, or be * for "
+                "all, got none: the page is open to everybody with site and live_transport=iot, or embedded"
             )
         needed = [settings.layer] if settings.has_lambda_1 else []
         needed += [] if settings.embedded else [settings.analysis_layer]

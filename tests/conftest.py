@@ -163,8 +163,10 @@ class Synthesized:
 
 @pytest.fixture(scope="session")
 def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """Build the app for stage dev, with drivers and the settings of the whole account."""
-    return _synthesize(tmp_path_factory, device_defender=True, iot_log_level="error", drivers=True)
+    """Build the app for stage dev, with every rule, drivers and the settings of the whole account."""
+    return _synthesize(
+        tmp_path_factory, device_defender=True, iot_log_level="error", drivers=True, live_transport="pubnub"
+    )
 
 
 @pytest.fixture(scope="session")
@@ -182,6 +184,7 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
         iot_log_level="error",
         robot_metrics=True,
         drivers=True,
+        live_transport="pubnub",
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_contract.cloud import PUBNUB
 from iort_contract.tables import ROBOT
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -33,6 +34,8 @@ _POLL_S = 10.0
 # cdk.json may say otherwise for the operator's own deployment: what must go again keeps nothing.
 _OF_ITS_OWN = {
     "stage": DEV,
+    # Lambda 1 is asked about, too. Whoever listens at AWS IoT hears the same cars.
+    "live_transport": PUBNUB,
     "site": "false",
     "customer_key": "false",
     "keep_customer_key": "false",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from iort_contract.cloud import PUBNUB
 from iort_station.cost.report import Rows, times
 from iort_station.cost.scale import Scale, on_paper
 from iort_station.cost.usage import Usage
@@ -24,10 +25,10 @@ def fleets(usage: Usage) -> Rows:
         body.append((need.name, *(f"**{times(value)}**" if value > 1 else times(value) for value in needs)))
     body.append(("breaks first", *(_first(scale) for scale in scales)))
     body.append(("AWS, dollars a month", *(f"{scale.aws_dollars_per_month:,.0f}" for scale in scales)))
-    body.append(
-        ("PubNub by transactions, a month", *(f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales))
-    )
-    body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
+    if usage.live_transport == PUBNUB:
+        dollars = (f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales)
+        body.append(("PubNub by transactions, a month", *dollars))
+        body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
     return Rows(head, body)
 
 

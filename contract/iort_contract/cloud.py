@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.analysis.findings import DriveKey
-from iort_contract.topics import check_namespace, check_robot
+from iort_contract.topics import CLAIM, check_namespace, check_robot
 
 # Query results too large for an answer, in the files' bucket for a day.
 RESULTS_PREFIX = "results/"
@@ -32,7 +32,7 @@ def fleet_name(namespace: str = DEFAULT_NAMESPACE) -> str:
 
 def claim_name(namespace: str = DEFAULT_NAMESPACE) -> str:
     """The name of the claims' IoT policy, and the prefix of a claim's client id."""
-    return f"{check_namespace(namespace)}-claim"
+    return f"{check_namespace(namespace)}-{CLAIM}"
 
 
 def client_prefix(role: str, namespace: str = DEFAULT_NAMESPACE) -> str:

@@ -17,6 +17,8 @@ _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
 # A robot's questions to functions of the cloud, and their answers.
 ASK, ANSWER = "ask", "answer"
+# In the names of claims, behind the namespace.
+CLAIM = "claim"
 # Who looks at a robot's live lane.
 VIEW = "view"
 LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG, ASK, ANSWER, VIEW)

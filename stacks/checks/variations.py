@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from iort_contract.cloud import IOT, PUBNUB
+from iort_contract.cloud import PUBNUB
 from stacks.settings import ALL_LOGS, PROD
 
 # Parameters with two values each, to change and to change back; the base has every default. Settings that
@@ -18,8 +18,9 @@ FLIPS: dict[str, dict[str, Any]] = {
     "budget": {"budget_usd": 50, "alarm_email": "lab@example.org"},
     "kept key": {"keep_customer_key": True},
     "account": {"device_defender": True, "iot_log_level": "error"},
-    "site": {"site": True},
-    "without PubNub": {"live_transport": IOT, "drivers": True, "site": True, "site_robots": ["car1"]},
+    "site": {"site": True, "site_robots": ["car1"]},
+    "drivers": {"drivers": True},
+    "PubNub": {"live_transport": PUBNUB},
     "no nightly analysis": {"nightly_analysis": False},
     "properties": {
         "retention_days": 7,

@@ -10,6 +10,7 @@ from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
 from iort_contract.cloud import DRIVER, VIEWER, client_prefix
 from iort_contract.topics import CMD, LIVE, VIEW
 from stacks.parts.base import PlatformStack
+from stacks.settings import ALL_ROBOTS
 
 _COGNITO = "cognito-identity.amazonaws.com"
 
@@ -55,13 +56,13 @@ def public_identity(stack: PlatformStack) -> None:
         stack, "PublicRoles", identity_pool_id=pool.ref, roles={"unauthenticated": role.role_arn}
     )
     CfnOutput(stack, "PublicPoolId", value=pool.ref)
-    CfnOutput(stack, "PublicRobots", value=",".join(stack.settings.site_robots) or "*")
+    CfnOutput(stack, "PublicRobots", value=",".join(stack.settings.site_robots))
 
 
 def _person(stack: PlatformStack, name: str, *, publishes: list[str]) -> None:
     """A role that people and programs of this account may assume, if their own policy says so."""
     role = iam.Role(stack, name.capitalize(), assumed_by=iam.AccountRootPrincipal())
-    _listens(stack, role, name, robots=[])
+    _listens(stack, role, name, robots=ALL_ROBOTS)
     topics = [f"{lane}/{stack.settings.namespace}/*" for lane in publishes]
     _rule(stack, role, "Publish", "topic", topics)
     CfnOutput(stack, f"{name.capitalize()}Role", value=role.role_arn)
@@ -69,7 +70,8 @@ def _person(stack: PlatformStack, name: str, *, publishes: list[str]) -> None:
 
 def _listens(stack: PlatformStack, role: iam.Role, client: str, *, robots: list[str]) -> None:
     namespace = stack.settings.namespace
-    heard = [f"{LIVE}/{namespace}/{robot}/*" for robot in robots] or [f"{LIVE}/{namespace}/*"]
+    named = [f"{LIVE}/{namespace}/{robot}/*" for robot in robots]
+    heard = [f"{LIVE}/{namespace}/*"] if robots == ALL_ROBOTS else named
     _rule(stack, role, "Connect", "client", [f"{client_prefix(client, namespace)}*"])
     _rule(stack, role, "Subscribe", "topicfilter", heard)
     _rule(stack, role, "Receive", "topic", heard)

@@ -65,7 +65,9 @@ def built(tmp_path):
 
 def test_no_stack_depends_on_the_account_stack(built):
     """It is deployed last, so that the other stacks exist if it fails."""
-    found = {stack.stack_name: stack for stack in built(device_defender=True, site=True)}
+    found = {
+        stack.stack_name: stack for stack in built(device_defender=True, site=True, site_robots=["car1"])
+    }
     before = {
         name: {one.id for one in stack.dependencies if not one.id.endswith(".assets")}
         for name, stack in found.items()
@@ -75,7 +77,7 @@ def test_no_stack_depends_on_the_account_stack(built):
 
 
 def test_the_embedded_cloud_has_no_account_wide_settings(built):
-    stacks = built(embedded=True, device_defender=True, iot_log_level="error")
+    stacks = built(embedded=True, site_robots=["*"], device_defender=True, iot_log_level="error")
     assert not KINDS & {one["Type"] for stack in stacks for one in stack.template["Resources"].values()}
 
 

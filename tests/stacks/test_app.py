@@ -95,7 +95,9 @@ def settings(tmp_path, layer):
 def test_the_context_sets_the_settings(settings, tmp_path):
     assert settings() == Settings(**layers(tmp_path / "layer"))
     # The CDK CLI gives every -c as text.
-    given = settings(namespace="lab2", retention_days="7", live_concurrency="0", embedded="true")
+    given = settings(
+        namespace="lab2", retention_days="7", live_concurrency="0", embedded="true", site_robots="*"
+    )
     assert (given.namespace, given.retention_days, given.live_concurrency, given.embedded) == (
         "lab2",
         7,
@@ -105,7 +107,10 @@ def test_the_context_sets_the_settings(settings, tmp_path):
     assert settings(embedded="false").embedded is False
     assert given.reserved_for_live == 0
     assert settings().reserved_for_live == 0 == Usage().live_concurrency
-    assert settings(stage="prod").reserved_for_live == 5
+    large = {"stage": "prod", "account_concurrency": 105}
+    assert settings(**large, live_transport="pubnub").reserved_for_live == 5
+    # Nothing calls it.
+    assert settings(**large).reserved_for_live == 0
     assert settings(stage="prod", live_concurrency="0").reserved_for_live == 0
     asked = {"stage": "prod", "customer_key": "true", "budget_usd": "50", "alarm_email": "lab@example.org"}
     given = settings(**asked, low_voltage_v="13.2", tags="team=lab,cost-centre=7")
@@ -113,7 +118,7 @@ def test_the_context_sets_the_settings(settings, tmp_path):
     assert (given.alarm_email, given.low_voltage_v) == ("lab@example.org", 13.2)
     assert given.tags == {"team": "lab", "cost-centre": "7"} == settings(tags=dict(given.tags)).tags
     # cdk.json's numbers arrive as JavaScript numbers.
-    assert settings(retention_days=7.0, embedded=True) == settings(retention_days="7", embedded="true")
+    assert settings(retention_days=7.0, site=False) == settings(retention_days="7", site="false")
 
 
 @pytest.mark.parametrize(
@@ -145,6 +150,9 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"live_transport": "mqtt"}, ["live_transport", "'mqtt'", "pubnub or iot"]),
         ({"site_robots": "car1,car 2"}, ["robot name", "car 2"]),
         ({"site_robots": 7}, ["site_robots", "7", "car1,car2"]),
+        ({"site_robots": "car1,*"}, ["robot name", "*"]),
+        ({"site": True}, ["site_robots", "car1,car2", "* for all"]),
+        ({"embedded": True}, ["site_robots", "got none"]),
         ({"site_robots": [f"car{i}" for i in range(51)]}, ["site_robots", "at most 50 robots"]),
         ({"tags": "aws:x=1"}, ["tags", "'aws:x=1'"]),
         ({"tags": {"team": 7}}, ["tags", "7"]),

@@ -8,12 +8,14 @@ import pytest
 
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.catalog.rules import RULES
-from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
+from iort_contract.cloud import IOT, PLANS_PREFIX, PUBNUB, RESULTS_PREFIX
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.bill.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import layers, name
+
+WAYS = {IOT: {}, PUBNUB: {"live_transport": PUBNUB}}
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,24 @@ def test_the_rules_are_the_contracts(rules):
         assert not payload.get("RuleDisabled")
         # By AWS' SQL an OR with a comparison with null is Undefined, and so selects nothing.
         assert " or " not in payload["Sql"].lower()
+
+
+def test_the_default_deployment_needs_no_third_party(deployment):
+    """Lambda 1 stays, and its export, so that one deployment changes the way."""
+    templates = {way: deployment(**given).templates for way, given in WAYS.items()}
+    rules = {
+        way: {
+            one["Properties"]["RuleName"].removeprefix("iort_")
+            for one in each["iort-ingest"]["Resources"].values()
+            if one["Type"] == "AWS::IoT::TopicRule"
+        }
+        for way, each in templates.items()
+    }
+    assert rules == {IOT: RULES.keys() - {"live"}, PUBNUB: RULES.keys()}
+    for way, each in templates.items():
+        assert each["iort-fleet"]["Outputs"]["LiveTransport"]["Value"] == way
+        assert not any(one.startswith("Public") for one in each["iort-fleet"]["Outputs"])
+    assert templates[IOT]["iort-processing"] == templates[PUBNUB]["iort-processing"]
 
 
 def test_every_rule_has_exactly_its_one_action(rules, reader):

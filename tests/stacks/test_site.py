@@ -17,7 +17,7 @@ def site() -> dict[str, Any]:
     from stacks.site import Site
 
     app = App()
-    Site(app, Settings())
+    Site(app, Settings(live_transport="pubnub"))
     template: dict[str, Any] = app.synth().get_stack_by_name("iort-site").template
     return template
 
@@ -69,7 +69,7 @@ def test_the_site_uses_tls_and_the_headers_of_the_pages_own_server(site):
 
 
 def test_without_pubnub_the_page_connects_to_aws_iot_and_cognito_of_its_region_only(deployment, reader):
-    template = deployment(live_transport="iot", drivers=True, site=True).templates["iort-site"]
+    template = deployment(drivers=True, site=True, site_robots=["car1"]).templates["iort-site"]
     (headers,) = of(template, "AWS::CloudFront::ResponseHeadersPolicy")
     security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
     aws = "${AWS::Region}.${AWS::URLSuffix}"

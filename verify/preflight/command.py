@@ -1,11 +1,11 @@
 """Checks an account for causes of a failed deployment, beforehand and read-only.
 
-    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json | --derive]
+    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json | --derive [--unchecked]]
 
 It reads settings like app.py, takes from the account those that are not given, and ignores other options of
-the CDK. Exit status 1 means that the deployment would fail. `make deploy` runs it first (skip it with
-SKIP_PREFLIGHT=1), and hands to the CDK what --derive prints, the findings beside it on stderr; `make
-verify-aws` runs it for its report.
+the CDK. Exit status 1 means that the deployment would fail. `make deploy` runs it first, and hands to the
+CDK what --derive prints, the findings beside it on stderr. `make diff`, `make destroy` and SKIP_PREFLIGHT=1
+take --unchecked, which has no findings. `make verify-aws` runs the checks for its report.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from iort_contract.limits import ContractError
 from iort_station.cli.console import Console
 from iort_station.cloud import Cloud
 from stacks.settings import ROOT, Settings, SettingsError
 from verify.preflight import account, deployed
-from verify.preflight.derived import derive
+from verify.preflight.derived import derive, namespace_of
 from verify.preflight.finding import Clients, Finding, Verdict
 
 _STYLES = {Verdict.FINE: "green", Verdict.WARNING: "yellow", Verdict.STOPS: "red"}
@@ -55,6 +56,7 @@ def options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--derive", action="store_true", help="print the CDK's arguments for what the account decides"
     )
+    parser.add_argument("--unchecked", action="store_true", help="look for nothing that would fail")
     known, _others = parser.parse_known_args(arguments)
     return known
 
@@ -88,17 +90,19 @@ def main() -> None:
     asked = options(sys.argv[1:])
     given = context(asked.context)
     try:
-        clients = Cloud(namespace=Settings.read(given.get).namespace, profile=asked.profile)
+        clients = Cloud(namespace=namespace_of(given), profile=asked.profile)
         answers = derive(clients, given)
         settings = Settings.read({**given, **answers}.get)
-    except SettingsError as error:
+    except (ContractError, SettingsError) as error:
         sys.exit(f"preflight: {error}")
-    findings = look(clients, settings)
+    findings = [] if asked.unchecked else look(clients, settings)
     if asked.json:
         sys.stdout.write(json.dumps(as_json(findings), indent=2) + "\n")
     else:
         show(findings, Console(file=sys.stderr if asked.derive else sys.stdout))
     if asked.derive:
-        sys.stdout.write(" ".join(f"-c {key}={value}" for key, value in answers.items()) + "\n")
+        derived = " ".join(f"-c {key}={value}" for key, value in answers.items())
+        sys.stderr.write(f"by the account: {derived or 'nothing'}\n")
+        sys.stdout.write(f"{derived}\n")
     if stopped(findings):
         sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys anyway")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from botocore.exceptions import ClientError
 
 from iort_contract.catalog.rules import RULES
-from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.cloud import IOT, PUBNUB, claim_name, fleet_name, pubnub_parameter
 from iort_contract.topics import rule_name
 from stacks.settings import PROD, Settings
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
@@ -19,6 +19,7 @@ STACKS = (
     *("storage", "quarantine", "fleet", "processing", "ingest", "archive", "analysis", "monitoring", "site"),
     "account",
 )
+_WAYS = {PUBNUB: "PubNub", IOT: "AWS IoT"}
 # In these states neither CloudFormation nor the CDK can continue.
 _STUCK = {
     "ROLLBACK_COMPLETE": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
@@ -171,6 +172,45 @@ def _holders(clients: Clients, namespace: str) -> Iterator[str]:
     return (name for name in names if name.startswith(prefixes))
 
 
+def has_pubnub_keys(clients: Clients, namespace: str) -> bool:
+    """Whether something is stored where PubNub's keys belong. It stays encrypted."""
+    try:
+        clients.client("ssm").get_parameter(Name=pubnub_parameter(namespace))
+    except ClientError as error:
+        if code(error) != "ParameterNotFound":
+            raise
+        return False
+    return True
+
+
+def transport(clients: Clients, namespace: str) -> str | None:
+    """The deployed way of live messages; None without a deployment."""
+    fleet = stack(clients, f"{namespace}-fleet")
+    if fleet is None:
+        return None
+    outputs = {one["OutputKey"]: one["OutputValue"] for one in fleet.get("Outputs", [])}
+    # Before there was another way, it had no output.
+    return str(outputs.get("LiveTransport", PUBNUB))
+
+
+@item("live messages", "ssm GetParameter /<namespace>/pubnub, cloudformation DescribeStacks")
+def live_messages(clients: Clients, settings: Settings) -> Found:
+    """Say which way live messages will take, and warn if it is another one than now."""
+    name, wanted = pubnub_parameter(settings.namespace), settings.live_transport
+    stored, now = has_pubnub_keys(clients, settings.namespace), transport(clients, settings.namespace)
+    keys = f"PubNub's keys are {'' if stored else 'not '}stored in {name}"
+    text = f"by {_WAYS[wanted]} (live_transport={wanted}); {keys}"
+    if now is not None and now != wanted:
+        return warning(
+            f"{text}; deployed is {_WAYS[now]}: pages, site and viewers of that way hear nothing more",
+            f"-c live_transport={now} keeps it"
+            + (", with `iort pubnub` for the keys" if now == PUBNUB and not stored else ""),
+        )
+    if wanted == PUBNUB and not stored:
+        return warning(f"{text}: nobody sees live messages", "`iort pubnub`, or without -c live_transport")
+    return fine(text)
+
+
 @item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
 def changes(clients: Clients, settings: Settings) -> Found:
     """Check that the settings may follow those of the deployed stacks."""
@@ -226,4 +266,4 @@ def _used_by(importers: list[str]) -> str:
     return f"{', '.join(names)} {'imports' if len(names) == 1 else 'import'}"
 
 
-ITEMS = (stacks, names, kept, changes)
+ITEMS = (stacks, names, kept, live_messages, changes)

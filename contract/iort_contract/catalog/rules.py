@@ -21,6 +21,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import (
     ASK,
+    CLAIM,
     FILE,
     LAMBDA,
     LIVE,
@@ -86,7 +87,9 @@ class Rule:
     ) -> str:
         """The SQL for a deployment."""
         return self.sql.format(
-            namespace=check_namespace(namespace), retention_s=retention_s, low_voltage_v=low_voltage_v
+            namespace=check_namespace(namespace),
+            retention_s=retention_s,
+            low_voltage_v=low_voltage_v,
         )
 
     def physical_name(self, namespace: str = DEFAULT_NAMESPACE) -> str:
@@ -101,6 +104,13 @@ _FROM = f"topic() AS {TOPIC}, {_RECEIVED}"
 # Raw bytes, JSON or not.
 _BYTES = f"encode(*, 'base64') AS {MESSAGE_BASE64}, {_FROM}"
 _VERSION = f"state.reported.{AGENT_VERSION}"
+# "Lifecycle events": principalIdentifier is a certificate's id, of 64 characters ("Certificate" in the API
+# reference), or the IAM credentials that viewers, drivers and strangers have. A claim has a certificate, and
+# a client id of its own. What the rule leaves out calls no function.
+_OF_A_ROBOT = (
+    "regexp_matches(principalIdentifier, '^[a-fA-F0-9x]{{64}}$')"
+    f" AND NOT regexp_matches(clientId, '^{{namespace}}-{CLAIM}-')"
+)
 
 RULES = {
     rule.name: rule
@@ -144,8 +154,8 @@ RULES = {
         ),
         Rule(
             "presence",
-            "notes in the registry who connects and disconnects",
-            "SELECT * FROM '$aws/events/presence/+/+' WHERE eventType <> 'connect_failed'",
+            "notes in the registry which robots connect and disconnect",
+            f"SELECT * FROM '$aws/events/presence/+/+' WHERE eventType <> 'connect_failed' AND {_OF_A_ROBOT}",
             Call("presence"),
         ),
         Rule(

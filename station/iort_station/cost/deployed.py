@@ -8,17 +8,20 @@ from typing import Any
 
 from iort_station.cloud import Cloud
 from iort_station.cost.usage import Usage
+from iort_station.fleet.roles import transport
 from iort_station.operations.monitoring import cloudwatch
 
 _INSIGHTS = re.compile(r'SELECT SUM\((?P<metric>\w+)\) FROM "(?P<namespace>[\w/]+)"')
 
 
 def as_deployed(usage: Usage, cloud: Cloud) -> Usage:
-    """The usage with memory, concurrency, logs, alarms, dashboards, recovery and key as deployed.
+    """The usage with live messages, memory, concurrency, logs, alarms, dashboards, recovery and key as
+    deployed.
 
     Alarms and dashboards are the whole account's, like CloudWatch's free allowances.
     """
-    return replace(usage, **_functions(cloud), **watching(cloud), **_tables(cloud))
+    deployed = {**_functions(cloud), **watching(cloud), **_tables(cloud)}
+    return replace(usage, live_transport=transport(cloud), **deployed)
 
 
 def _functions(cloud: Cloud) -> dict[str, Any]:

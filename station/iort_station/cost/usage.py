@@ -36,7 +36,7 @@ class Usage:
 
     Somebody looks at a robot for ``watched_hours`` of its hours a day; at other times it sends a live message
     of each stream every `LIVE_BROKER_EVERY_S`. None is for ``live.when: always``. Live messages reach their
-    viewers by ``live_transport``, PubNub or AWS IoT.
+    viewers by ``live_transport``, AWS IoT or PubNub.
 
     Only AWS knows the billed milliseconds; ``live_ms``, ``summarize_ms`` and ``summarize_batch_ms`` (for each
     batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet in those hours.
@@ -54,7 +54,7 @@ class Usage:
     questions_per_hour: float = 0.0
     hours_per_day: float = 2.0
     watched_hours: float | None = 2.0
-    live_transport: str = "pubnub"
+    live_transport: str = IOT
     viewers: int = 1
     retention_days: int = DEFAULT_RETENTION_DAYS
     archive_days: int = 365
@@ -157,7 +157,7 @@ def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
     yield "as configured", usage
     for share, name in ((0.0, "nobody looks"), (0.1, "somebody looks a tenth of the time")):
         yield name, replace(usage, watched_hours=share * usage.hours_per_day)
-    yield "live messages by AWS IoT alone", replace(usage, live_transport=IOT)
+    yield "live messages by PubNub", replace(usage, live_transport=PUBNUB)
     for live_hz in (5.0, 2.0, 1.0, 0.0):
         if live_hz != usage.live_hz:
             name = f"live lane at {live_hz:g} Hz" if live_hz else "no live lane"

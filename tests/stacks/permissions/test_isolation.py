@@ -39,7 +39,7 @@ def test_the_isolation_table_is_large_and_has_no_duplicates():
 @pytest.fixture(scope="module")
 def roles(deployment: Any, reader: Any) -> dict[str, list[dict[str, Any]]]:
     """The statements of the roles of whoever watches or drives, with ARNs of one account."""
-    template = deployment(live_transport="iot", drivers=True, site=True).templates["iort-fleet"]
+    template = deployment(drivers=True, site=True, site_robots=["*"]).templates["iort-fleet"]
     policies = [r["Properties"] for r in template["Resources"].values() if r["Type"] == "AWS::IAM::Policy"]
     names = {"Viewer": VIEWER, "Driver": DRIVER, "PublicRole": EVERYBODY}
     return {
@@ -63,7 +63,7 @@ def test_the_roles_agree_with_the_isolation_table(roles, row):
 
 
 def test_everybody_hears_only_the_robots_of_the_site(deployment, reader):
-    template = deployment(live_transport="iot", site=True, site_robots=[A]).templates["iort-fleet"]
+    template = deployment(site=True, site_robots=[A]).templates["iort-fleet"]
     (policy,) = (
         resource["Properties"]["PolicyDocument"]
         for logical_id, resource in template["Resources"].items()

@@ -9,6 +9,7 @@ import pytest
 from functions import alert, echo, presence
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
+from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
 from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
 from iort_contract.messages.event import event_message
 from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
@@ -138,3 +139,27 @@ def test_the_brokers_own_event_is_passed_on_unchanged():
     assert event == json.loads(CONNECTED)
     assert presence.change(event)["Key"] == {ROBOT: {"S": "a"}}
     assert of_rule("presence", "$aws/events/presence/x/a", b'{"eventType": "connect_failed"}') is None
+
+
+# "Lifecycle events": a certificate's id, or IAM credentials.
+CERTIFICATE, SESSION = "0123456789abcdef" * 4, "AROAEXAMPLEEXAMPLEEX:CognitoIdentityCredentials"
+
+
+@pytest.mark.parametrize("kind", ["connected", "disconnected"])
+@pytest.mark.parametrize(
+    ("client", "principal", "noted"),
+    [
+        ("a", CERTIFICATE, True),
+        ("iort-viewer-robot", CERTIFICATE, True),
+        (f"{client_prefix(VIEWER)}0a1b2c3d", SESSION, False),
+        (f"{client_prefix(DRIVER)}0a1b2c3d", SESSION, False),
+        (f"{claim_name()}-0a1b2c3d", CERTIFICATE, False),
+        # A role that a page or program of another deployment has.
+        ("a", SESSION, False),
+        ("a", "AIDAEXAMPLEEXAMPLEEX", False),
+    ],
+)
+def test_presence_is_called_for_robots_only(client, principal, kind, noted):
+    event = {**json.loads(CONNECTED), "clientId": client, "principalIdentifier": principal, "eventType": kind}
+    sent = json.dumps(event).encode()
+    assert (of_rule("presence", f"$aws/events/presence/{kind}/{client}", sent) is not None) == noted

@@ -57,7 +57,9 @@ NEW = {
         "Arn": "arn:aws:iam::123456789012:user/a",
         "UserId": "a",
     },
-    "GetParameter": {"Parameter": {"Value": "21"}},
+    "GetParameter": lambda **asked: (
+        {"Parameter": {"Value": "21"}} if asked["Name"].startswith("/cdk") else Refused("ParameterNotFound")
+    ),
     "GetV2LoggingOptions": Refused("NotConfiguredException", "not configured", 404),
     "DescribeAccountAuditConfiguration": {
         "auditCheckConfigurations": {"LOGGING_DISABLED_CHECK": {"enabled": False}}
@@ -121,15 +123,17 @@ def settings(**given):
     return Settings(**given)
 
 
-def stack_answers(states, *, tags=(), resources=None):
-    """DescribeStacks and ListStackResources of these stacks, by noun."""
+def stack_answers(states, *, tags=(), resources=None, outputs=None):
+    """DescribeStacks and ListStackResources of these stacks, by noun; all have the same ``outputs``."""
+    told = [{"OutputKey": key, "OutputValue": value} for key, value in (outputs or {}).items()]
 
     def describe(**asked):
         noun = asked["StackName"].removeprefix("iort-")
         if noun not in states:
             return no_stack(**asked)
         given = [{"Key": key, "Value": value} for key, value in tags]
-        return {"Stacks": [{"StackName": asked["StackName"], "StackStatus": states[noun], "Tags": given}]}
+        found = {"StackName": asked["StackName"], "StackStatus": states[noun], "Tags": given}
+        return {"Stacks": [{**found, "Outputs": told}]}
 
     def listed(**asked):
         noun = asked["StackName"].removeprefix("iort-")

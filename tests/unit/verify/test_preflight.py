@@ -11,7 +11,7 @@ from botocore.exceptions import NoCredentialsError
 from iort_station.cli.console import Console
 from iort_station.errors import StationError
 from stacks.settings import Settings, SettingsError
-from tests.unit.verify.account import NEW, Account, Refused, denied, limits, settings
+from tests.unit.verify.account import NEW, Account, Refused, denied, limits, settings, stack_answers
 from verify.preflight import account
 from verify.preflight import command as preflight
 from verify.preflight.derived import derive
@@ -51,7 +51,7 @@ EVERYTHING = {"site": True, "device_defender": True, "iot_log_level": "error", "
 def test_a_new_account_passes_and_is_only_read():
     account = Account()
     findings = preflight.look(account, settings(**EVERYTHING))
-    assert len({finding.item for finding in findings}) == len(findings) == 11
+    assert len({finding.item for finding in findings}) == len(findings) == 12
     assert not preflight.stopped(findings)
     assert all(name.startswith(("Get", "List", "Describe")) for name in account.asked)
 
@@ -59,7 +59,7 @@ def test_a_new_account_passes_and_is_only_read():
 def test_a_missing_permission_is_a_warning_that_names_it():
     answers = {name: denied(f"service:{name}") for name in NEW if name != "GetCallerIdentity"}
     _, *findings = preflight.look(Account(**answers), settings(**EVERYTHING))
-    assert len(findings) == 10
+    assert len(findings) == 11
     for finding in findings:
         assert finding.verdict is WARNING
         assert finding.found.startswith("not answered: the permission service:")
@@ -125,9 +125,43 @@ def test_the_cdks_arguments_are_read_as_app_py_reads_them(tmp_path):
         ({}, denied("lambda:GetAccountSettings"), {}),
     ],
 )
-def test_what_is_not_given_follows_from_the_account(tmp_path, given, answer, derived):
-    layers = {"layer": tmp_path, "analysis_layer": tmp_path}
-    assert derive(Account(GetAccountSettings=answer), {**given, **layers}) == derived
+def test_what_is_not_given_follows_from_the_account(given, answer, derived):
+    given = {"live_transport": "iot", **given}
+    assert derive(Account(GetAccountSettings=answer), given) == derived
+
+
+STORED, DENIED = {"Parameter": {"Value": "x"}}, denied("ssm:GetParameter")
+
+
+@pytest.mark.parametrize(
+    ("given", "keys", "deployed", "derived"),
+    [
+        ({}, Refused("ParameterNotFound"), None, "iot"),
+        ({}, STORED, None, "pubnub"),
+        ({}, STORED, "iot", "pubnub"),
+        ({}, Refused("ParameterNotFound"), "pubnub", "iot"),
+        ({"live_transport": "iot"}, STORED, "pubnub", None),
+        # Nobody may look: what is deployed stays, and the default is AWS IoT.
+        ({}, DENIED, "pubnub", "pubnub"),
+        ({}, DENIED, "iot", None),
+        ({}, DENIED, None, None),
+    ],
+)
+def test_live_messages_go_by_pubnub_where_its_keys_are_stored(given, keys, deployed, derived):
+    there = (
+        stack_answers({"fleet": "UPDATE_COMPLETE"}, outputs={"LiveTransport": deployed}) if deployed else {}
+    )
+    answers = derive(Account(GetParameter=keys, **there), {"account_concurrency": "10", **given})
+    assert answers.get("live_transport") == derived
+    # A public page needs its robots with AWS IoT only, so the settings are read with the answer.
+    site = Settings(site=True, **answers)
+    assert site.public == (derived != "pubnub")
+
+
+def test_a_wrong_namespace_is_refused_before_the_account_is_asked(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["preflight", "-c", "namespace=No"])
+    with pytest.raises(SystemExit, match="preflight: namespace must be"):
+        preflight.main()
 
 
 def test_a_deployment_gets_what_the_account_decides(tmp_path, monkeypatch, capsys):
@@ -139,5 +173,12 @@ def test_a_deployment_gets_what_the_account_decides(tmp_path, monkeypatch, capsy
     preflight.main()
 
     printed = capsys.readouterr()
-    assert printed.out == "-c account_concurrency=1000\n"
+    assert printed.out == "-c account_concurrency=1000 -c live_transport=iot\n"
     assert "1000 concurrent executions" in printed.err
+    assert "live messages: by AWS IoT" in printed.err
+
+    monkeypatch.setattr(sys, "argv", ["preflight", "--derive", "--unchecked", *context])
+    preflight.main()
+    unchecked = capsys.readouterr()
+    assert unchecked.out == printed.out
+    assert unchecked.err == f"by the account: {printed.out}"

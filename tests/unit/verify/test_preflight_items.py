@@ -23,6 +23,8 @@ def exported(name, *importers):
     return {**answers, **({"ListImports": {"Imports": list(importers)}} if importers else {})}
 
 
+STORED, BY_PUBNUB = {"GetParameter": {"Parameter": {"Value": "x"}}}, {"live_transport": "pubnub"}
+
 CASES = [
     ("bootstrap", {}, {}, FINE, "version 21, needed is 6"),
     ("bootstrap", {}, {"GetParameter": Refused("ParameterNotFound")}, STOPS, "not bootstrapped"),
@@ -73,21 +75,21 @@ CASES = [
     ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 concurrent executions"),
     (
         "concurrency",
-        {"stage": "prod", "account_concurrency": 105},
+        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
         {"GetAccountSettings": limits(105, 105)},
         FINE,
         "5 are to be reserved",
     ),
     (
         "concurrency",
-        {"stage": "prod", "account_concurrency": 105},
+        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
         {"GetAccountSettings": limits(104, 104)},
         STOPS,
         "requires 100 unreserved",
     ),
     (
         "concurrency",
-        {"stage": "prod", "account_concurrency": 105},
+        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
         {
             "GetAccountSettings": limits(105, 100),
             "GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5},
@@ -98,7 +100,7 @@ CASES = [
     ),
     (
         "concurrency",
-        {"stage": "prod", "account_concurrency": 104},
+        {"stage": "prod", "account_concurrency": 104, **BY_PUBNUB},
         {"GetAccountSettings": limits(104, 104)},
         FINE,
         "0 are to be reserved",
@@ -204,6 +206,27 @@ CASES = [
         ),
         FINE,
         "no leftovers",
+    ),
+    ("live_messages", {}, {}, FINE, "by AWS IoT (live_transport=iot); PubNub's keys are not stored"),
+    ("live_messages", {}, STORED, FINE, "by AWS IoT (live_transport=iot); PubNub's keys are stored"),
+    ("live_messages", BY_PUBNUB, STORED, FINE, "by PubNub"),
+    ("live_messages", BY_PUBNUB, {}, WARNING, "nobody sees live messages"),
+    ("live_messages", {}, stack_answers(ALL, outputs={"LiveTransport": "iot"}), FINE, "by AWS IoT"),
+    (
+        "live_messages",
+        {},
+        stack_answers(ALL, outputs={"LiveTransport": "pubnub"}),
+        WARNING,
+        "deployed is PubNub: pages, site and viewers of that way hear nothing more",
+    ),
+    # A deployment from before the output.
+    ("live_messages", {}, stack_answers(ALL), WARNING, "deployed is PubNub"),
+    (
+        "live_messages",
+        BY_PUBNUB,
+        STORED | stack_answers(ALL, outputs={"LiveTransport": "iot"}),
+        WARNING,
+        "deployed is AWS IoT",
     ),
     ("changes", {}, {}, FINE, "nothing is deployed"),
     ("changes", {"site": True, "device_defender": True}, stack_answers(ALL), FINE, "none that must not be"),

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from iort_contract.catalog.metrics import METRICS, metrics_of
+from iort_contract.cloud import IOT
 from iort_station.cost.prices import MONTH_HOURS, PRICES, Price
 from iort_station.cost.usage import Usage
 
@@ -36,6 +37,9 @@ def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRI
     the account's own key."""
     hours, robots = MONTH_HOURS, usage.robots if usage.robot_metrics else 0
     metrics = len(METRICS) + robots * len(metrics_of("health"))
+    if usage.live_transport == IOT:
+        # AWS bills what is written, and nothing calls Lambda 1.
+        metrics -= len(metrics_of("live"))
     dashboards = dashboard_metrics(usage)
     counts = {
         "metrics": ("metric", max(0, metrics - FREE_METRICS)),

@@ -117,7 +117,8 @@ def test_a_statement_contains_the_deployments_parameters():
     stored = RULES["record"].statement("lab", retention_s=60)
     assert "+ 60 AS expires_s FROM 'dt/lab/+/+'" in stored
     assert RULES["battery"].statement(low_voltage_v=14).endswith("sample.voltage_input < 14")
-    assert not [rule for rule in RULES.values() if "{" in rule.statement()]
+    # A count of a regular expression has braces, too.
+    assert not [rule for rule in RULES.values() if re.search(r"\{[a-z_]", rule.statement())]
 
 
 def test_every_metrics_chart_is_drawn():

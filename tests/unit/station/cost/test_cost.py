@@ -13,7 +13,8 @@ from bench.meters import message_sizes
 from functions.shared.metrics import Gathered, emit
 from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
-from iort_contract.catalog.metrics import METRICS
+from iort_contract.catalog.metrics import METRICS, metrics_of
+from iort_contract.cloud import IOT, PUBNUB
 from iort_station.cli.main import app
 from iort_station.cost import report, scale
 from iort_station.cost.bill import line_items, model
@@ -30,7 +31,8 @@ from iort_station.cost.usage import CLOCK_PING_S, Usage
 from iort_station.errors import StationError
 from scripts.docs_parts import ROOT
 
-_ONE = Usage()
+# By PubNub, which uses every part of the model.
+_ONE = Usage(live_transport=PUBNUB)
 
 
 def _units(items, lane, price):
@@ -228,12 +230,25 @@ def test_the_modelled_length_of_other_lines_matches_the_real_lines(capsys):
 
 
 def test_the_quota_that_breaks_first_needs_the_fewest_robots():
-    paper = scale.on_paper(Usage(robots=10_000, live_concurrency=5))
+    paper = scale.on_paper(replace(_ONE, robots=10_000, live_concurrency=5))
     at = [need.robots_at_quota for need in paper.needs if need.robots_at_quota]
     assert at == sorted(at)
     assert paper.breaks_first.robots_at_quota == 5 / (10 * 0.020)
     unreserved = scale.on_paper(Usage(robots=10_000))
     assert unreserved.breaks_first.name.startswith("IoT Core")
+
+
+def test_without_pubnub_nothing_of_lambda_1_is_billed():
+    """The default deployment's whole bill, which README begins with."""
+    iot, pubnub = Usage(), _ONE
+    assert iot.live_transport == IOT
+    computed, with_lambda_1 = (
+        {item.lane for item in model.bill(one) if item.service in ("Lambda", "CloudWatch") and item.units}
+        for one in (iot, pubnub)
+    )
+    assert with_lambda_1 - computed == {"live"}
+    fixed, with_pubnub = (deployment_dollars_per_month(one)["metrics"] for one in (iot, pubnub))
+    assert with_pubnub - fixed == pytest.approx(0.3 * len(metrics_of("live")))
 
 
 def test_the_documents_and_the_model_count_the_same_monitoring():

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract.cloud import PUBNUB
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
@@ -60,7 +59,9 @@ def cost_(
     ] = None,
     live_transport: Annotated[
         str | None,
-        typer.Option(help=f"How live messages reach viewers: {' or '.join(TRANSPORTS)}. Default: {PUBNUB}."),
+        typer.Option(
+            help=f"The way to viewers: {' or '.join(TRANSPORTS)}. Default: {_DEFAULT.live_transport}."
+        ),
     ] = None,
     viewers: Annotated[int, typer.Option(help="People who watch the fleet.")] = _DEFAULT.viewers,
     retention_days: Annotated[int, typer.Option(help="Days that items are kept.")] = _DEFAULT.retention_days,
