@@ -139,21 +139,33 @@ def content(cloud: Cloud, key: str) -> bytes | None:
 
 
 def empty(cloud: Cloud, progress: CountProgress = lambda _count: None) -> None:
-    """Delete everything in the bucket, including unfinished uploads, before its stack is deleted."""
+    """Delete everything in the bucket, including unfinished uploads and earlier versions, before its stack is
+    deleted."""
     client, bucket = cloud.client("s3"), _bucket(cloud)
     uploads = client.get_paginator("list_multipart_uploads").paginate(Bucket=bucket)
     for begun in [one for page in uploads for one in page.get("Uploads", ())]:
         client.abort_multipart_upload(Bucket=bucket, Key=begun["Key"], UploadId=begun["UploadId"])
         progress(1)
-    pages = client.get_paginator("list_objects_v2").paginate(Bucket=bucket)
-    keys = iter([one["Key"] for page in pages for one in page.get("Contents", ())])
-    while chunk := list(islice(keys, _DELETE_SIZE)):
-        objects: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in chunk]
-        answer = client.delete_objects(Bucket=bucket, Delete={"Objects": objects, "Quiet": True})
+    # An object of a bucket without versions is its version "null": "ListObjectVersions".
+    pages = client.get_paginator("list_object_versions").paginate(Bucket=bucket)
+    versions: list[ObjectIdentifierTypeDef] = [
+        {"Key": one["Key"], "VersionId": one["VersionId"]}
+        for page in pages
+        for one in (*page.get("Versions", ()), *page.get("DeleteMarkers", ()))
+    ]
+    every = iter(versions)
+    while chunk := list(islice(every, _DELETE_SIZE)):
+        answer = client.delete_objects(Bucket=bucket, Delete={"Objects": chunk, "Quiet": True})
         if answer.get("Errors"):
             first = answer["Errors"][0]
             raise StationError(f"{first['Key']} cannot be deleted: {first['Code']} {first['Message']}")
         progress(len(chunk))
+
+
+def is_empty(cloud: Cloud) -> bool:
+    """Whether CloudFormation can delete the bucket: no object, and no earlier version of one."""
+    answer = cloud.client("s3").list_object_versions(Bucket=_bucket(cloud), MaxKeys=1)
+    return not answer.get("Versions") and not answer.get("DeleteMarkers")
 
 
 def _bucket(cloud: Cloud) -> str:

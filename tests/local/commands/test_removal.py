@@ -13,6 +13,7 @@ from iort_station.cli.main import app
 from iort_station.fleet import registry, robots
 from iort_station.fleet.identity import certificates, claims
 from local.deployment import deploy
+from scripts import destroy
 from tests.local.conftest import until
 
 
@@ -58,6 +59,20 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
     def iort(*arguments):
         return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
 
+    scheduler, deployment = cloud.client("scheduler"), destroy.Deployment(cloud)
+
+    def states():
+        pages = scheduler.get_paginator("list_schedules").paginate()
+        return {one["Name"]: one["State"] for page in pages for one in page["Schedules"]}
+
+    before = states()
+    deployment.pause()
+    assert {name for name, state in states().items() if state != before[name]} == {
+        name for name in before if name.startswith("lab-")
+    }
+    assert not deployment.is_empty()
+    deployment.resume()
+    assert states() == before
     # Delete a stack before the stacks whose outputs it uses.
     for noun in ("monitoring", "ingest"):
         assert destroyed(cloud, noun) == (True, ""), noun

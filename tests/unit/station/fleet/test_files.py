@@ -169,6 +169,17 @@ def test_empty_deletes_all_files(cloud, store, s3):
     assert "Uploads" not in s3.list_multipart_uploads(Bucket=FILES)
 
 
+def test_empty_deletes_earlier_versions_too(cloud, store, s3):
+    """As `prod` keeps them; CloudFormation deletes no bucket that has one."""
+    s3.put_bucket_versioning(Bucket=FILES, VersioningConfiguration={"Status": "Enabled"})
+    for content in (b"one", b"another"):
+        s3.put_object(Bucket=FILES, Key="archive/hour.parquet", Body=content)
+    s3.delete_object(Bucket=FILES, Key="archive/hour.parquet")
+    assert not files.is_empty(cloud)
+    files.empty(cloud)
+    assert files.is_empty(cloud)
+
+
 # --- the command ------------------------------------------------------------------------------------
 
 
