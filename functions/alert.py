@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from functions.shared import clients
+from functions.shared import clients, mails
 from functions.shared.environment import variables
 from functions.shared.metrics import emit
 from iort_contract.catalog.environments import AlertEnvironment
@@ -133,9 +133,7 @@ def _notices() -> Notices:
 
 
 def _notify(subject: str, text: str) -> None:
-    # "Publish", SNS API: a subject is up to 100 ASCII characters.
-    topic = variables(AlertEnvironment).alarm_topic
-    clients.sns().publish(TopicArn=topic, Subject=subject[:100], Message=text)
+    mails.send(variables(AlertEnvironment).alarm_topic, subject, text)
 
 
 def handler(event: dict[str, Any], _context: object) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from functions.shared import clients
+from functions.shared import clients, mails
 from functions.shared.analysis.failures import failure
 from functions.shared.analysis.kept import Kept
 from functions.shared.environment import variables
@@ -73,9 +73,7 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
 
 
 def _notify(subject: str, text: str) -> None:
-    # "Publish", SNS API: a subject is up to 100 ASCII characters.
-    topic = variables(PresentEnvironment).alarm_topic
-    clients.sns().publish(TopicArn=topic, Subject=subject[:100], Message=text)
+    mails.send(variables(PresentEnvironment).alarm_topic, subject, text)
 
 
 def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:
