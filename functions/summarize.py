@@ -6,6 +6,7 @@ Batches of a robot over its share are put off to `functions.later`.
 
 from __future__ import annotations
 
+import time
 from functools import cache
 from typing import Any
 
@@ -16,6 +17,7 @@ from functions.shared import clients
 from functions.shared.environment import variables
 from functions.shared.summary.processing import Bounds, processed, recompute, stored_tables
 from functions.shared.summary.share import PutOff, Share, Told
+from functions.shared.summary.volume import Volume
 from iort_contract.catalog.environments import SummarizeEnvironment
 from iort_contract.tables import RECOMPUTE_FROM_S, REPLAY
 
@@ -24,6 +26,12 @@ from iort_contract.tables import RECOMPUTE_FROM_S, REPLAY
 @cache
 def _bounds() -> Bounds:
     return Bounds(Share(), lambda changes: _put_off().put(changes), lambda *said: _told().tell(*said))
+
+
+@cache
+def _volume() -> Volume:
+    given = variables(SummarizeEnvironment)
+    return Volume(clients.dynamodb(), given.robots_table, given.record_bytes_a_day)
 
 
 @cache
@@ -45,4 +53,8 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     if event.get(REPLAY):
         # The operator's replays are not charged to a robot, and the stream continues meanwhile.
         return processed(event, beside_others=True)
-    return processed(event, bounds=_bounds())
+    answer = processed(event, bounds=_bounds())
+    left = {one["itemIdentifier"] for one in answer["batchItemFailures"]}
+    changes = (record["dynamodb"] for record in event["Records"])
+    _volume().note((one for one in changes if one["SequenceNumber"] not in left), time.time())
+    return answer

@@ -68,6 +68,7 @@ __all__ = [
     "refusals",
     "rules",
     "settings",
+    "spending",
     "stream",
 ]
 
@@ -93,6 +94,7 @@ FILES = tuple(
         "docs/reference/iort.md",
         "docs/reference/messages.md",
         "docs/explanation/processing.md",
+        "docs/explanation/security.md",
     )
 )
 PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"
@@ -176,6 +178,13 @@ def stream(name: str) -> None:
 def settings() -> None:
     """The deployment's parameters."""
     _table(("key", "default", "meaning"), cloud_tables.settings_rows(), right=False)
+
+
+def spending() -> None:
+    """What one robot and one stranger can spend at most, by the default deployment's templates."""
+    from scripts import ceilings  # noqa: PLC0415 - the CDK takes seconds to load
+
+    _table(("who", "what", "at most", "held by", "dollars a day"), ceilings.rows(), right=False)
 
 
 def questions() -> None:

@@ -14,9 +14,10 @@ from stacks.parts import iot_core
 from stacks.parts.base import PlatformStack
 from stacks.settings import Settings
 
-# The "Audit checks" of certificates, policies and clients. The others concern role aliases, Cognito and
-# intermediate authorities, which this platform does not use.
+# The "Audit checks" of certificates, policies, clients and Cognito's identities. The others concern role
+# aliases and intermediate authorities, which this platform does not use.
 _CHECKS = (
+    "AUTHENTICATED_COGNITO_ROLE_OVERLY_PERMISSIVE_CHECK",
     "CA_CERTIFICATE_EXPIRING_CHECK",
     "CA_CERTIFICATE_KEY_QUALITY_CHECK",
     "CONFLICTING_CLIENT_IDS_CHECK",
@@ -27,19 +28,27 @@ _CHECKS = (
     "LOGGING_DISABLED_CHECK",
     "REVOKED_CA_CERTIFICATE_STILL_ACTIVE_CHECK",
     "REVOKED_DEVICE_CERTIFICATE_STILL_ACTIVE_CHECK",
+    "UNAUTHENTICATED_COGNITO_ROLE_OVERLY_PERMISSIVE_CHECK",
 )
-# The resources that these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, without IAM and
-# Cognito, which only the disabled checks read.
+# What these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, without role aliases and the
+# services last accessed, which only the disabled checks read.
 _AUDIT_READS = (
-    "DescribeCACertificate",
-    "DescribeCertificate",
-    "GetEffectivePolicies",
-    "GetLoggingOptions",
-    "GetPolicy",
-    "GetV2LoggingOptions",
-    "ListCACertificates",
-    "ListCertificates",
-    "ListPolicies",
+    "cognito-identity:GetIdentityPoolRoles",
+    "iam:GetPolicy",
+    "iam:GetPolicyVersion",
+    "iam:GetRole",
+    "iam:GetRolePolicy",
+    "iam:ListAttachedRolePolicies",
+    "iam:ListRolePolicies",
+    "iot:DescribeCACertificate",
+    "iot:DescribeCertificate",
+    "iot:GetEffectivePolicies",
+    "iot:GetLoggingOptions",
+    "iot:GetPolicy",
+    "iot:GetV2LoggingOptions",
+    "iot:ListCACertificates",
+    "iot:ListCertificates",
+    "iot:ListPolicies",
 )
 # AWS IoT creates this log group and never expires it; docs/how-to/alarms.md says how to set the retention.
 _LOG_GROUP = "AWSIotLogsV2"
@@ -57,9 +66,7 @@ class Account(PlatformStack):
 
     def _audit(self) -> None:
         role = iot_core.role(self, "AuditRole")
-        role.add_to_policy(
-            iam.PolicyStatement(actions=[f"iot:{action}" for action in _AUDIT_READS], resources=["*"])
-        )
+        role.add_to_policy(iam.PolicyStatement(actions=[*_AUDIT_READS], resources=["*"]))
         on = iot.CfnAccountAuditConfiguration.AuditCheckConfigurationProperty(enabled=True)
         audit = iot.CfnAccountAuditConfiguration(
             self,

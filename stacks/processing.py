@@ -30,7 +30,16 @@ from iort_contract.catalog.rules import Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.requests.ask import ASK_FOLDER
 from iort_contract.messages.requests.files import FILES_PREFIX
-from iort_contract.tables import ALERT_PREFIX, ASKED_PREFIX, FILES_BYTES, FILES_DAY, STREAMS, TOPIC
+from iort_contract.tables import (
+    ALERT_PREFIX,
+    ASKED_PREFIX,
+    FILES_BYTES,
+    FILES_DAY,
+    RECORD_BYTES,
+    RECORD_DAY,
+    STREAMS,
+    TOPIC,
+)
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
@@ -109,9 +118,11 @@ class Processing(PlatformStack):
 
     def _summarize(self, put_off: sqs.Queue) -> None:
         environment = SummarizeEnvironment(
-            **vars(self._summarizing_environment()), put_off_queue=put_off.queue_url
+            **vars(self._summarizing_environment()),
+            put_off_queue=put_off.queue_url,
+            record_bytes_a_day=self.settings.record_gb_a_day * 10**9,
         )
-        summarize = self._summarizing("Summarize", environment)
+        summarize = self._summarizing("Summarize", environment, RECORD_DAY, RECORD_BYTES)
         allow(summarize, ["sqs:SendMessage"], put_off.queue_arn)
         # It tells a robot in its shadow that the robot is over its share. AWS IoT: "Action resources".
         shadow = self.format_arn(service="iot", resource="thing", resource_name=f"*/{SHADOW}")
@@ -168,9 +179,9 @@ class Processing(PlatformStack):
         )
 
     def _summarizing(
-        self, name: str, environment: LaterEnvironment, *, reserved_concurrency: int = 0
+        self, name: str, environment: LaterEnvironment, *keeps: str, reserved_concurrency: int = 0
     ) -> lambda_.Function:
-        """A function that reads batches and writes seconds."""
+        """A function that reads batches and writes seconds; it ``keeps`` these attributes of robots, too."""
         made = function(
             self,
             name,
@@ -182,7 +193,7 @@ class Processing(PlatformStack):
         self._storage.telemetry.grant(made, "dynamodb:Query")
         self._storage.summary.grant(made, "dynamodb:BatchWriteItem")
         self._storage.robots.grant(made, "dynamodb:GetItem")
-        self._storage.may_keep(made, STREAMS)
+        self._storage.may_keep(made, STREAMS, *keeps)
         if self.settings.archive:
             self._storage.may_change(self._storage.archive, made, TOPIC, HOUR, DUE_MS, FIRST_DUE_MS)
         return made

@@ -32,6 +32,14 @@ OWN_LOGS, ALL_LOGS = "own", "all"
 ALL_ROBOTS = ["*"]
 # AWS IoT ends a connection with more subscriptions.
 _MOST_SITE_ROBOTS = 50
+# "AWS IoT Core endpoints and quotas", message broker: a connection's throughput is 512 KB a second, in at
+# most 100 messages, each of which may begin another unit of 1 KB.
+CONNECTION_BYTES_S, CONNECTION_MESSAGES_S = 512 * 1024, 100
+A_ROBOTS_MOST = CONNECTION_BYTES_S // 1024 + CONNECTION_MESSAGES_S
+# Write units a second of a robot with lidar: docs/explanation/cost.md. Summaries are by second and stream.
+_WRITES = {"Batches": 50, "Summary": 20}
+# These tables grow by events, not by samples. Refused messages wait in their queue instead.
+_WRITES_OF_ALL = {"Robots": 500, "Archive": 500, "Quarantine": 200, "Findings": 500}
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
@@ -166,7 +174,17 @@ class Settings(BaseModel):
         "[the archive](archive.md). `false`: no more hours do",
     )
     files_days: Annotated[int, _whole(0, 3650)] = Field(
-        default=0, description="lifetime of uploaded files; 0: for good"
+        default=365, description="lifetime of uploaded files; 0: for good"
+    )
+    fleet_robots: Annotated[int, _whole(1, 100_000)] = Field(
+        default=20,
+        description="how many robots drive at once: the tables take that many writes a second, and no more "
+        "([what that bounds](../explanation/security.md#what-one-can-spend-at-most))",
+    )
+    record_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
+        default=5,
+        description="what a robot may record a day, in 1e9 bytes; above it an alarm goes off. AWS IoT has no "
+        "limit of a day, so nothing is refused",
     )
     upload_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
         default=50, description="a robot's daily upload limit, in 1e9 bytes"
@@ -314,6 +332,19 @@ class Settings(BaseModel):
         """Whether anybody may see live messages, by an identity of Amazon Cognito. The embedded cloud has it
         for whoever builds such a page: it listens on loopback."""
         return self.embedded or (self.site and self.live_transport == IOT)
+
+    @property
+    def writes(self) -> dict[str, int]:
+        """The most write units a second of each table, by its construct: for the whole fleet, and beside it
+        for one robot that writes as much as AWS IoT takes from a connection."""
+        return {
+            table: A_ROBOTS_MOST + of_a_robot * self.fleet_robots for table, of_a_robot in _WRITES.items()
+        } | _WRITES_OF_ALL
+
+    @property
+    def telemetry_writes(self) -> int:
+        """The most write units a second of the telemetry table."""
+        return self.writes["Batches"]
 
     @property
     def retention_s(self) -> int:

@@ -18,12 +18,15 @@ from stacks.settings import Settings
 # Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not
 # move objects below 128 KB, which it would make dearer.
 _RARE_AFTER_DAYS = 30
+# How long a deleted or replaced object can be restored in `prod`: docs/how-to/restore.md.
+VERSIONS_DAYS = 30
 _TEXT = dynamodb.AttributeType.STRING
 
 
 class Storage(PlatformStack):
-    """Six tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
-    time. The quarantine has one item per message, by robot, and the findings one per finding and drive.
+    """Six tables, paid by request up to a limit, and a bucket. Every topic is a time series: partition key
+    topic, sort key time. The quarantine has one item per message, by robot, and the findings one per finding
+    and drive.
 
     All other stacks use ``encryption`` for their resources.
     """
@@ -74,6 +77,8 @@ class Storage(PlatformStack):
             point_in_time_recovery_specification=dynamodb.PointInTimeRecoverySpecification(
                 point_in_time_recovery_enabled=self.settings.protected
             ),
+            # AWS applies it at its best: "DynamoDB maximum throughput for on-demand tables".
+            max_write_request_units=self.settings.writes[name],
             **self.encryption.table,
         )
         CfnOutput(self, output or f"{name}Table", value=table.table_name)
@@ -102,13 +107,33 @@ class Storage(PlatformStack):
         role.grant_principal.add_to_principal_policy(statement)
 
     def _files(self) -> s3.Bucket:
-        """Files too large for a message. Not versioned: a key is written once and names its content, and our
-        code deletes nothing, so a second version could only be a file that somebody deleted."""
+        """Files too large for a message, and what is kept of telemetry. In `prod` what a function or a person
+        deletes or writes over stays as an earlier version for a month; no role of ours may delete one."""
+        protected = self.settings.protected
+        soon = Duration.days(1) if protected else None
         rules = [
             s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
-            s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
-            s3.LifecycleRule(id="plans", prefix=PLANS_PREFIX, expiration=Duration.days(7)),
+            s3.LifecycleRule(
+                id="results",
+                prefix=RESULTS_PREFIX,
+                expiration=Duration.days(1),
+                noncurrent_version_expiration=soon,
+            ),
+            s3.LifecycleRule(
+                id="plans",
+                prefix=PLANS_PREFIX,
+                expiration=Duration.days(7),
+                noncurrent_version_expiration=soon,
+            ),
         ]
+        if protected:
+            rules.append(
+                s3.LifecycleRule(
+                    id="versions",
+                    noncurrent_version_expiration=Duration.days(VERSIONS_DAYS),
+                    expired_object_delete_marker=True,
+                )
+            )
         # Read at once as ever, stored at a sixth of the price, and kept for good.
         rarest = s3.Transition(
             storage_class=s3.StorageClass.GLACIER_INSTANT_RETRIEVAL,
@@ -132,6 +157,7 @@ class Storage(PlatformStack):
             enforce_ssl=True,
             minimum_tls_version=1.2,
             lifecycle_rules=rules,
+            versioned=protected,
             # CloudFormation deletes only an empty bucket, so `iort files empty` comes first. The CDK's own
             # way deploys a function that may delete every object, for good.
             removal_policy=self.settings.removal_policy,

@@ -14,6 +14,9 @@ DEFAULT_RETENTION_DAYS = 90
 ROBOT = "robot"
 # Registry: the day (UTC) and the bytes of a robot's upload quota.
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
+# Registry: the day (UTC) and the bytes that a robot has recorded on it.
+RECORD_DAY, RECORD_BYTES = "record_day", "record_bytes"
+DAYS = (FILES_DAY, FILES_BYTES, RECORD_DAY, RECORD_BYTES)
 # Registry: the hour (UTC) and the number of a robot's questions, two attributes for each with this prefix.
 ASKED_PREFIX = "asked_"
 # Registry: the time of the last mail, one attribute per cause with this prefix.

@@ -38,11 +38,20 @@ EVERY_RESOURCE = {
     ),
     # An audit covers all certificates and policies, whoever owns them.
     *(
-        ("AuditRole", f"iot:{action}")
-        for action in (
-            *("DescribeCACertificate", "DescribeCertificate", "GetEffectivePolicies", "GetLoggingOptions"),
-            *("GetPolicy", "GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
-        )
+        ("AuditRole", f"{service}:{action}")
+        for service, actions in {
+            "cognito-identity": ("GetIdentityPoolRoles",),
+            "iam": (
+                *("GetPolicy", "GetPolicyVersion", "GetRole", "GetRolePolicy"),
+                *("ListAttachedRolePolicies", "ListRolePolicies"),
+            ),
+            "iot": (
+                *("DescribeCACertificate", "DescribeCertificate", "GetEffectivePolicies"),
+                *("GetLoggingOptions", "GetPolicy", "GetV2LoggingOptions", "ListCACertificates"),
+                *("ListCertificates", "ListPolicies"),
+            ),
+        }.items()
+        for action in actions
     ),
 }
 # The CDK grants these to the users of a key: each is the variants of one action, on the key alone.

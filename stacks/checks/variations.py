@@ -26,6 +26,8 @@ FLIPS: dict[str, dict[str, Any]] = {
         "retention_days": 7,
         "archive": False,
         "files_days": 30,
+        "fleet_robots": 5,
+        "record_gb_a_day": 1,
         "upload_gb_a_day": 5,
         "live_concurrency": 5,
         "account_concurrency": 1000,

@@ -33,6 +33,8 @@ class Alarms(Construct):
         for name, table in watched.tables.items():
             throttled = metrics.table("WriteThrottleEvents", table).with_(period=_FIVE_MINUTES)
             self._add(f"{name}Throttled", throttled)
+        written = metrics.table("ConsumedWriteCapacityUnits", watched.tables["Batches"])
+        self._add("BatchesVolume", written.with_(period=Duration.hours(1)))
         for name, reader in watched.readers.items():
             self._add(f"{name}Behind", metrics.function("IteratorAge", reader))
         for name, machine in watched.machines.items():

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.catalog.rules import RULES
-from iort_contract.cloud import IOT, PLANS_PREFIX, PUBNUB, RESULTS_PREFIX
+from iort_contract.cloud import ANALYSIS_PREFIX, IOT, PLANS_PREFIX, PUBNUB, RESULTS_PREFIX
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.bill.model import RECORDS_A_CALL, WINDOW_S
-from tests.stacks.templates import layers, name
+from stacks.checks.invariants import granted, several
+from stacks.checks.variations import EVERYTHING
+from stacks.settings import A_ROBOTS_MOST, Settings
+from stacks.storage import VERSIONS_DAYS
+from tests.stacks.templates import Reader, layers, name
+from tests.stacks.updates.test_flips import identity
 
 WAYS = {IOT: {}, PUBNUB: {"live_transport": PUBNUB}}
 
@@ -137,6 +143,29 @@ def test_the_tables_keys_are_the_contracts(synthesized):
         "Batches": {"StreamViewType": "NEW_IMAGE"}
     }
     assert {v["BillingMode"] for v in tables.values()} == {"PAY_PER_REQUEST"}
+
+
+def test_no_table_takes_more_than_the_fleet_and_one_robot_at_its_worst(deployment):
+    def most(**settings):
+        resources = deployment(**settings).templates["iort-storage"]["Resources"]
+        return {
+            name(key): one["Properties"]["OnDemandThroughput"]["MaxWriteRequestUnits"]
+            for key, one in resources.items()
+            if one["Type"] == "AWS::DynamoDB::Table"
+        }
+
+    few, many = most(fleet_robots=5), most(fleet_robots=105)
+    assert few.keys() == {"Batches", "Summary", "Robots", "Archive", "Quarantine", "Findings"}
+    # A robot with lidar stores 50 KB a second; a hostile one what AWS IoT takes from a connection.
+    assert (many["Batches"] - few["Batches"]) / 100 == 50
+    assert min(few["Batches"], few["Summary"]) > A_ROBOTS_MOST == 612
+    assert Settings().writes == most()
+
+
+def test_the_volume_alarm_is_half_of_what_the_table_takes_for_an_hour(alarms):
+    volume = alarms["BatchesVolume"]
+    assert (volume["MetricName"], volume["Period"]) == ("ConsumedWriteCapacityUnits", 3600)
+    assert volume["Threshold"] == Settings().writes["Batches"] * 3600 / 2
 
 
 # --- functions --------------------------------------------------------------------------------------
@@ -291,7 +320,6 @@ def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
     from aws_cdk import App
 
     from app import build
-    from stacks.settings import Settings
 
     layer = tmp_path_factory.mktemp("layer")
     (layer / "nothing.py").touch()
@@ -300,9 +328,34 @@ def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
     build(app, Settings(namespace="lab2", **layers(layer), retention_days=7, **account))
     stacks = app.synth().stacks
     assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
-    text = json.dumps([stack.template for stack in stacks])
+    # An alarm's advice names a program.
+    text = json.dumps([stack.template for stack in stacks]).replace("`iort-agent ", "")
     assert not any(word in text for word in ("iort/", "/iort", "iort_", "iort-", "iort."))
     assert f"+ {7 * 86_400} AS expires_s" in text
+
+
+def test_two_environments_in_one_account_share_no_name(deployment):
+    """A stage dev and a stage prod with everything, beside each other: stacks, exports, and what has a name
+    of ours. The account's own settings exist once, and the preflight asks for them; a role's policy is within
+    its role."""
+    apart = {"AWS::IoT::AccountAuditConfiguration", "AWS::IoT::Logging", "AWS::IAM::Policy"}
+
+    def names(**settings):
+        templates = deployment(**settings).templates
+        yield from (("stack", stack) for stack in templates)
+        for template in templates.values():
+            for output in template.get("Outputs", {}).values():
+                if "Export" in output:
+                    yield "export", json.dumps(output["Export"]["Name"])
+            for one in template["Resources"].values():
+                # A reference is another name in each deployment.
+                if one["Type"] not in apart and "'Ref'" not in (text := str(identity(one))) != "None":
+                    yield one["Type"], text
+
+    dev = set(names(**{**EVERYTHING, "stage": "dev"}))
+    prod = set(names(**EVERYTHING, namespace="lab2"))
+    assert {kind for kind, _ in dev} == {kind for kind, _ in prod} >= {"stack", "export", "AWS::IoT::Policy"}
+    assert not dev & prod
 
 
 # --- files ------------------------------------------------------------------------------------------
@@ -317,7 +370,8 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
     (ownership,) = bucket["OwnershipControls"]["Rules"]
     assert ownership["ObjectOwnership"] == "BucketOwnerEnforced"
     rules = {rule["Id"]: rule for rule in bucket["LifecycleConfiguration"]["Rules"]}
-    assert rules.keys() == {"abandoned", "results", "plans", "archive", "rare"}
+    assert rules.keys() == {"abandoned", "results", "plans", "archive", "rare", "old"}
+    assert "VersioningConfiguration" not in bucket
     # What is archived is kept for good.
     assert rules["archive"]["Prefix"] == ARCHIVE_PREFIX
     assert "ExpirationInDays" not in rules["archive"]
@@ -328,9 +382,8 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
         RESULTS_PREFIX,
         1,
     )
-    # Without the setting, uploaded files are kept.
-    assert rules["rare"]["Prefix"] == FILES_PREFIX
-    assert "ExpirationInDays" not in rules["rare"]
+    assert rules["rare"]["Prefix"] == rules["old"]["Prefix"] == FILES_PREFIX
+    assert rules["old"]["ExpirationInDays"] == 365
     (policy,) = synthesized.resources("AWS::S3::BucketPolicy").values()
     statements = policy["PolicyDocument"]["Statement"]
     assert {statement["Effect"] for statement in statements} == {"Deny"}
@@ -342,12 +395,12 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
 
 
 @pytest.mark.parametrize(
-    ("days", "kept"), [(7, {"old": 7}), (30, {"old": 30}), (365, {"rare": None, "old": 365})]
+    ("days", "kept"),
+    [(7, {"old": 7}), (30, {"old": 30}), (365, {"rare": None, "old": 365}), (0, {"rare": None})],
 )
 def test_files_expire_after_the_configured_days(tmp_path, days, kept):
     from aws_cdk import App
 
-    from stacks.settings import Settings
     from stacks.storage import Storage
 
     app = App(outdir=str(tmp_path))
@@ -356,3 +409,33 @@ def test_files_expire_after_the_configured_days(tmp_path, days, kept):
     (bucket,) = [r["Properties"] for r in template["Resources"].values() if r["Type"] == "AWS::S3::Bucket"]
     rules = bucket["LifecycleConfiguration"]["Rules"]
     assert {r["Id"]: r.get("ExpirationInDays") for r in rules if r["Id"] in {"rare", "old"}} == kept
+
+
+def test_in_prod_what_is_deleted_or_replaced_stays_for_a_month(production):
+    (bucket,) = production.resources("AWS::S3::Bucket").values()
+    assert bucket["VersioningConfiguration"] == {"Status": "Enabled"}
+    rules = {rule["Id"]: rule for rule in bucket["LifecycleConfiguration"]["Rules"]}
+    assert {
+        rule["Id"]: rule["NoncurrentVersionExpiration"]["NoncurrentDays"]
+        for rule in rules.values()
+        if "NoncurrentVersionExpiration" in rule
+    } == {"versions": VERSIONS_DAYS, "results": 1, "plans": 1}
+    assert rules["versions"]["ExpiredObjectDeleteMarker"] is True
+    assert not {"Prefix", "ExpirationInDays"} & rules["versions"].keys()
+
+
+def test_who_may_delete_what_by_prefix(synthesized, production):
+    """No role may delete an earlier version, or change how long one stays."""
+    for app in (synthesized, production):
+        reader = Reader(app)
+        deletes = set()
+        for template in app.templates.values():
+            for logical_id, one in template["Resources"].items():
+                for role, statement in granted(logical_id, one["Type"], one.get("Properties", {})):
+                    for action in several(statement["Action"]):
+                        if re.fullmatch(r"s3:(Delete|Put(Lifecycle|BucketVersioning)|Bypass).*", action):
+                            deletes |= {(role, action, text) for text in reader.texts(statement["Resource"])}
+        assert deletes == {
+            ("ArchiveRole", "s3:DeleteObject", f"Files.Arn/{ARCHIVE_PREFIX}*"),
+            ("PresentRole", "s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*"),
+        }

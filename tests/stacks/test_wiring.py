@@ -75,7 +75,7 @@ def test_the_variables_have_the_values_that_the_functions_expect(functions, read
     parameter = pubnub_parameter()
     assert given("Later", environments.LaterEnvironment) == later
     assert given("Summarize", environments.SummarizeEnvironment) == environments.SummarizeEnvironment(
-        **vars(later), put_off_queue="PutOff"
+        **vars(later), put_off_queue="PutOff", record_bytes_a_day=5 * 10**9
     )
     assert given("Echo", environments.EchoEnvironment) == environments.EchoEnvironment(name, "Rejected")
     assert given("Upload", environments.UploadEnvironment) == files

@@ -5,6 +5,7 @@ from __future__ import annotations
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.catalog.rules import RULES
+from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import rule_name
 from iort_station.cost.scale import on_paper
 from iort_station.cost.usage import Usage
@@ -17,6 +18,8 @@ from verify.preflight.finding import Clients, Found, code, fine, item, listed, s
 # manifest.
 BOOTSTRAP = 6
 BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
+# "CreatePolicyVersion", AWS IoT: with five, one must be deleted first.
+POLICY_VERSIONS = 5
 # The quotas should suffice for this fleet.
 ROBOTS = 100
 # Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/scale.py).
@@ -174,4 +177,50 @@ def quotas(clients: Clients, settings: Settings) -> Found:
     return fine(text)
 
 
-ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas)
+@item("spending", "the settings")
+def spending(_clients: Clients, settings: Settings) -> Found:
+    """Say loudly who hears of costs, and what bounds them."""
+    lacking = {
+        "alarm_email": "nobody hears of an alarm",
+        "budget_usd": "nobody hears of the bill before its end of the month",
+    }
+    missing = {name: why for name, why in lacking.items() if not getattr(settings, name)}
+    if not settings.files_days:
+        missing["files_days"] = "uploaded files are kept, and paid, for good"
+    text = (
+        f"telemetry takes at most {settings.telemetry_writes:,} write units a second "
+        f"(fleet_robots={settings.fleet_robots})"
+    )
+    if not missing or settings.embedded:
+        return fine(text)
+    return warning(
+        f"{text}; not set: {'; '.join(f'{name}: {why}' for name, why in missing.items())}",
+        "-c alarm_email=you@example.org -c budget_usd=50 (docs/explanation/security.md, what one can spend)",
+    )
+
+
+@item("policy versions", "iot ListPolicyVersions of the robots' and the claims' policy")
+def policy_versions(clients: Clients, settings: Settings) -> Found:
+    """Check that a changed policy has room for another version."""
+    counts = {}
+    for name in (fleet_name(settings.namespace), claim_name(settings.namespace)):
+        try:
+            answer = clients.client("iot").list_policy_versions(policyName=name)
+        except ClientError as error:
+            if code(error) != "ResourceNotFoundException":
+                raise
+            continue
+        counts[name] = len(answer["policyVersions"])
+    if not counts:
+        return fine("no policy yet")
+    text = ", ".join(f"{name} has {count} of {POLICY_VERSIONS}" for name, count in counts.items())
+    if max(counts.values()) < POLICY_VERSIONS:
+        return fine(text)
+    return warning(
+        f"{text}: AWS IoT takes no other version of a policy that has {POLICY_VERSIONS}",
+        "if this deployment changes the policy, delete an old version first: `aws iot list-policy-versions "
+        "--policy-name NAME`, `aws iot delete-policy-version --policy-name NAME --policy-version-id 1`",
+    )
+
+
+ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas, spending, policy_versions)

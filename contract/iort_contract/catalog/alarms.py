@@ -62,7 +62,8 @@ ERRORS = Alarm(
 )
 THROTTLED = Alarm(
     "the table refused writes",
-    "a partition takes 1,000 units a second: one robot sends that much, or the table is new and grows",
+    "a partition takes 1,000 units a second, and the table what `fleet_robots` gives it: one robot sends "
+    "that much, or the fleet has grown",
 )
 BEHIND = Alarm(
     "the stream is read late",
@@ -77,6 +78,14 @@ FAILED = Alarm(
     "the execution's history in Step Functions names the state and its error; afterwards run "
     "`iort analyse --fleet --new`. A drive that fails is a finding instead, and fails no execution",
 )
+# Of an hour, half of what the table takes at most.
+VOLUME = Alarm(
+    "the robots write half of what the table takes at most, for an hour",
+    "Lambda 2's log names a robot over its daily bytes, and `iort cost` says what a robot should write; "
+    "mend what it sends, or `iort robots remove`. A fleet that has grown needs a larger `fleet_robots`",
+    threshold="telemetry_writes",
+    factor=3600 / 2,
+)
 # By the ends of their names.
 OF_RESOURCES = {
     "Waiting": WAITING,
@@ -86,7 +95,11 @@ OF_RESOURCES = {
     "Failed": FAILED,
 }
 # By their names.
-OF_ONE_RESOURCE = {"PutOffWaiting": PUT_OFF_WAITING, "ArchiveTasksWaiting": ARCHIVE_TASKS_WAITING}
+OF_ONE_RESOURCE = {
+    "PutOffWaiting": PUT_OFF_WAITING,
+    "ArchiveTasksWaiting": ARCHIVE_TASKS_WAITING,
+    "BatchesVolume": VOLUME,
+}
 # Messages that can be lost without being in quarantine, by AWS' namespace and metric. Account-wide, since AWS
 # documents no values for some of the dimensions.
 OF_THE_ACCOUNT = {

@@ -62,9 +62,10 @@ class LaterEnvironment(Environment):
 
 @dataclass(frozen=True)
 class SummarizeEnvironment(LaterEnvironment):
-    """Lambda 2, which puts batches off for `later`."""
+    """Lambda 2, which puts batches off for `later`, and counts what each robot records."""
 
     put_off_queue: str
+    record_bytes_a_day: int
 
 
 @dataclass(frozen=True)

@@ -147,6 +147,17 @@ METRICS = {
             ),
         ),
         Metric("BatchesPutOff", "summarize", GAPS_CHART),
+        Metric(
+            "RobotsOverVolume",
+            "summarize",
+            BATCHES_CHART,
+            right=True,
+            alarm=Alarm(
+                "a robot has recorded more than its bytes of a day",
+                "nothing is refused, and it costs money: Lambda 2's log names the robot; mend what it sends "
+                "(`record` in car.yaml), raise `record_gb_a_day`, or `iort robots remove`",
+            ),
+        ),
         Metric("SamplesSummarized", "summarize", BATCHES_CHART),
         Metric("BatchesSummarized", "summarize", BATCHES_CHART),
         Metric("AgentReports", "health", REPORTS_CHART),

@@ -66,9 +66,9 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 39
+    alarms: int = 41
     insights_metrics: int = 63
-    dashboards: tuple[int, ...] = (49, 20, 21)
+    dashboards: tuple[int, ...] = (49, 20, 22)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False

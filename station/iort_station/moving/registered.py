@@ -19,8 +19,7 @@ from iort_contract.tables import (
     ALERT_PREFIX,
     ASKED_PREFIX,
     CONNECTED_MS,
-    FILES_BYTES,
-    FILES_DAY,
+    DAYS,
     MOVED_FROM,
     OVER_SHARE,
     PRESENCE,
@@ -37,7 +36,7 @@ from iort_station.fleet.identity.bundle import Bundle
 from iort_station.moving.plan import origin
 
 # What a registry's row says of the deployment and not of the robot.
-_STAYS = frozenset({ROBOT, FILES_DAY, FILES_BYTES, MOVED_FROM, *PRESENCE, *ADMISSION}) - {SERIAL}
+_STAYS = frozenset({ROBOT, MOVED_FROM, *DAYS, *PRESENCE, *ADMISSION}) - {SERIAL}
 _COUNTERS = (ALERT_PREFIX, ASKED_PREFIX)
 
 

@@ -6,7 +6,16 @@ from iort_contract.archive import ARCHIVE_PREFIX, DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.requests.ask import ASK_FOLDER
 from iort_contract.messages.requests.files import FILES_PREFIX
-from iort_contract.tables import BATCH, EXPIRES_S, PRESENCE, PUT_OFF_TO_S, STREAMS, TOPIC
+from iort_contract.tables import (
+    BATCH,
+    EXPIRES_S,
+    PRESENCE,
+    PUT_OFF_TO_S,
+    RECORD_BYTES,
+    RECORD_DAY,
+    STREAMS,
+    TOPIC,
+)
 from iort_contract.topics import SHADOW
 from stacks.checks.invariants import EVERY_RESOURCE, LOG_DELIVERY
 
@@ -307,7 +316,7 @@ KEEPS = {
     "AlertRole": ("alert_*",),
     "PresenceRole": PRESENCE,
     "LaterRole": (STREAMS,),
-    "SummarizeRole": (STREAMS,),
+    "SummarizeRole": (RECORD_BYTES, RECORD_DAY, STREAMS),
     "UploadRole": ("files_bytes", "files_day"),
     "AnswerRole": ("asked_*",),
 }

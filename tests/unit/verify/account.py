@@ -75,6 +75,7 @@ NEW = {
     "DescribeThingGroup": absent,
     "GetPolicy": absent,
     "DescribeProvisioningTemplate": absent,
+    "ListPolicyVersions": absent,
     "ListDashboards": {"DashboardEntries": []},
     "ListTables": {"TableNames": []},
     "ListBuckets": {"Buckets": []},

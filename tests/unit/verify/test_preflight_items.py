@@ -25,7 +25,25 @@ def exported(name, *importers):
 
 STORED, BY_PUBNUB = {"GetParameter": {"Parameter": {"Value": "x"}}}, {"live_transport": "pubnub"}
 
+
+def versions(count):
+    return {"ListPolicyVersions": {"policyVersions": [{"versionId": str(i)} for i in range(count)]}}
+
+
 CASES = [
+    ("spending", {}, {}, WARNING, "alarm_email: nobody hears of an alarm; budget_usd: nobody hears"),
+    ("spending", {"alarm_email": "a@b.org"}, {}, WARNING, "not set: budget_usd"),
+    ("spending", {"alarm_email": "a@b.org", "budget_usd": 50}, {}, FINE, "at most 1,612 write units"),
+    (
+        "spending",
+        {"alarm_email": "a@b.org", "budget_usd": 50, "files_days": 0},
+        {},
+        WARNING,
+        "not set: files_days: uploaded files are kept",
+    ),
+    ("policy_versions", {}, {}, FINE, "no policy yet"),
+    ("policy_versions", {}, versions(4), FINE, "iort-robot has 4 of 5, iort-claim has 4 of 5"),
+    ("policy_versions", {}, versions(5), WARNING, "takes no other version"),
     ("bootstrap", {}, {}, FINE, "version 21, needed is 6"),
     ("bootstrap", {}, {"GetParameter": Refused("ParameterNotFound")}, STOPS, "not bootstrapped"),
     (

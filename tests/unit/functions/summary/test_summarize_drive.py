@@ -7,6 +7,7 @@ import random
 import pytest
 
 from functions import summarize
+from functions.shared.summary.volume import size_of
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
@@ -15,6 +16,7 @@ from tests.fakes import (
     NAMES,
     ROBOTS,
     SUMMARY,
+    TELEMETRY,
 )
 from tests.recordings import recording
 from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, counted, drive_of
@@ -27,6 +29,7 @@ def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys
         monkeypatch.setenv(f"{queue}_QUEUE", f"https://sqs.example/{queue}")
     monkeypatch.setenv("ARCHIVE_TABLE", ARCHIVE)
     monkeypatch.setenv("ROBOT_METRICS", "false")
+    monkeypatch.setenv("RECORD_BYTES_A_DAY", "1")
     dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream = Stream(dynamodb)
     drive = [
@@ -43,6 +46,9 @@ def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys
     assert {s for s, item in by_second.items() if item["missing_batches"]} == {8}
     assert all(item["speed_mps_mean"] == second for second, item in by_second.items())
     assert counted(capsys)["SamplesSummarized"] == 39 * 50
+    row = plain(dynamodb.get_item(TableName=ROBOTS, Key={"robot": {"S": "car"}})["Item"])
+    stored = dynamodb.scan(TableName=TELEMETRY)["Items"]
+    assert row["record_bytes"] == sum(map(size_of, stored)) > 0
     # The same through the fake: it must behave as moto does.
     fake = Stream()
     fake.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})

@@ -23,10 +23,9 @@ from iort_contract.tables import (
     ALERT_PREFIX,
     ASKED_PREFIX,
     CONNECTED_MS,
+    DAYS,
     DISCONNECT_REASON,
     DISCONNECTED_MS,
-    FILES_BYTES,
-    FILES_DAY,
     GAIN_SET_MS,
     LAST_SEEN_MS,
     ONLINE,
@@ -250,7 +249,7 @@ def _parameter(text: str) -> tuple[str, float]:
 
 def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
     """A robot's row with every attribute that an operator may use; null is not known."""
-    known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, FILES_DAY, FILES_BYTES))
+    known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, *DAYS))
     told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
     told |= {name: float(row[name]) for name in (*robots.F1TENTH, *KNOWN) if name in row}
     for name in (CONNECTED_MS, DISCONNECTED_MS, LAST_SEEN_MS, ADMITTED_MS):
@@ -276,7 +275,7 @@ def _connection(row: Mapping[str, Any]) -> str:
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {ROBOT, GAIN_SET_MS, FILES_DAY, FILES_BYTES, STREAMS, *PRESENCE, *ADMISSION}
+    known = {ROBOT, GAIN_SET_MS, *DAYS, STREAMS, *PRESENCE, *ADMISSION}
     return ", ".join(
         f"{key} {value}"
         for key, value in sorted(row.items())
