@@ -9,7 +9,11 @@ _NEAREST = 3
 
 
 class StationError(Exception):
-    """The station cannot do what was asked; the text says why and, where it can, what helps."""
+    """The station cannot do what was asked; the text says why and, where it can, what helps. Several
+    arguments are a line each."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.args))
 
 
 class UsageError(StationError):

@@ -1,8 +1,9 @@
 """Prints texts that may come from robots: a terminal obeys no character of them.
 
 An escape sequence in a name or a value could move the cursor, hide a line or write the operator's clipboard
-(OSC 52). So every control character except new line and tab is shown as the text of its code. Characters
-that change the direction of a line are shown so too, and no text is rich's markup.
+(OSC 52). So every control character is shown as the text of its code. Characters that change the
+direction of a line are shown so too, and no text is rich's markup. A line break is shown so as well: a
+robot's text must not begin a line, which would look like one of ours. `Lines` is a text of ours with lines.
 """
 
 from __future__ import annotations
@@ -13,10 +14,25 @@ from decimal import Decimal
 from typing import Any
 
 from rich import console
+from rich.json import JSON
+from rich.measure import Measurement
 from rich.segment import Segment
 from rich.text import Text
 
 from iort_station.texts import one_line, visible
+
+
+class Lines:
+    """A text of our own, which may have several lines. What it has of robots must be `one_line`."""
+
+    def __init__(self, text: str | Text, end: str = "\n") -> None:
+        self._text = Text(visible(text), end=end) if isinstance(text, str) else text
+
+    def __rich_console__(self, to: console.Console, options: console.ConsoleOptions) -> Iterable[Segment]:
+        return self._text.__rich_console__(to, options)
+
+    def __rich_measure__(self, to: console.Console, options: console.ConsoleOptions) -> Measurement:
+        return Measurement.get(to, options, self._text)
 
 
 class Console(console.Console):
@@ -25,19 +41,21 @@ class Console(console.Console):
     def __init__(self, **given: Any) -> None:
         super().__init__(**{"highlight": False, "markup": False, "emoji": False, **given})
 
-    def print(self, *objects: Any, lines: bool = False, **given: Any) -> None:
-        """As rich does. A text is one line unless it has ``lines`` of our own: a robot's must begin none."""
-        shown = [one_line(one) if isinstance(one, str) and not lines else one for one in objects]
-        super().print(*shown, **given)
+    def print_json(self, json: str | None = None, **given: Any) -> None:
+        """As rich does."""
+        self.print(Lines(JSON(json or "null", **given).text), soft_wrap=True)
 
     def render_str(self, text: str, **given: Any) -> Text:
-        """As rich does; before the layout, which counts characters."""
-        return super().render_str(visible(text), **given)
+        """As rich does, in one line; before the layout, which counts characters."""
+        return super().render_str(one_line(text), **given)
 
     def render(
         self, renderable: console.RenderableType, options: console.ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         """As rich does; also for what is not a string, for example a `Text`."""
+        if isinstance(renderable, Text) and "\n" in renderable.plain:
+            # With the styles of its parts.
+            renderable = renderable.blank_copy(r"\n").join(renderable.split(allow_blank=True))
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=visible(segment.text))
 
@@ -50,9 +68,9 @@ def print_json(value: Any) -> None:
     out.print_json(json.dumps(value, default=_number))
 
 
-def tell(facts: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+def tell(facts: Mapping[str, Any], text: str | Lines, *, as_json: bool) -> None:
     """Print what a verb has done: a line of JSON for a script, or a text."""
-    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True, lines=True)
+    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
 
 
 def _number(value: Any) -> int | float:

@@ -82,9 +82,9 @@ def main() -> None:
     try:
         app(prog_name="iort")
     except UsageError as error:
-        _end(str(error), 2)
+        _end(*error.args, status=2)
     except (StationError, AnalysisError) as error:
-        _end(str(error))
+        _end(*error.args)
     except ClientError as error:
         _end(f"AWS refused a call: {error}")
     except BotoCoreError as error:
@@ -99,8 +99,8 @@ def main() -> None:
         sys.exit(130)
 
 
-def _end(text: str, status: int = 1) -> NoReturn:
-    say(text)
+def _end(*lines: str, status: int = 1) -> NoReturn:
+    say(*lines)
     sys.exit(status)
 
 

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, TextIO
 from rich.table import Table
 
 from iort_analysis.samples.positions import in_degrees
+from iort_station.cli.console import Lines
 from iort_station.data import Result
 from iort_station.recordings.tabular import texts_of_time
-from iort_station.texts import visible
+from iort_station.texts import one_line
 
 # A terminal shows the beginning and the end of a long result: this many rows each.
 _ENDS = 20
@@ -40,7 +41,7 @@ def plain(result: Result, file: TextIO) -> None:
     widths = [column.width for column in columns]
 
     def write(stamp: str, values: Iterable[str]) -> None:
-        cells = [value.replace("\n", "\\n").rjust(width) for value, width in zip(values, widths, strict=True)]
+        cells = [value.rjust(width) for value, width in zip(values, widths, strict=True)]
         print(stamp.ljust(len(_TIME_WIDE)), *cells, sep=" " * _GAP, file=file)
 
     write("time (UTC)", [column.name for column in columns])
@@ -72,7 +73,7 @@ def terminal(result: Result, width: int | None = None) -> Shown:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("time (UTC)", no_wrap=True)
     for column in columns:
-        table.add_column(column.heading, justify="right", max_width=_TEXT_WIDE, overflow="fold")
+        table.add_column(Lines(column.heading), justify="right", max_width=_TEXT_WIDE, overflow="fold")
     for place, row in enumerate(zip(stamps, *(column.cells for column in columns), strict=True)):
         if n > 2 * _ENDS and place == _ENDS:
             table.add_row("...", *["..."] * len(columns))
@@ -97,7 +98,7 @@ class _Column(NamedTuple):
 def _columns(result: Result, rows: Sequence[int]) -> list[_Column]:
     return [
         _Column(
-            visible(name),
+            one_line(name),
             result.unit(name),
             [_cell(column[i], 7 if in_degrees(name) else None) for i in rows],
         )
@@ -117,4 +118,4 @@ def _cell(value: Any, digits: int | None) -> str:
         if digits is not None:
             return f"{value:.{digits}f}"
         return f"{value:.6g}" if abs(value) < 1e6 or not value.is_integer() else f"{value:.0f}"
-    return visible(str(value))
+    return one_line(str(value))

@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from iort_station.texts import visible
+from iort_station.texts import one_line
 from iort_station.times import iso_s
 
 if TYPE_CHECKING:
     from iort_contract.messages.page import Archived
 
 
-def say(text: str) -> None:
-    """Print a line."""
-    print(visible(f"iort: {text}"), file=sys.stderr, flush=True)
+def say(*lines: str) -> None:
+    """Print a text, or several lines. What a robot has said begins no line of its own."""
+    print("iort: " + "\n".join(map(one_line, lines)), file=sys.stderr, flush=True)
 
 
 def examples(*commands: str) -> str:

@@ -20,9 +20,11 @@ from hypothesis import strategies as st
 from iort_agent.clock import SystemClock
 from iort_agent.errors import IdentityError, UplinkError
 from iort_agent.identity.certificate import check_pair, parse_certificate, read_certificate, stamp
+from iort_agent.identity.claim import Claim
 from iort_agent.identity.machine_key import make_key
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.mqtt.exchange import Exchange
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:
@@ -121,7 +123,7 @@ def test_a_stamp_changes_with_every_replacement(tmp_path: Path) -> None:
     assert len(set(seen)) == 3
 
 
-def test_swapped_files_are_named_also_by_the_running_agent(tmp_path: Path) -> None:
+def test_swapped_files_are_named_also_by_the_running_agent_and_of_a_claim(tmp_path: Path) -> None:
     now = dt.datetime.now(dt.timezone.utc)
     certificate, key = made(now, now + dt.timedelta(days=1))
     of_another = made(now, now + dt.timedelta(days=1))[1]
@@ -152,3 +154,5 @@ def test_swapped_files_are_named_also_by_the_running_agent(tmp_path: Path) -> No
         )
         with pytest.raises(UplinkError, match=why):
             uplink.start()
+        with pytest.raises(IdentityError, match=rf"^the claim: .*{why}"):
+            Exchange(Claim(endpoint="127.0.0.1", certificate=paths[0], private_key=paths[1]))

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from iort_contract.catalog.analysis.car import GROUPS
 from iort_contract.messages.analysis.findings import encode_estimate
-from iort_station.cli.console import out, print_json
+from iort_station.cli.console import Lines, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.data import inventory
@@ -56,7 +56,7 @@ def calibrate(
     _print(found)
     if not lines:
         return
-    out.print(f"\nvesc.yaml:\n{lines}", end="", highlight=False, lines=True)
+    out.print(Lines(f"\nvesc.yaml:\n{lines}", end=""))
     gain = found.found[calibration.GAIN].estimate
     if vehicle is not None and not gain.low <= vehicle.speed_to_erpm_gain <= gain.high:
         say(

@@ -11,7 +11,7 @@ import typer
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_station.cli.console import errors, tell
+from iort_station.cli.console import Lines, errors, tell
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
@@ -39,7 +39,7 @@ def ask(
     cloud = context.obj.cloud()
     with errors.status(f"waiting for {question} of {robot}"):
         answer = questions.ask(cloud, robot, question, asked)
-    tell(answer, json.dumps(answer, indent=2), as_json=as_json)
+    tell(answer, Lines(json.dumps(answer, indent=2)), as_json=as_json)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from iort_contract.catalog.derived import F1TENTH
-from iort_station.cli.console import errors, tell
+from iort_station.cli.console import Lines, errors, tell
 from iort_station.cli.options import AsJson, Force, Robot, Yes, agreed, to_file
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
@@ -48,7 +48,11 @@ def add(
     if cloud.mqtt_endpoint == "127.0.0.1":
         where, config = "This cloud is for robots of this machine alone; run here", str(bundle.config)
     text = f"{name} is registered. {where}:\n\n  iort-agent run --config {config}\n\n{_STOP}"
-    tell({"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)}, text, as_json=as_json)
+    tell(
+        {"robot": name, "folder": str(bundle.folder), "config": str(bundle.config)},
+        Lines(text),
+        as_json=as_json,
+    )
 
 
 @commands.command("register", epilog=examples("robots register car20 car21 --days 7"))
@@ -93,7 +97,7 @@ def claim(
         f"Copy {folder} to the robot, then run there:\n\n"
         f"  iort-agent provision --config {folder.name}/{path.name}"
     )
-    tell({"robot": name, "folder": str(folder), "claim": str(path)}, text, as_json=as_json)
+    tell({"robot": name, "folder": str(folder), "claim": str(path)}, Lines(text), as_json=as_json)
 
 
 @commands.command("rotate", epilog=examples("robots rotate car7 --out claim-car7 --no-wait"))
@@ -124,7 +128,7 @@ def rotate(
             f"Copy {folder} to {name} within five minutes, then run there:\n\n"
             f"  iort-agent renew --config car.yaml --claim {folder.name}/{path.name}\n"
         )
-        tell({"robot": name, "folder": str(folder), "claim": str(path)}, text, as_json=as_json)
+        tell({"robot": name, "folder": str(folder), "claim": str(path)}, Lines(text), as_json=as_json)
     if finish or wait:
         with errors.status("waiting") as status:
             old = rotation.finish(cloud, name, settled_s=settled_s, progress=status.update)

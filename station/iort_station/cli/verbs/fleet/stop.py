@@ -118,8 +118,8 @@ def _not_done(why: str, *, release: bool, everyone: bool = False) -> NoReturn:
     """End with what did not happen, what happens without it, and only then why."""
     if release:
         raise StationError(f"NOTHING WAS RELEASED: {why}")
-    named = "\nA stop by names needs no list of the robots: `iort stop NAME`." if everyone else ""
-    raise StationError(f"NOTHING WAS STOPPED.\n{_ELSEWHERE}{named}\nThe cloud: {why}")
+    named = ["A stop by names needs no list of the robots: `iort stop NAME`."] if everyone else []
+    raise StationError("NOTHING WAS STOPPED.", _ELSEWHERE, *named, f"The cloud: {why}")
 
 
 def _motion(cloud: Cloud, names: Iterable[str]) -> dict[str, Motion | None]:

@@ -15,7 +15,6 @@ from iort_station.cli.words import examples, say
 from iort_station.data.stored.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
-from iort_station.texts import one_line
 
 commands = typer.Typer(
     name="archive", no_args_is_help=True, help="Telemetry that is kept for good, as Parquet in the bucket."
@@ -117,7 +116,8 @@ def verify(
         lines += [f"    {hour}: {problem}" for hour, problem in problems.items()]
         lines += [f"    cannot be decoded: {line}" for line in found.refused.named]
         if not as_json:
-            console.out.print("\n".join(map(one_line, lines)), soft_wrap=True, lines=True)
+            for line in lines:
+                console.out.print(line, soft_wrap=True)
     if as_json:
         console.print_json(streams)
     elif not streams:

@@ -15,7 +15,7 @@ from iort_contract.limits import ContractError
 from iort_contract.tables import ROBOT
 from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import completion
-from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.console import Lines, errors, out, print_json
 from iort_station.cli.options import AsJson, Range, When, ranged
 from iort_station.cli.words import examples, say_archived
 from iort_station.errors import UsageError
@@ -256,8 +256,8 @@ def _table(one: Audit) -> Table:
         missing = sum(gap.batches for gap in run.missing)
         table.add_row(
             run.boot[:8],
-            f"{iso_s(run.first_us)}\n{iso_s(run.last_us)}",
-            f"{run.first_seq:,}\n{run.last_seq:,}",
+            Lines(f"{iso_s(run.first_us)}\n{iso_s(run.last_us)}"),
+            Lines(f"{run.first_seq:,}\n{run.last_seq:,}"),
             f"{run.expected:,}",
             f"{run.batches:,}",
             f"{missing:,}",
@@ -269,10 +269,10 @@ def _table(one: Audit) -> Table:
     return table
 
 
-def _late(run: RunAudit) -> str:
+def _late(run: RunAudit) -> Lines:
     if run.late is None or run.latest_ms is None:
-        return "-"
-    return f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else "")
+        return Lines("-")
+    return Lines(f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else ""))
 
 
 def _as_json(one: Audit, contents: Mapping[str, str]) -> dict[str, Any]:

@@ -148,9 +148,9 @@ def cost_(
         f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
         f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
         f"live {usage.live_hz:g} Hz {_looking(usage)}, {usage.hours_per_day:g} h a day, "
-        f"kept {usage.retention_days} days.\n",
-        lines=True,
+        f"kept {usage.retention_days} days.",
     )
+    out.print()
     for title, rows in (
         ("A robot-hour", report.robot_hour(usage, prices)),
         ("A month", report.month(usage, prices)),

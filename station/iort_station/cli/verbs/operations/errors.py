@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from iort_contract.tables import NO_ROBOT
-from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.console import Lines, errors, out, print_json
 from iort_station.cli.options import AsJson, OneRobot, Range, When, ranged
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
@@ -89,9 +89,9 @@ def _show(entry: DeadLetter, *, as_json: bool) -> None:
         ("last", f"{_utc(entry.last_ms)}, {entry.seen} times, {entry.replays} replays"),
         ("bytes", str(len(payload))),
     ):
-        out.print(Text.assemble((f"{name:<11}", "bold"), one_line(value)), soft_wrap=True)
+        out.print(Text.assemble((f"{name:<11}", "bold"), value), soft_wrap=True)
     out.print()
-    out.print(as_text(payload), soft_wrap=True, lines=True)
+    out.print(Lines(as_text(payload)), soft_wrap=True)
 
 
 def as_text(payload: bytes) -> str:
@@ -102,7 +102,7 @@ def as_text(payload: bytes) -> str:
         text = "\0"
     # A terminal would obey control characters.
     if all(character.isprintable() or character in "\n\t" for character in text):
-        return text
+        return one_line(text)
     lines = []
     for start in range(0, len(payload), _HEX_WIDTH):
         line = payload[start : start + _HEX_WIDTH]
