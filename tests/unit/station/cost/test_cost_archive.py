@@ -15,6 +15,7 @@ from iort_station.cost.bill import analysing, archiving, model
 from iort_station.cost.prices import MONTH_DAYS, PRICES
 from iort_station.cost.usage import Usage
 from stacks import analysis, archive, storage
+from stacks.settings import Settings
 
 _ONE = Usage()
 
@@ -63,7 +64,8 @@ def test_the_model_has_the_memory_and_the_times_of_the_stacks():
     assert archiving.MEMORY_MB == archive._MEMORY_MB
     assert archiving.STANDARD_DAYS == storage._RARE_AFTER_DAYS
     one = analysing.Function()
-    assert (one.memory_mb, one.at_once) == (analysis._CORE_MB, analysis._DRIVES)
+    large = Settings(account_concurrency=1000)
+    assert (one.memory_mb, one.at_once) == (analysis._CORE_MB, large.at_once.drives)
 
 
 def test_the_command_compares_a_robot_year_in_the_table_with_one_in_the_archive(tmp_path):
