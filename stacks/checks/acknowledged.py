@@ -160,7 +160,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide("*"): "a delivery of logs takes no resource",
         },
         "analysis/MapPolicy": {
-            wide(f"{states}:execution:<MachineNAME>:*"): "Step Functions names the executions of the machine"
+            wide(f"{states}:execution:<Machine6FC8AE80.Name>:*"): "Step Functions names the executions"
         },
         "analysis/Machine": {
             "AwsSolutions-SF1": "its log has every error; the history of executions stays for 90 days",
@@ -195,6 +195,18 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
                 "Viewer": ("topicfilter/live", "topic/live", "topic/view"),
                 "Driver": ("topicfilter/live", "topic/live", "topic/view", "topic/cmd"),
             }.items()
+        },
+        "fleet/PublicRole/DefaultPolicy": {
+            wide(f"{iot}:client/{settings.namespace}-viewer-*"): "every connection has its own id",
+            **{
+                wide(f"{iot}:{what}/live/{settings.namespace}/{robot}/*"): "the wildcard is its stream"
+                for robot in settings.site_robots
+                for what in ("topicfilter", "topic")
+            },
+        },
+        "fleet/PublicPool": {
+            "AwsSolutions-COG7": "a public page has no login; its role may only hear the named robots",
+            "CKV_AWS_366": "as AwsSolutions-COG7",
         },
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {

@@ -61,7 +61,8 @@ def _car(robot: str, given: Any) -> dict[str, dict[str, Any]]:
         raise ContractError(f"car must be an object of {', '.join(CAR_LIMITS)}, got {shown(given)}")
     # Without a calibration to look up, the table is not read.
     wanted = any(limit.calibrated and name not in given for name, limit in CAR_LIMITS.items())
-    known = {name: one.value for name, (one, _) in parameters.latest(robot).items()} if wanted else {}
+    drives = parameters.newest_drives(robot) if wanted else []
+    known = {name: one.value for name, (one, _) in parameters.latest(drives).items()}
     car = {}
     for name, limit in CAR_LIMITS.items():
         source, value = "question", given.get(name)

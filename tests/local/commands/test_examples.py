@@ -22,9 +22,21 @@ from tests.local.robots.test_shadow import driving
 from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
-# Laps need minutes of driving, `iort drive` a terminal, and `iort invite` a page.
+# Laps and a calibration need minutes of driving, `iort drive` a terminal, and `iort invite` a page.
 NOT_RUN = {
-    *("adopt", "backup", "dashboard", "drive", "files empty", "invite", "laps", "move", "pubnub", "restore"),
+    *(
+        "adopt",
+        "ask",
+        "backup",
+        "dashboard",
+        "drive",
+        "files empty",
+        "invite",
+        "laps",
+        "move",
+        "pubnub",
+        "restore",
+    ),
     *("robots revoke-claims", "site"),
 }
 # Runs until Ctrl-C.

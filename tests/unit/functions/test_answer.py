@@ -284,6 +284,12 @@ def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
         "both": (2.0, "0000000002000000"),
     }
     assert answer.handler({**asked, "robot": "car2"}, Context)["refused"] == NO_DATA
+    nothing = AnalysedDrive(
+        DriveKey("car3", 1, "00c0ffee"), 2, "nightly", 1, {}, {"mass": "16 s are too short"}, {}
+    )
+    FindingsTable(deployed, FINDINGS).put_drive(nothing)
+    refused = answer.handler({**asked, "robot": "car3"}, Context)
+    assert (refused["refused"], "16 s are too short" in str(refused)) == (NO_DATA, True)
     assert answer.handler({**asked, "question": "nobody"}, Context)["refused"] == UNKNOWN
 
 
