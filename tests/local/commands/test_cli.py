@@ -115,7 +115,9 @@ def test_the_cost_covers_the_deployed_resources(iort):
     assert (usage["recoverable"], usage["customer_key"]) == (False, False)
     # The embedded cloud has no Metrics Insights alarms, but has dashboards of other tests.
     assert (usage["alarms"], usage["insights_metrics"]) == (Usage().alarms, 0)
-    assert set(usage["dashboards"]) >= set(Usage().dashboards)
+    platform, *others = Usage().dashboards
+    # By PubNub the platform's has the messages that nobody could send on.
+    assert set(usage["dashboards"]) >= {platform + 1, *others}
     assert usage["dashboards"][-1] == Usage().dashboards[-1]
 
 

@@ -177,7 +177,9 @@ def test_a_claimed_robot_that_is_killed_in_an_outage_loses_only_its_open_batch(e
     subprocess.run(provision, check=True, timeout=GUARD_S)
     assert "queue" not in car.config.read_text()
     log = counter_log(tmp_path / "long.csv", 600)
-    robots.configure(car, {"port": proxy.port, "sources": [{"type": "bag", "path": str(log)}]})
+    # The written motion command is that of its simulated car.
+    settings = {"port": proxy.port, "sources": [{"type": "bag", "path": str(log)}], "downlink": {}}
+    robots.configure(car, settings)
     first = Agent(car)
     until(lambda: first.said("connected to"))
     proxy.mode = REFUSE
