@@ -21,7 +21,7 @@ from iort_agent.sources import FAIL, OK, Finding
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.recording.look import look_into
 from iort_agent.sources.recording.player import Message
-from tests.unit.agent.sources.test_bag import START, STORAGES, play, write_ros1, write_ros2
+from tests.unit.agent.sources.test_bag import START, STORAGES, needs_mcap, play, write_ros1, write_ros2
 from tests.unit.agent.sources.test_vesc_csv import row, write
 from tests.unit.agent.test_agent import config_file
 
@@ -172,7 +172,7 @@ BOMBS = [
 ]
 
 
-@pytest.mark.skipif("mcap" not in STORAGES, reason="the zstd of the rosbags for Python 3.8 has no bound")
+@needs_mcap
 @pytest.mark.parametrize("make", BOMBS)
 def test_what_inflates_without_end_is_not_inflated(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     path = make(tmp_path)
