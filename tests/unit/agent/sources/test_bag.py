@@ -402,8 +402,7 @@ SERVO = ("/servo", "std_msgs/msg/Float64", "float64 data\n", b"\0\1\0\0" + bytes
 
 
 def needs_mcap(test: Any) -> Any:
-    """Leave a test out, so that nothing skips, with the rosbags for Python 3.8: it needs metadata.yaml, and its
-    chunks have no bound."""
+    """Leave a test out, so that nothing skips, with the rosbags for Python 3.8: it needs metadata.yaml."""
     return test if "mcap" in STORAGES else None
 
 
