@@ -353,8 +353,9 @@ def test_updates_do_not_move_the_layout(page: Page, car: Car) -> None:
         sample = {name: value for name in SAMPLE if name != "fault_code"}
         show(page, car.send({**sample, "fault_code": 5 if value == 5 else 0}))
     shifts = page.evaluate("shifts")
-    # Bars and figures of the delay move a little with each message. Anything that appears above moves more.
-    assert max((value for value, _ in shifts), default=0) < 0.01, "\n".join(map(str, shifts))
+    # Bars and figures move a little with each message, at most 0.011 where a slow browser draws two at once.
+    # A line that appears above everything moves 0.03.
+    assert max((value for value, _ in shifts), default=0) < 0.02, "\n".join(map(str, shifts))
 
 
 def test_memory_stays_bounded(page: Page, car: Car, url: str) -> None:
