@@ -152,7 +152,7 @@ def kept(clients: Clients, settings: Settings) -> Found:
     shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
     return warning(
         f"of an earlier deployment, without conflict: {shown}",
-        "a new deployment begins empty: copy batches with `iort adopt TABLE`, or delete them to save costs",
+        "a new deployment begins empty: delete them to save costs, or move what they hold by a script",
     )
 
 

@@ -40,7 +40,7 @@ from iort_contract.topics import parse_topic
 
 # Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4
-# A stream keeps its records for 24 hours. Older ones were put into the table by hand (`iort adopt`, a
+# A stream keeps its records for 24 hours. Older ones were put into the table by hand (`iort move`, a
 # replay), and are no news of their car.
 _NEWS_MS = 24 * 3_600_000
 # A car adds to a second for a second, and a round reads it after that.

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 from iort_analysis.archive.hours import HourFile, is_expiring, key_of
 from iort_analysis.archive.stored import ahead
 from iort_analysis.samples.batches import Item
-from iort_contract.dynamodb import WRITE_ITEMS, Keys, whole
+from iort_contract.dynamodb import WRITE_ITEMS, Keys, TableError, TelemetryTable, whole
 from iort_contract.tables import BATCH, EXPIRES_S
 from iort_station.cloud import Cloud
 from iort_station.data.stored.batches import telemetry_table
 from iort_station.data.stored.recorded import archive_of
-from iort_station.recordings.adopt import UNITS_PER_S, write
+from iort_station.errors import StationError
 
+# A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half
+# of them are left to the robot.
+UNITS_PER_S = 500
+_UNIT_BYTES = 1024
 # The target's archive finds a batch within a day, by a sweep.
 _MERGED_S = 30 * 86_400
 # Receives the number of batches read.
@@ -36,8 +41,7 @@ def copy(
     table, batches = telemetry_table(target), 0
     for items in ahead(page.items for page in telemetry_table(source).pages(topic)):
         new = list(_lacking(target, topic, items))
-        for start in range(0, len(new), WRITE_ITEMS):
-            write(table, new[start : start + WRITE_ITEMS], units_per_s)
+        write(table, new, units_per_s)
         batches += len(new)
         progress(len(items))
     return batches
@@ -64,8 +68,7 @@ def merge(
         old = [item for item in ours.read(row, HourFile.items) if key_of(item) not in known]
         expires = {EXPIRES_S: {"N": str(int(time.time()) + _MERGED_S)}}
         new = [{**item, **expires} for item in _lacking(target, topic, old)]
-        for start in range(0, len(new), WRITE_ITEMS):
-            write(table, new[start : start + WRITE_ITEMS], units_per_s)
+        write(table, new, units_per_s)
         batches += len(new)
         progress(row.batches)
     return batches
@@ -83,3 +86,16 @@ def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]
         expires_s = whole(item, EXPIRES_S)
         if key_of(item) not in there and (expires_s is None or expires_s > now_s):
             yield item
+
+
+def write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+    """Write items at so many write units a second; raises `StationError` if DynamoDB rejects them."""
+    for start in range(0, len(items), WRITE_ITEMS):
+        part, began = items[start : start + WRITE_ITEMS], time.monotonic()
+        try:
+            table.put(part)
+        except TableError as error:
+            raise StationError(f"{error}; do it again, or with fewer --units") from error
+        # About the units of an item, which is nearly all samples.
+        units = sum(-(-len(str(item)) // _UNIT_BYTES) for item in part)
+        time.sleep(max(0.0, began + units / units_per_s - time.monotonic()))

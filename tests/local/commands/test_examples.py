@@ -25,7 +25,6 @@ from tests.manual import COMMANDS, examples
 # Laps and a calibration need minutes of driving, `iort drive` a terminal, and `iort invite` a page.
 NOT_RUN = {
     *(
-        "adopt",
         "ask",
         "backup",
         "dashboard",

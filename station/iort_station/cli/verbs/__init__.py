@@ -33,7 +33,6 @@ VERBS = {
     "upkeep.doctor": "Say what is wrong with the cloud, or will be, and what to do.",
     "upkeep.backup": "Write the cloud of `make up` into one file, while it runs.",
     "upkeep.restore": "Make the cloud of `make up` from a backup.",
-    "operations.adopt": "Copy batches of another telemetry table.",
     "operations.move": "Copy robots and their recordings into another cloud.",
     "fleet.send": "Send a command and print the robot's answer.",
     "fleet.drive": "Drive a car by the keys of this terminal.",

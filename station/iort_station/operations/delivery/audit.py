@@ -2,7 +2,7 @@
 
 Each run of the agent numbers its batches of a stream from 0 without gaps, and its first batches name the runs
 before it with their last numbers, as far as its queue knows. A number that is not stored is a batch that was
-lost, or that still waits in the car. Earlier agents numbered on over restarts if the queue had a file.
+lost, or that still waits in the car.
 """
 
 from __future__ import annotations
@@ -151,18 +151,14 @@ def audit(
     ends = _ends(in_order)
     runs: list[RunAudit] = []
     before_first = 0
-    numbered_on: RunAudit | None = None
     for found in in_order:
         run = _run(found, ends.get(found[0].id.boot, -1), late_ms)
-        from_0 = any(stored.previous is not None for stored in found)
-        first = _first(None if from_0 else numbered_on, run)
         if not runs and not from_start:
             before_first = run.first_seq
-        elif run.first_seq > first:
+        elif run.first_seq > 0:
             after_us = runs[-1].last_us if runs else None
-            run.missing.insert(0, Missing(first, run.first_seq - 1, after_us, run.first_us))
+            run.missing.insert(0, Missing(0, run.first_seq - 1, after_us, run.first_us))
         runs.append(run)
-        numbered_on = numbered_on if from_0 else run
     lost_runs = tuple(_lost_runs(in_order, ends, from_start=from_start))
     return Audit(stream, runs, before_first, refused, lost_runs=lost_runs)
 
@@ -236,12 +232,6 @@ def _run(found: Sequence[Header], last: int, late_ms: int) -> RunAudit:
         missing=missing,
         samples_of={seq: header.samples for seq, header in by_seq.items()},
     )
-
-
-def _first(previous: RunAudit | None, run: RunAudit) -> int:
-    """The number that a run began with: 0, or the one after those of the run before, where runs numbered on.
-    A number that starts again lower is a queue that was lost."""
-    return previous.last_seq + 1 if previous is not None and run.first_seq > previous.last_seq else 0
 
 
 def headers(

@@ -19,6 +19,7 @@ from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import described, write_day
 from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import ArchivedHour, archived_hour, parse_hour
+from iort_contract.dynamodb import TableError
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
@@ -230,3 +231,32 @@ def test_a_note_that_was_deleted_on_either_side_does_not_come_back() -> None:
     assert written.copy(source, target, "car7") == 0
     assert list(target.findings.notes("car7")) == [notes[2]]
     assert list(source.findings.notes("car7")) == [notes[2], notes[1]]
+
+
+class Full:
+    """A table that takes nothing, or everything."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error, self.calls = error, []
+
+    def put(self, items: list[Any]) -> None:
+        self.calls.append(len(items))
+        if self.error:
+            raise self.error
+
+
+def test_the_write_rate_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic is one partition, and the robot writes to it at the same time."""
+    slept: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept.append)
+    table: Any = Full()
+    recorded.write(table, [{"samples": "x" * 100}] * 100, 5)
+    # A small batch is one unit, and 25 are written at once.
+    assert table.calls == [25] * 4
+    assert sum(slept) == pytest.approx(100 / 5, abs=1)
+
+
+def test_items_that_stay_unprocessed_are_an_error_with_advice() -> None:
+    table: Any = Full(TableError("1 items of telemetry not written"))
+    with pytest.raises(StationError, match=r"1 items of telemetry not written; do it again"):
+        recorded.write(table, [{"samples": "x"}], 5)
