@@ -27,7 +27,7 @@ from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.meters import chromium
 from bench.proof.analysing import analysed
 from bench.proof.cars import drive_of
-from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block

@@ -18,9 +18,8 @@ from typing import Any
 import urllib3
 
 from bench.load import camera
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel
 from iort_contract.limits import Value

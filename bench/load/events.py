@@ -6,9 +6,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BATCH, TOPIC

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.limits import Value
 
 RATE_HZ = 50

@@ -13,8 +13,7 @@ from bench.meters.round_trips import Connected
 from iort_agent.common.state import ClockOffset
 from iort_agent.control.questions import Questions
 from iort_agent.errors import AskError
-from iort_agent.files.http import downloader
-from iort_agent.files.upload import make_uploader
+from iort_agent.files.upload import downloader, make_uploader
 from iort_contract.messages.requests.ask import NO_DATA
 from iort_station.fleet.robots import Bundle
 

@@ -23,8 +23,8 @@ from iort_agent.clock import SystemClock
 from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.intake import Intake, TopicConfig
-from iort_agent.sources.sim.source import PoseConfig, SimConfig
-from iort_agent.spool.config import QueueConfig
+from iort_agent.sources.sim import PoseConfig, SimConfig
+from iort_agent.spool import QueueConfig
 from iort_agent.spool.sqlite import make_spool
 from tests.agent_fakes import Loopback
 

@@ -17,7 +17,7 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 from bench.load.simulated import simulated_drive
-from iort_agent.sources.sim.parameters import VehicleConfig
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.archive.writing import write_hour
 from iort_contract.archive import hour_of
 from iort_contract.catalog.derived import Vehicle as Gain

@@ -15,7 +15,7 @@ from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
-from iort_agent.lanes.config import PingConfig
+from iort_agent.lanes import PingConfig
 from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher

@@ -19,8 +19,8 @@ import iort_contract
 from bench import ROOT
 from bench.proof.cars import DriveSpec
 from bench.proof.drives import digest, simulated
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import ALL
+from iort_agent.sources.sim import ALL
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, Measured
 from iort_contract.catalog.derived import F1TENTH

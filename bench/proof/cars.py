@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from iort_agent.sources.sim import ALL, ROS1
 from iort_agent.sources.sim.faults import KINDS, FaultConfig
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import ALL, ROS1
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_contract.messages.analysis.findings import DriveKey
 
 DRIVE_S = 600.0

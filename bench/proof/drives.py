@@ -18,8 +18,8 @@ import numpy as np
 import iort_agent.sources.sim
 from bench import ROOT
 from bench.proof.cars import DriveSpec
+from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.driver import Wish
-from iort_agent.sources.sim.sensors import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.streams import POSE_STREAM

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from iort_agent.sources.sim.heat import WIND_MPS
-from iort_agent.sources.sim.parameters import AIR_KG_PER_M3, G_MPS2
+from iort_agent.sources.sim.vehicle import AIR_KG_PER_M3, G_MPS2, WIND_MPS
 
 # Estimates that are only compared with the car's own earlier drives, in a VESC's units: their interval says
 # how well a drive repeats, and a bias that all drives share changes no finding.

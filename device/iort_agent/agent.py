@@ -14,21 +14,20 @@ from iort_agent.control.downlink import make_downlink
 from iort_agent.control.motion.commands import Operator, refuse_commands
 from iort_agent.control.motion.kept_stop import KeptStop
 from iort_agent.control.shadow import Shadow
+from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
-from iort_agent.files.uploads import make_uploads
+from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.attachment import make_attachments
-from iort_agent.lanes.clock_offset import OffsetEstimator
-from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
-from iort_agent.lanes.pings import Pings
+from iort_agent.lanes.pings import OffsetEstimator, Pings
 from iort_agent.lanes.record import RecordLane
 from iort_agent.lanes.streams import Streams
 from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
-from iort_agent.sources.run import SourceRun
-from iort_agent.sources.sim.source import SimSource
-from iort_agent.spool.interface import Spool
+from iort_agent.sources.registry import SourceRun
+from iort_agent.sources.sim import SimSource
+from iort_agent.spool import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS

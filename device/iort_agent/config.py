@@ -22,11 +22,11 @@ from iort_agent.common.schema import (
 )
 from iort_agent.control.config import DownlinkConfig, MotionState, ShareConfig, share_rule
 from iort_agent.errors import ConfigError
-from iort_agent.files.config import FilesConfig
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
+from iort_agent.files.folder import FilesConfig
+from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
-from iort_agent.spool.config import QueueConfig, default_path
+from iort_agent.spool import QueueConfig, default_path
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError

@@ -10,7 +10,7 @@ from iort_agent.agent import Agent
 from iort_agent.common.threads import WATCH, Supervised
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import Emit
-from iort_agent.sources.run import SourceRun
+from iort_agent.sources.registry import SourceRun
 from iort_contract.catalog.streams import AGENT_STREAM, LOG_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)

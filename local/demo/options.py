@@ -11,7 +11,7 @@ from typing import Any
 from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place
 from iort_agent.errors import ConfigError, SourceError
-from iort_agent.sources.recording.bag import BagConfig, BagSource
+from iort_agent.sources.recording import BagConfig, BagSource
 from iort_agent.sources.sim.faults import fault_rule
 from iort_contract.cloud import IOT, PUBNUB
 from local.cloud import FOLDER

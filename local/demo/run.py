@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 
-from iort_agent.sources.sim.circuit import HALL
+from iort_agent.sources.sim.driver import HALL
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT

@@ -15,12 +15,11 @@ import pytest
 from iort_agent.cli import main
 from iort_agent.common.private_files import make_private, open_below, write_below
 from iort_agent.errors import UploadError
-from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import from_json, read, to_json
-from iort_agent.files.folder import STATE, Folder
+from iort_agent.files.folder import STATE, FilesConfig, Folder
 from iort_agent.lanes.attachment import Attachments
+from iort_agent.spool import PROCESS
 from iort_agent.spool.file import SpoolFile
-from iort_agent.spool.interface import PROCESS
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
 from iort_contract.catalog.vesc import VESC_STREAM
 from tests.agent_fakes import ManualClock

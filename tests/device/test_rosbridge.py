@@ -22,8 +22,8 @@ pytest.importorskip("websocket")
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
-from iort_agent.sources.rosbridge.source import RosbridgeConfig, RosbridgeSource, TopicConfig
-from iort_agent.sources.rosbridge.subscription import Times
+from iort_agent.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig
+from iort_agent.sources.rosbridge.connection import Times
 from tests.device.running import Running, eventually
 from tests.ports import free_port
 from tests.rosbridge_standin import RosbridgeStandin

@@ -13,10 +13,8 @@ from iort_agent.common.threads import Supervised
 from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
-from iort_agent.files.folder import STATE, Folder
-from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
-from iort_agent.files.upload import make_uploader
-from iort_agent.files.uploads import Uploads
+from iort_agent.files.folder import STATE, Folder, Uploads
+from iort_agent.files.upload import ByteRate, Outcome, Sender, make_uploader, trusting
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.status.server import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files

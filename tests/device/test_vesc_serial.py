@@ -16,8 +16,7 @@ import serial
 from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
-from iort_agent.sources.vesc.port import why
-from iort_agent.sources.vesc.serial_line import VescConfig
+from iort_agent.sources.vesc import VescConfig, why
 from tests.device.running import Running, eventually
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from bench.target import Target
-from iort_agent.files.http import trusting
+from iort_agent.files.upload import trusting
 from iort_contract.messages.requests.files import (
     Address,
     File,

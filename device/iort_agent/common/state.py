@@ -69,7 +69,7 @@ class Lanes:
 
 @dataclass(frozen=True)
 class StreamReport:
-    """The counts of a stream, as in `iort_agent.lanes.batch_encoder.StreamCounts`."""
+    """The counts of a stream, as in `iort_agent.lanes.streams.StreamCounts`."""
 
     samples: int
     stored: int

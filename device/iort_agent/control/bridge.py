@@ -8,7 +8,7 @@ from typing import Callable
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1.graph import Graph
+from iort_agent.ros1 import Graph
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from iort_agent.control.peers import Peers
 from iort_agent.control.questions import Questions
 from iort_agent.control.shares import Shares
 from iort_agent.errors import SourceError
-from iort_agent.files.http import downloader
-from iort_agent.files.upload import Uploader
+from iort_agent.files.upload import Uploader, downloader
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1.graph import Graph
+from iort_agent.ros1 import Graph
 from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
 from iort_agent.sources.ros1 import Ros1Config
 

@@ -8,7 +8,7 @@ from typing import Any, Iterable, Mapping
 
 from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes import RuntimeSettings
 from iort_contract.checks import check_field
 from iort_contract.messages.control.driving import NO_MOTION
 from iort_contract.messages.control.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS

@@ -15,7 +15,7 @@ from typing import Any, Callable, Mapping
 
 from iort_agent.control.runtime_settings import overlay
 from iort_agent.errors import UplinkError
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.driving import DriveLimits

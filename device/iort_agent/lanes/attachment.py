@@ -7,7 +7,9 @@ upload.
 
 from __future__ import annotations
 
+import base64
 import hashlib
+import io
 import logging
 import threading
 from pathlib import Path, PurePath
@@ -16,16 +18,47 @@ from typing import Any, Callable, Mapping
 from iort_agent.clock import Clock
 from iort_agent.common.private_files import write_below
 from iort_agent.common.throttled_log import ThrottledLog
-from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import kind_of, wire_name
-from iort_agent.files.uploads import Uploads
-from iort_agent.lanes.thumbnail import thumbnail
+from iort_agent.files.folder import FilesConfig, Uploads
 from iort_agent.sources import Emit
 from iort_contract.limits import Value
 from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, file_key
 from iort_contract.ros1.message import RosMessage, cut
 
 _log = logging.getLogger(__name__)
+
+_SIZE = (96, 96)
+_QUALITIES = (50, 30, 15)
+# In base64 it must fit into a text of a sample.
+_MAX_BYTES = 3072
+_KINDS = ("image/jpeg", "image/png")
+
+
+def thumbnail(content: bytes, content_type: str) -> str | None:
+    """A JPEG of at most 96 x 96 pixels in base64; None if the content is no picture, or without Pillow, which
+    `pip install 'iort-agent[thumbnail]'` brings."""
+    if content_type not in _KINDS:
+        return None
+    try:
+        from PIL import Image  # noqa: PLC0415 - optional
+    except ImportError:
+        _log.debug("no thumbnails: pip install 'iort-agent[thumbnail]'")
+        return None
+    try:
+        with Image.open(io.BytesIO(content), formats=("JPEG", "PNG")) as picture:
+            # Decoding a JPEG at a fraction of its size saves most of the time.
+            picture.draft("RGB", _SIZE)
+            small = picture.convert("RGB")
+            small.thumbnail(_SIZE)
+            for quality in _QUALITIES:
+                out = io.BytesIO()
+                small.save(out, "JPEG", quality=quality)
+                if out.tell() <= _MAX_BYTES:
+                    return base64.b64encode(out.getvalue()).decode()
+    except Exception as error:  # noqa: BLE001 - a damaged picture raises about anything
+        _log.debug("no thumbnail: %s", error)
+    return None
+
 
 # First bytes of the files that people want to open. Other bytes are for programs that know the message.
 _BEGINNINGS = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))

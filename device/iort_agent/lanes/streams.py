@@ -2,17 +2,197 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
-from typing import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from operator import itemgetter
+from typing import Hashable, Iterable, Mapping, Sequence, Tuple
 
 from iort_agent.clock import Clock
-from iort_agent.lanes.batch_encoder import BatchEncoder, StreamCounts
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
-from iort_agent.spool.interface import Spool
+from iort_agent.spool import Spool
 from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.limits import Value
+from iort_contract.limits import MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError, Value
+from iort_contract.messages.batch import Batch, encode_batch, split_batch
+from iort_contract.ros1.message import Messages, RosMessage
 from iort_contract.topics import check_stream
+
+_log = logging.getLogger(__name__)
+
+# Real telemetry takes about 2 bytes a value in a message, random doubles 12; a batch that is too large all
+# the same is split when it is encoded.
+MAX_VALUES = 20_000
+# Of serialized messages, which compress to between a tenth and all of it, and a third more as text.
+MAX_BYTES = 96 * 1024
+# The sample that closes a batch by itself may come a little after batch_s.
+_GRACE_S = 0.1
+_MOST_OPEN = 8
+
+Sample = Tuple[int, Mapping[str, Value]]
+
+
+@dataclass
+class StreamCounts:
+    """What became of a stream's samples since the start: ``samples`` were taken, and ``stored`` of them put
+    into the queue, in ``batches`` numbered from 0; ``refused`` cannot be sent; ``nulled`` values were not
+    finite."""
+
+    samples: int = 0
+    stored: int = 0
+    batches: int = 0
+    refused: int = 0
+    nulled: int = 0
+
+
+@dataclass
+class _Open:
+    opened: float
+    samples: list[Sample] = field(default_factory=list)
+    full: float = 0.0
+
+
+class BatchEncoder:
+    """Collects the samples of one stream of a run into batches, and puts these as messages into the spool.
+
+    A batch lies within one second of the samples' own time. Clocks may interleave, as two publishers' do if
+    one of them is behind: each second that is open has a batch of its own. A batch closes
+    - with the first sample of another second, once it is about ``batch_s`` old;
+    - when it is full: `MAX_VALUES` values, or `MAX_BYTES` of messages, which is near the message limit;
+    - by the clock, a little after ``batch_s``, when the topic falls silent;
+    - when too many seconds are open at once, as in a recording that is played fast: the oldest first.
+
+    Samples of one time stay two samples. Within a batch they are in order of time, and as they came if the
+    time is the same. Safe to use from several threads.
+    """
+
+    def __init__(self, stream: str, *, boot: str, batch_s: float, spool: Spool, clock: Clock) -> None:
+        self._stream, self._boot, self._spool, self._clock = stream, boot, spool, clock
+        self._batch_s = batch_s
+        self._batch_us = round(batch_s * 1_000_000)
+        self._counts = StreamCounts()
+        self._lock = threading.Lock()
+        # By the part of time that they hold, oldest first.
+        self._open: dict[tuple[int, int], _Open] = {}
+
+    def add(self, t_us: int, values: Mapping[str, Value]) -> None:
+        """Take a sample; the mapping must not change afterwards."""
+        second, within_us = divmod(t_us, 1_000_000)
+        slot = (second, within_us // self._batch_us if self._batch_us else 0)
+        with self._lock:
+            self._counts.samples += 1
+            batch = self._open.get(slot)
+            if batch is None:
+                now = self._clock.monotonic()
+                self._close_older(now, self._batch_s - _GRACE_S)
+                while len(self._open) >= _MOST_OPEN:
+                    self._close(next(iter(self._open)))
+                batch = self._open[slot] = _Open(now)
+            batch.samples.append((t_us, values))
+            # Only to know when to close: looking into each message would cost more than keeping it.
+            if isinstance(values, RosMessage):
+                batch.full += (len(values.raw) + 1) / MAX_BYTES
+            else:
+                batch.full += max(1, len(values)) / MAX_VALUES
+            if batch.full >= 1 or len(batch.samples) >= MAX_SAMPLES or not self._batch_us:
+                self._close(slot)
+
+    def counts(self) -> StreamCounts:
+        """The counts of one moment."""
+        with self._lock:
+            return replace(self._counts)
+
+    def tick(self) -> None:
+        """Close the batches of a topic that has fallen silent."""
+        with self._lock:
+            if self._open:
+                self._close_older(self._clock.monotonic(), self._batch_s + _GRACE_S)
+
+    def flush(self) -> None:
+        """Close every batch, whatever it holds."""
+        with self._lock:
+            for slot in list(self._open):
+                self._close(slot)
+
+    def _close_older(self, now: float, age_s: float) -> None:
+        for slot in [slot for slot, batch in self._open.items() if now - batch.opened >= age_s]:
+            self._close(slot)
+
+    def _close(self, slot: tuple[int, int]) -> None:
+        """Put the samples into the spool, in as many messages as they need: one for each ROS type, or each
+        set of fields, since a missing field is not the same as a null one."""
+        samples = self._open.pop(slot).samples
+        samples.sort(key=itemgetter(0))
+        alike: dict[Hashable, list[Sample]] = {}
+        for sample in samples:
+            values = sample[1]
+            names = values.beside if isinstance(values, RosMessage) else values
+            kind = values.kind.id if isinstance(values, RosMessage) else None
+            alike.setdefault((kind, frozenset(names)), []).append(sample)
+        for group in alike.values():
+            self._put(_batch(self._boot, group))
+
+    def _put(self, batch: Batch) -> None:
+        """Encode a batch, or its halves if it does not fit, down to the sample to refuse."""
+        batch = replace(batch, seq=self._counts.batches, previous=self._spool.previous(self._stream))
+        problem = self._try(batch)
+        if problem and len(batch.times_us) > 1:
+            # One bad value must not cost the others.
+            for half in split_batch(batch):
+                self._put(half)
+            return
+        if problem and batch.previous:
+            # Other batches of the run name the runs before it.
+            problem = self._try(replace(batch, previous=()))
+        if problem:
+            self._refuse(problem)
+
+    def _try(self, batch: Batch) -> str:
+        """Put the batch into the spool; returns the problem of one that cannot be sent."""
+        try:
+            payload = encode_batch(batch)
+        except ContractError as error:
+            return str(error)
+        if len(payload) > MAX_MESSAGE_BYTES:
+            return f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes"
+        n = len(batch.times_us)
+        self._spool.put(self._stream, batch.boot, batch.seq, payload, samples=n)
+        self._counts.batches += 1
+        self._counts.stored += n
+        self._counts.nulled += _nonfinite(batch.columns)
+        return ""
+
+    def _refuse(self, why: str) -> None:
+        self._counts.refused += 1
+        # A stream that is wrong is wrong at its full rate; the first one says it all.
+        level = logging.WARNING if self._counts.refused == 1 else logging.DEBUG
+        _log.log(level, "stream %s: a sample cannot be sent: %s", self._stream, why)
+
+
+def _batch(boot: str, samples: Sequence[Sample]) -> Batch:
+    times = [t_us for t_us, _ in samples]
+    first = samples[0][1]
+    if isinstance(first, RosMessage):
+        messages = [values for _, values in samples if isinstance(values, RosMessage)]
+        beside = {name: [message.beside[name] for message in messages] for name in first.beside}
+        raw = [message.raw for message in messages]
+        return Batch(boot, 0, times, beside, 0, Messages(first.kind.id, first.kind.layout, raw))
+    return Batch(boot, 0, times, {name: [values[name] for _, values in samples] for name in first})
+
+
+def _nonfinite(columns: Mapping[str, Sequence[Value]]) -> int:
+    return sum(map(_nonfinite_of, columns.values()))
+
+
+def _nonfinite_of(column: Sequence[Value]) -> int:
+    try:
+        if all(map(math.isfinite, column)):  # type: ignore[arg-type]  # what is no number is told apart below
+            return 0
+    except (TypeError, OverflowError):
+        pass  # a text, a null, or an integer beyond every float among them
+    return sum(type(value) is float and not math.isfinite(value) for value in column)
+
 
 _MOST_TYPES = 1024
 

@@ -13,9 +13,8 @@ import threading
 from typing import NamedTuple
 
 from iort_agent.common.throttled_log import ThrottledLog
-from iort_agent.lanes.config import RuntimeSettings
-from iort_agent.lanes.live import LiveLane
-from iort_agent.lanes.tempo import Demand
+from iort_agent.lanes import RuntimeSettings
+from iort_agent.lanes.live import Demand, LiveLane
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import LIVE_BROKER_EVERY_S, ContractError
 from iort_contract.messages.control.settings import ALWAYS

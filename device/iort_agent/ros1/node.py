@@ -21,10 +21,8 @@ from typing import Any, Mapping
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.threads import Supervised
 from iort_agent.errors import SourceError
-from iort_agent.ros1 import connecting, master
-from iort_agent.ros1.graph import OnBytes
-from iort_agent.ros1.trigger import OnTrigger, trigger
-from iort_agent.ros1.types import Installed, installed, rospy
+from iort_agent.ros1 import OnBytes, master
+from iort_agent.ros1.types import Installed, OnTrigger, installed, rospy, trigger
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
 
@@ -328,7 +326,7 @@ class Node:
         for name, level in _LOGGERS.items():
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
-        connecting.mend(self._me)
+        master.mend(self._me)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
             self.base, argv=[self.base], disable_signals=True, disable_rosout=True, disable_rostime=True

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Mapping
+import logging
+import threading
+from typing import Any, Mapping, Sequence
 
-from iort_agent.sources import SourceConfig
-from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.clock import Clock
+from iort_agent.errors import SourceError
+from iort_agent.sources import Emit, SourceConfig
+from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.ros1 import Ros1Config
-from iort_agent.sources.rosbridge.source import RosbridgeConfig
-from iort_agent.sources.sim.source import SimConfig
-from iort_agent.sources.vesc.serial_line import VescConfig
+from iort_agent.sources.rosbridge import RosbridgeConfig
+from iort_agent.sources.sim import SimConfig
+from iort_agent.sources.vesc import VescConfig
 
 SOURCES: Mapping[str, type[SourceConfig]] = {
     "bag": BagConfig,
@@ -18,3 +22,59 @@ SOURCES: Mapping[str, type[SourceConfig]] = {
     "sim": SimConfig,
     "vesc": VescConfig,
 }
+
+
+_log = logging.getLogger(__name__)
+
+
+class SourceRun:
+    """Builds the source of a configuration and runs it once."""
+
+    def __init__(self, config: SourceConfig, clock: Clock) -> None:
+        self.description, self.streams = config.describe(), config.streams()
+        self.recorded, self.replayed = config.recorded(), config.replayed()
+        self.source = config.build(clock)
+        self.failed = False
+        self._ended = False
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Run until the source ends, fails or is stopped. Raises what is no `SourceError`, unless the source
+        plays a recording: run again, it would give its samples twice."""
+        _log.info("source started: %s", self.description)
+        try:
+            self.source.run(emit, stop)
+        except SourceError as error:
+            _log.error("source failed: %s: %s", self.description, error)
+            self.failed = True
+        except Exception:
+            if not self.recorded:
+                raise
+            _log.exception("source failed: %s", self.description)
+            self.failed = True
+        else:
+            _log.info("source ended: %s", self.description)
+            self._ended = not stop.is_set()
+
+    def check_stored(self, streams: Sequence[tuple[int, int]]) -> None:
+        """Set `failed` if the source ended by itself and none of its samples could be stored.
+
+        ``streams`` are the counts of accepted and rejected samples of each of its streams.
+        """
+        if not self._ended:
+            return
+        samples, refused = sum(one[0] for one in streams), sum(one[1] for one in streams)
+        if not streams:
+            _log.error("source failed: %s: it gave no sample", self.description)
+            self.failed = True
+        elif samples and samples == refused:
+            _log.error("source failed: %s: none of its %d samples could be stored", self.description, samples)
+            self.failed = True
+
+    def waits(self) -> str | None:
+        """The reason why the source waits; None if it does not wait."""
+        why = self.source.report().get("waits")
+        return str(why) if why else None
+
+    def report(self) -> Mapping[str, Any]:
+        """The source's own counts."""
+        return self.source.report()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 
-from iort_agent.spool.interface import OVERWRITE_OLDEST, Backlog, Dropped, Entry, OnStored
+from iort_agent.spool import OVERWRITE_OLDEST, Backlog, Dropped, Entry, OnStored
 from iort_contract.messages.batch import RunEnd
 
 

@@ -28,19 +28,18 @@ from typing import Callable, Iterable
 from iort_agent.clock import Clock
 from iort_agent.common.threads import Supervised
 from iort_agent.errors import AgentError
-from iort_agent.spool.config import QueueConfig
-from iort_agent.spool.file import READ_BYTES, READ_ENTRIES, QueueLock, SpoolFile
-from iort_agent.spool.interface import (
-    OVERWRITE_OLDEST,
-    PROCESS,
-    Backlog,
-    Dropped,
-    Entry,
-    OnStored,
-    Spool,
+from iort_agent.spool import OVERWRITE_OLDEST, PROCESS, Backlog, Dropped, Entry, OnStored, QueueConfig, Spool
+from iort_agent.spool.file import (
+    READ_BYTES,
+    READ_ENTRIES,
+    QueueLock,
+    SpoolFile,
+    is_damage,
+    put_in_place,
+    rebuild,
+    rebuilt,
 )
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.spool.salvage import is_damage, put_in_place, rebuild, rebuilt
 from iort_contract.messages.batch import RunEnd
 
 _log = logging.getLogger(__name__)
@@ -74,7 +73,7 @@ def make_spool(queue: QueueConfig, clock: Clock) -> Spool:
 
 
 class SqliteSpool:
-    """A `iort_agent.spool.interface.Spool` in an SQLite file. ``max_bytes`` bounds the payloads.
+    """A `iort_agent.spool.Spool` in an SQLite file. ``max_bytes`` bounds the payloads.
 
     `start` begins the thread; without it, call `work`. The file is a little larger than its payloads and
     gives pages back when it has been emptied.

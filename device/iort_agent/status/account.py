@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any, Callable, Iterator, Mapping, Sequence, Tuple
 
 from iort_agent.clock import Clock
-from iort_agent.lanes.batch_encoder import StreamCounts
-from iort_agent.lanes.streams import Streams
-from iort_agent.spool.interface import Spool
+from iort_agent.lanes.streams import StreamCounts, Streams
+from iort_agent.spool import Spool
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 

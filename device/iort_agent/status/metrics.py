@@ -12,11 +12,11 @@ from typing import Mapping
 from iort_agent.clock import Clock
 from iort_agent.common.schema import flag, number, setting
 from iort_agent.common.threads import WATCH
-from iort_agent.files.uploads import Uploads
-from iort_agent.lanes.batch_encoder import StreamCounts
-from iort_agent.lanes.clock_offset import OffsetEstimator
+from iort_agent.files.folder import Uploads
+from iort_agent.lanes.pings import OffsetEstimator
+from iort_agent.lanes.streams import StreamCounts
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.spool.interface import Spool
+from iort_agent.spool import Spool
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import Value
 

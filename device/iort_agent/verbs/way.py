@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 
 from iort_agent.common.state import Status
 from iort_agent.config import Config
-from iort_agent.files.http import trusting
+from iort_agent.files.upload import trusting
 from iort_agent.mqtt.by_hand import ForeignError, RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.verbs.tls import SET_CLOCK, TIMEOUT_S, BlockedError, no_tls, refused_ours, secured, utc

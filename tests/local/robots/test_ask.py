@@ -15,7 +15,7 @@ import pytest
 from bench.meters.asking import Ask, asking
 from iort_agent.config import load_config
 from iort_agent.errors import AskError
-from iort_agent.files.http import downloader
+from iort_agent.files.upload import downloader
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import DriveKey, Estimate

@@ -26,7 +26,7 @@ from rosbags.rosbag1 import Reader
 
 from iort_agent.clock import SystemClock
 from iort_agent.files.file import read
-from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
+from iort_agent.files.upload import ByteRate, Outcome, Sender, trusting
 from iort_contract.messages.requests.files import (
     FILES_PREFIX,
     PART_BYTES,

@@ -23,8 +23,7 @@ from iort_agent.control.downlink import Downlink
 from iort_agent.control.motion.commands import Operator
 from iort_agent.control.motion.guard import Guard
 from iort_agent.control.questions import Questions
-from iort_agent.files.http import downloader
-from iort_agent.files.upload import make_uploader
+from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.node import DEFAULT_NODE, shared
 from iort_contract.messages.control.commands import Command, FleetMessage, encode_command, encode_fleet

@@ -8,7 +8,7 @@ import time
 import roslib.message
 import rospy
 
-from iort_agent.ros1 import connecting
+from iort_agent.ros1 import master
 
 
 def say(line: str) -> None:
@@ -24,7 +24,7 @@ def plain(value):
 
 
 name, topic, kind = sys.argv[1:4]
-connecting.mend(f"/{name}")
+master.mend(f"/{name}")
 rospy.init_node(name, disable_signals=True)
 subscriber = rospy.Subscriber(
     topic,

@@ -6,7 +6,7 @@ import threading
 
 import rospy
 
-from iort_agent.ros1 import connecting
+from iort_agent.ros1 import master
 from tests.ros.mixed.robot import TOPICS
 
 turn = threading.Lock()
@@ -19,7 +19,7 @@ def say(message, topic):
         sys.stdout.flush()
 
 
-connecting.mend("/feed")
+master.mend("/feed")
 rospy.init_node("feed", disable_signals=True, disable_rosout=True)
 subscribers = [rospy.Subscriber(name, rospy.AnyMsg, say, callback_args=name) for name in TOPICS]
 sys.stdin.readline()

@@ -19,16 +19,15 @@ from iort_agent.common.state import Connection, Status, document, read
 from iort_agent.config import Config, without_sources
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import SourceError
-from iort_agent.lanes.config import PingConfig, RecordConfig
+from iort_agent.lanes import PingConfig, RecordConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit, SourceConfig
-from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.sim.source import SimConfig
-from iort_agent.spool.config import QueueConfig
-from iort_agent.spool.interface import REJECT_NEW, Spool
+from iort_agent.sources.recording import BagConfig
+from iort_agent.sources.sim import SimConfig
+from iort_agent.spool import REJECT_NEW, QueueConfig, Spool
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.metrics import MetricsConfig

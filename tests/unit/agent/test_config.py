@@ -10,9 +10,9 @@ import pytest
 from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
-from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.sim.source import SimConfig
-from iort_agent.spool.config import QueueConfig, default_path
+from iort_agent.sources.recording import BagConfig
+from iort_agent.sources.sim import SimConfig
+from iort_agent.spool import QueueConfig, default_path
 from iort_agent.spool.sqlite import make_spool
 
 GOOD = """\

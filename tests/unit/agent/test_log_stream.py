@@ -16,7 +16,7 @@ from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit, SourceConfig
-from iort_agent.spool.config import REJECT_NEW
+from iort_agent.spool import REJECT_NEW
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM
 from iort_contract.messages.batch import decode_batch

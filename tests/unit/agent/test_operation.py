@@ -24,8 +24,8 @@ from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is
 from iort_agent.common.state import Status, read
 from iort_agent.config import load_config
 from iort_agent.errors import AgentError, BusyError, NotRunningError
-from iort_agent.lanes.batch_encoder import StreamCounts
-from iort_agent.lanes.clock_offset import OffsetEstimator
+from iort_agent.lanes.pings import OffsetEstimator
+from iort_agent.lanes.streams import StreamCounts
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources import OK, WARN
 from iort_agent.spool.memory import MemorySpool

@@ -22,13 +22,13 @@ from iort_agent.common.threads import END, FIRST_S, RESTART, THREADS, WATCH, Kin
 from iort_agent.config import Config
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import AgentError
-from iort_agent.files.config import FilesConfig
-from iort_agent.lanes.config import PingConfig
+from iort_agent.files.folder import FilesConfig
+from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.reporting import make_status
 from iort_agent.ros1.node import Node
 from iort_agent.runtime import Runtime
-from iort_agent.sources.sim.source import SimConfig
+from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_agent.status.server import StatusServer, fetch
 from iort_contract.messages.batch import decode_batch

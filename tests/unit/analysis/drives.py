@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
+from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle as SimulatedCar
+from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.drives.drive import Drive
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH

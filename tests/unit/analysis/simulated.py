@@ -6,9 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.messages.analysis.findings import DriveKey

@@ -74,7 +74,7 @@ def test_the_imports_keep_all_walls(house: Path) -> None:
         ("station", "station/iort_station/data/stored/batches.py", "iort_station.cli.console"),
         ("contract", "contract/iort_contract/codec/columns.py", "iort_contract.messages.batch"),
         ("functions", "functions/live.py", "functions.alert"),
-        ("circles", "device/iort_agent/sources/recording/player.py", "iort_agent.sources.recording.bag"),
+        ("circles", "device/iort_agent/sources/recording/player.py", "iort_agent.sources.recording.rosbag"),
     ],
 )
 def test_a_forbidden_import_breaks_its_wall(house: Path, contract: str, file: str, imported: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_agent.sources.sim.circuit import HALL
+from iort_agent.sources.sim.driver import HALL
 from iort_contract.catalog.streams import LOG_STREAM, POSE_STREAM
 from iort_station.page.server import PageServer
 from tests.browser import drawn, plain, show, until

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_agent.lanes.thumbnail import thumbnail
+from iort_agent.lanes.attachment import thumbnail
 from iort_station.page.server import PageServer
 from tests.browser import drawn, show, until
 from tests.images import jpeg

@@ -51,7 +51,7 @@ def _file(content: bytes, name: str) -> File:
     },
     source=f"{_GUIDE}/using-presigned-url.html, {_GUIDE}/conditional-requests.html and "
     "https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch",
-    relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/http.py"),
+    relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/upload.py"),
 )
 def in_one(target: Target) -> Seen:
     """A signed address accepts this content, of this length, under this key, once. Other bytes are refused
@@ -128,7 +128,7 @@ def in_parts(target: Target) -> Seen:
         "blocked": ["BlockPublicAcls", "BlockPublicPolicy", "IgnorePublicAcls", "RestrictPublicBuckets"],
     },
     source=f"{_GUIDE}/using-presigned-url.html and {_GUIDE}/access-control-block-public-access.html",
-    relied_on_by=("stacks/storage.py", "device/iort_agent/files/http.py"),
+    relied_on_by=("stacks/storage.py", "device/iort_agent/files/upload.py"),
 )
 def closed(target: Target) -> Seen:
     """An expired address is refused with 403, and so is a request without signature."""

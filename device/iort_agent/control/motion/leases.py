@@ -12,7 +12,7 @@ What a session has sent before its lease ended moves nothing after the stop, eve
 lease still holds.
 
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
-within the uncertainty of its measured offset (`iort_agent.lanes.clock_offset`), and counts a command as old
+within the uncertainty of its measured offset (`iort_agent.lanes.pings`), and counts a command as old
 as it may be. Without a known offset, no motion command passes. Leases run on the monotonic clock.
 """
 

@@ -16,8 +16,7 @@ from typing import Any, Callable, Iterator, Mapping, NamedTuple, Optional, Seque
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Message
-from iort_agent.sources.recording.reader import INDEX, Reader
-from iort_agent.sources.recording.unreadable import wrapped
+from iort_agent.sources.recording.reader import INDEX, Reader, wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import ROS2, MessageType

@@ -9,16 +9,149 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import dataclass
 from typing import Sequence
 
-from iort_agent.sources.sim.battery import Battery
-from iort_agent.sources.sim.circuit import HALL, Circuit, Grip, wrapped
-from iort_agent.sources.sim.damage import Damage
-from iort_agent.sources.sim.driver import Driver, Pose, Wish
-from iort_agent.sources.sim.faults import FaultConfig
-from iort_agent.sources.sim.heat import Heat
-from iort_agent.sources.sim.parameters import AIR_KG_PER_M3, G_MPS2, IDLE_W, VehicleConfig
+from iort_agent.common.schema import number, setting
+from iort_agent.sources.sim.driver import HALL, Circuit, Driver, Grip, Pose, Wish, wrapped
+from iort_agent.sources.sim.faults import Damage, FaultConfig
+from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.vesc import TACHOMETER_COUNTS
+
+G_MPS2 = 9.81
+AIR_KG_PER_M3 = 1.2
+# The power that the VESC's logic draws from the battery, and heats its board with.
+IDLE_W = 1.5
+
+
+@dataclass(frozen=True)
+class VehicleConfig:
+    """A car; the defaults are a 1:10 F1TENTH car with a three-cell battery.
+
+    Forces, and masses of what turns, are those at the tyres. The motor runs in FOC: a winding's resistance
+    is a phase's at 25 degC, and the MOSFETs' adds to it. The battery's resistance acts at once, and its slow
+    resistance within ``battery_slow_s``. The air cools twice as well at 5 m/s as for a standing car.
+    """
+
+    mass_kg: float = setting(number(0.1, 5000, unit="kg"), 3.7)
+    rotating_mass_kg: float = setting(number(0, 5000, unit="kg, inertia of motor, gears and wheels"), 0.35)
+    drag_area_m2: float = setting(number(0, 5, unit="m2, drag coefficient times area"), 0.03)
+    rolling_resistance: float = setting(number(0, 0.5), 0.03)
+    drivetrain_friction_n: float = setting(number(0, 10_000, unit="N"), 1.0)
+    drivetrain_efficiency: float = setting(number(0.1, 1), 0.93)
+    speed_to_erpm_gain: float = setting(number(1, 1e6, unit="erpm per m/s"), F1TENTH.speed_to_erpm_gain)
+    pole_pairs: int = setting(number(1, 50, whole=True), 2)
+    motor_kv: float = setting(number(1, 20_000, unit="rpm/V"), 3500.0)
+    motor_resistance_ohm: float = setting(number(0.0001, 10, unit="ohm"), 0.015)
+    motor_inductance_h: float = setting(number(0, 0.1, unit="H"), 4e-6)
+    fet_resistance_ohm: float = setting(number(0, 1, unit="ohm"), 0.005)
+    motor_heat_capacity_j_per_k: float = setting(number(0.1, 1e7, unit="J/K"), 90.0)
+    motor_cooling_w_per_k: float = setting(number(0.0001, 1e5, unit="W/K, standing"), 0.12)
+    board_heat_capacity_j_per_k: float = setting(number(0.1, 1e7, unit="J/K"), 60.0)
+    board_cooling_w_per_k: float = setting(number(0.0001, 1e5, unit="W/K, standing"), 0.25)
+    motor_to_board_w_per_k: float = setting(number(0, 1e5, unit="W/K"), 0.01)
+    max_current_a: float = setting(number(0.1, 1000, unit="A"), 45.0)
+    max_brake_current_a: float = setting(number(0, 1000, unit="A"), 22.0)
+    max_speed_mps: float = setting(number(0.1, 100, unit="m/s"), 6.5)
+    wheelbase_m: float = setting(number(0.01, 20, unit="m"), 0.33)
+    max_steering_rad: float = setting(number(0.01, 1.4, unit="rad"), 0.42)
+    friction: float = setting(number(0.01, 5), 0.7)
+    slip_stiffness: float = setting(number(1, 200, unit="share of the weight per share of slip"), 15.0)
+    cells: int = setting(number(1, 100, whole=True), 3)
+    capacity_ah: float = setting(number(0.01, 1000, unit="Ah"), 5.0)
+    battery_resistance_ohm: float = setting(number(0, 10, unit="ohm"), 0.03)
+    battery_slow_resistance_ohm: float = setting(number(0, 10, unit="ohm"), 0.015)
+    battery_slow_s: float = setting(number(0.1, 10_000, unit="s"), 40.0)
+    charge: float = setting(number(0.01, 1, unit="share of the capacity at the start"), 0.97)
+    ambient_degc: float = setting(number(-40, 60, unit="degC"), 24.0)
+
+    @property
+    def flux_linkage_wb(self) -> float:
+        """The motor's flux linkage, as VESC Tool has it."""
+        return 60 / (2 * math.pi * math.sqrt(3) * self.motor_kv * self.pole_pairs)
+
+    @property
+    def newtons_per_amp(self) -> float:
+        """The motor's force at the tyres, before the gears' losses."""
+        motor_rad_per_m = self.speed_to_erpm_gain / self.pole_pairs * 2 * math.pi / 60
+        return 1.5 * self.pole_pairs * self.flux_linkage_wb * motor_rad_per_m
+
+
+def open_voltage(charge: float) -> float:
+    """The voltage of a lithium-polymer cell at rest: a long flat stretch, then a knee."""
+    return 3.45 + 0.55 * charge + 0.2 * charge**8 - 0.45 * (1 - charge) ** 12
+
+
+class Battery:
+    """The battery's state and the VESC's counters of charge and energy, in ampere-hours and watt-hours."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self._config = config
+        self.charge = config.charge
+        self.wear(1.0, 1.0)
+        self._slow_v = 0.0
+        self.current_a = 0.0
+        self.open_v = self.voltage_v = config.cells * open_voltage(self.charge)
+        self.drawn_ah = self.regen_ah = self.drawn_wh = self.regen_wh = 0.0
+
+    def wear(self, resistance: float, capacity: float) -> None:
+        """Multiply the new battery's resistances and capacity."""
+        c = self._config
+        self._resistance_ohm = c.battery_resistance_ohm * resistance
+        self._slow_ohm = c.battery_slow_resistance_ohm * resistance
+        self._capacity_ah = c.capacity_ah * capacity
+
+    def step(self, watts: float, dt: float, *, lost_v: float = 0.0) -> None:
+        """Give so many watts for ``dt`` seconds; ``lost_v`` is what a bad cell does not give."""
+        self.open_v = self._config.cells * open_voltage(self.charge)
+        source_v = max(0.1, self.open_v - self._slow_v - lost_v)
+        # At the terminals V = source - I R and V I = watts; the root near no load is the real one.
+        root = max(0.0, source_v**2 - 4 * self._resistance_ohm * watts)
+        self.voltage_v = voltage_v = (source_v + math.sqrt(root)) / 2
+        self.current_a = current_a = watts / voltage_v
+        self._slow_v += (current_a * self._slow_ohm - self._slow_v) * min(
+            1.0, dt / self._config.battery_slow_s
+        )
+        amp_hours = current_a * dt / 3600
+        if amp_hours > 0:
+            self.drawn_ah += amp_hours
+            self.drawn_wh += amp_hours * voltage_v
+        else:
+            self.regen_ah -= amp_hours
+            self.regen_wh -= amp_hours * voltage_v
+        self.charge = min(1.0, max(0.0, self.charge - amp_hours / self._capacity_ah))
+
+
+# Copper's resistance grows by this share a kelvin; the settings are at this temperature.
+_COPPER_PER_K, REFERENCE_DEGC = 0.0039, 25.0
+# The car's own wind doubles the cooling at this speed.
+WIND_MPS = 5.0
+# The logic warms the board before the drive begins.
+_WARM_K = 3.0
+
+
+class Heat:
+    """The temperatures of motor and board."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self._config = config
+        self.motor_degc = config.ambient_degc
+        self.board_degc = config.ambient_degc + _WARM_K
+
+    def winding(self, ohm: float) -> float:
+        """A winding's resistance now, from the one at 25 degC."""
+        return ohm * (1 + _COPPER_PER_K * (self.motor_degc - REFERENCE_DEGC))
+
+    def step(self, motor_w: float, board_w: float, speed_mps: float, cooling: float, dt: float) -> None:
+        """Heat both for ``dt`` seconds; ``cooling`` is the share of their cooling that is left."""
+        c = self._config
+        wind = cooling * (1 + abs(speed_mps) / WIND_MPS)
+        across_w = (self.motor_degc - self.board_degc) * c.motor_to_board_w_per_k
+        motor_out_w = (self.motor_degc - c.ambient_degc) * c.motor_cooling_w_per_k * wind + across_w
+        board_out_w = (self.board_degc - c.ambient_degc) * c.board_cooling_w_per_k * wind - across_w
+        self.motor_degc += (motor_w - motor_out_w) / c.motor_heat_capacity_j_per_k * dt
+        self.board_degc += (board_w - board_out_w) / c.board_heat_capacity_j_per_k * dt
+
 
 _RAD_S_PER_ERPM = 2 * math.pi / 60
 # A servo turns the wheels this fast.

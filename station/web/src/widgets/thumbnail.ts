@@ -5,7 +5,7 @@ import { bytes, type Claim } from "../live/attachments";
 import { el, setAttribute, Text } from "../base/dom";
 import { age } from "../base/format";
 
-// The cars' thumbnails have 96 pixels; see device/iort_agent/lanes/thumbnail.py.
+// The cars' thumbnails have 96 pixels; see device/iort_agent/lanes/attachment.py.
 const MOST_PIXELS = 256;
 // The marker of a frame of any coding; three markers of the range are tables (ITU T.81, table B.1).
 const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);

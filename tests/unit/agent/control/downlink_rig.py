@@ -17,7 +17,7 @@ from iort_agent.control.motion.commands import Operator
 from iort_agent.control.motion.stops import STOP_AHEAD_MS
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.ros1.trigger import OnTrigger
+from iort_agent.ros1.types import OnTrigger
 from iort_contract.limits import Value
 from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse

@@ -14,12 +14,10 @@ from PIL import Image
 
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
-from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import read
-from iort_agent.files.folder import Folder
-from iort_agent.lanes.attachment import Attachments
-from iort_agent.lanes.thumbnail import thumbnail
-from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.files.folder import FilesConfig, Folder
+from iort_agent.lanes.attachment import Attachments, thumbnail
+from iort_agent.sources.recording import BagConfig
 from iort_contract.limits import MAX_PUBNUB_BYTES, MessageError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.lanes.batch_encoder import MAX_VALUES, BatchEncoder, StreamCounts, _Open
+from iort_agent.lanes.streams import MAX_VALUES, BatchEncoder, StreamCounts, _Open
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
 from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of

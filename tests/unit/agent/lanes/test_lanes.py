@@ -17,9 +17,8 @@ from iort_agent.agent import Agent
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.state import document
 from iort_agent.config import Config
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
-from iort_agent.lanes.production import Production, Rate
-from iort_agent.lanes.record import too_many
+from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
+from iort_agent.lanes.record import Production, Rate, too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.reporting import make_report, make_status

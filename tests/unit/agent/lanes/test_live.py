@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from iort_agent.lanes.live import LiveLane
-from iort_agent.lanes.tempo import Demand
+from iort_agent.lanes.live import Demand, LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import LiveSample, decode_live

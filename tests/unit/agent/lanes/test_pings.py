@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import RoundTrips
 from iort_agent.errors import ConfigError
-from iort_agent.lanes.config import PingConfig
+from iort_agent.lanes import PingConfig
 from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import MAX_MESSAGE_BYTES

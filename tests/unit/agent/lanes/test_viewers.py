@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.dispatch import Dispatcher

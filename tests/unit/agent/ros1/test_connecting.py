@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from iort_agent.ros1 import connecting, master
+from iort_agent.ros1 import master
 
 TOPIC, URI = "/wheel", "http://127.0.0.1:1"
 CHOSEN = ["TCPROS", "127.0.0.1", 2]
@@ -53,7 +53,7 @@ def rospy(monkeypatch: pytest.MonkeyPatch) -> Rospy:
     ):
         monkeypatch.setitem(sys.modules, f"rospy.impl.{name}", module)
     monkeypatch.setattr(master, "proxy", lambda *_: found)
-    connecting.mend("/iort_agent")
+    master.mend("/iort_agent")
     found.connect = lambda topic=TOPIC: handlers._connect_topic(found, topic, URI)
     return found
 

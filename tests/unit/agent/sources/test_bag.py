@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK
-from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.recording.rosbag import _VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
+from iort_agent.sources.rosbridge import Numbers, Repeats
 
 
 @pytest.mark.parametrize(

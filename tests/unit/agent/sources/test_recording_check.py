@@ -18,9 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Finding
-from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.recording.look import look_into
-from iort_agent.sources.recording.player import Message
+from iort_agent.sources.recording import BagConfig
+from iort_agent.sources.recording.player import Message, look_into
 from tests.unit.agent.sources.test_bag import START, STORAGES, needs_mcap, play, write_ros1, write_ros2
 from tests.unit.agent.sources.test_vesc_csv import row, write
 from tests.unit.agent.test_agent import config_file

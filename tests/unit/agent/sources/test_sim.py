@@ -12,13 +12,9 @@ import pytest
 
 from iort_agent.common.schema import Place, load
 from iort_agent.errors import ConfigError, SourceError
-from iort_agent.sources.sim.circuit import HALL, Circuit, wrapped
-from iort_agent.sources.sim.driver import Pose
-from iort_agent.sources.sim.graph import SimGraph
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.source import PoseConfig, SimConfig
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim import PoseConfig, Sensors, SimConfig, SimGraph
+from iort_agent.sources.sim.driver import HALL, Circuit, Pose, wrapped
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import CATALOG, POSE_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.messages.control.driving import DRIVE_TYPE, DriveLimits

@@ -10,12 +10,10 @@ import pytest
 
 from iort_agent.common.schema import Place, load
 from iort_agent.errors import ConfigError
+from iort_agent.sources.sim import Sensors, SimConfig
 from iort_agent.sources.sim.driver import Wish
 from iort_agent.sources.sim.faults import KINDS, STRENGTHS, FaultConfig
-from iort_agent.sources.sim.parameters import G_MPS2
-from iort_agent.sources.sim.sensors import Sensors
-from iort_agent.sources.sim.source import SimConfig
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim.vehicle import G_MPS2, Vehicle
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.sources.test_sim_physics import CAR, steps
 

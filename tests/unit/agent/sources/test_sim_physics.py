@@ -7,13 +7,10 @@ from typing import Any, Iterator
 
 import pytest
 
-from iort_agent.sources.sim.battery import Battery
+from iort_agent.sources.sim import ALL, Sensors
 from iort_agent.sources.sim.driver import Wish
-from iort_agent.sources.sim.heat import Heat
-from iort_agent.sources.sim.parameters import G_MPS2, IDLE_W, VehicleConfig, open_voltage
-from iort_agent.sources.sim.sensors import ALL, Sensors
-from iort_agent.sources.sim.vehicle import Vehicle
-from iort_agent.sources.vesc.protocol import LAYOUTS
+from iort_agent.sources.sim.vehicle import G_MPS2, IDLE_W, Battery, Heat, Vehicle, VehicleConfig, open_voltage
+from iort_agent.sources.vesc_protocol import LAYOUTS
 
 DT = 0.02
 CAR = VehicleConfig()

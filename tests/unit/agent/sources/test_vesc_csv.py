@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from iort_agent.errors import SourceError
-from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.recording import BagConfig
 from iort_contract.catalog.vesc import VESC_FIELDS, absent
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from tests.agent_fakes import ManualClock

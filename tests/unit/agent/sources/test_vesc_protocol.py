@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.sources.vesc import protocol
-from iort_agent.sources.vesc.protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
+from iort_agent.sources import vesc_protocol
+from iort_agent.sources.vesc_protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
 from iort_contract.catalog.vesc import VESC_FIELDS
 from tests.vesc_standin import FIRMWARE, framed, values
 
@@ -68,8 +68,8 @@ def test_memory_is_bounded(chunks: list[bytes]) -> None:
     parser = FrameParser()
     for chunk in chunks:
         parser.feed(chunk)
-        assert parser.pending <= len(parser._buffer) <= protocol._MAX_BUFFER
-        assert sum(map(len, parser._ends.values())) <= 2 * protocol._MAX_FRAME
+        assert parser.pending <= len(parser._buffer) <= vesc_protocol._MAX_BUFFER
+        assert sum(map(len, parser._ends.values())) <= 2 * vesc_protocol._MAX_FRAME
 
 
 def test_a_frame_after_a_megabyte_of_start_bytes() -> None:
@@ -81,7 +81,7 @@ def test_a_frame_after_a_megabyte_of_start_bytes() -> None:
 
 
 def test_no_length_of_garbage_hides_the_frame_after_it() -> None:
-    for length in range(1, 2 * protocol._MAX_BUFFER, 13):
+    for length in range(1, 2 * vesc_protocol._MAX_BUFFER, 13):
         parser = FrameParser()
         for at in range(0, length, 61):
             parser.feed(b"\xaa" * min(61, length - at))
@@ -123,9 +123,9 @@ def test_a_frame_is_what_the_description_says(payload: bytes) -> None:
 
 def test_known_frames() -> None:
     """As every description of the protocol has them."""
-    assert protocol.request(protocol.COMM_GET_VALUES) == bytes.fromhex("02 01 04 40 84 03")
-    assert protocol.request(protocol.COMM_FW_VERSION) == bytes.fromhex("02 01 00 00 00 03")
-    forwarded = protocol.request(protocol.COMM_GET_VALUES, 17)
+    assert vesc_protocol.request(vesc_protocol.COMM_GET_VALUES) == bytes.fromhex("02 01 04 40 84 03")
+    assert vesc_protocol.request(vesc_protocol.COMM_FW_VERSION) == bytes.fromhex("02 01 00 00 00 03")
+    forwarded = vesc_protocol.request(vesc_protocol.COMM_GET_VALUES, 17)
     assert FrameParser().feed(forwarded) == [bytes((34, 17, 4))]
 
 
@@ -191,7 +191,7 @@ def test_firmware_2_has_a_layout_of_its_own() -> None:
     assert (decoded["displacement"], decoded["distance_traveled"]) == (-5, 6)
 
 
-@given(st.binary(min_size=1, max_size=300).filter(lambda payload: len(payload) not in protocol.LAYOUTS))
+@given(st.binary(min_size=1, max_size=300).filter(lambda payload: len(payload) not in vesc_protocol.LAYOUTS))
 def test_an_unknown_length_is_refused(payload: bytes) -> None:
     with pytest.raises(ProtocolError, match=f"got {len(payload)} bytes"):
         decode_values(b"\x04" + payload[1:])

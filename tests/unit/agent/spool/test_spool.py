@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_agent.spool.interface import OVERWRITE_OLDEST, REJECT_NEW, Spool
+from iort_agent.spool import OVERWRITE_OLDEST, REJECT_NEW, Spool
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool
 from tests.agent_fakes import ManualClock

@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from iort_agent.clock import SystemClock
-from iort_agent.spool.config import QueueConfig
+from iort_agent.spool import FULL, PROCESS, REJECT_NEW, Entry, QueueConfig
 from iort_agent.spool.file import SpoolFile
-from iort_agent.spool.interface import FULL, PROCESS, REJECT_NEW, Entry
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool, make_spool
 from tests.agent_fakes import ManualClock

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iort_agent.sources.sim.parameters import open_voltage
+from iort_agent.sources.sim.vehicle import open_voltage
 from iort_analysis.drives.transform import with_derived
 from iort_analysis.mining.battery import mine
 from iort_analysis.mining.charge import Spent, charge

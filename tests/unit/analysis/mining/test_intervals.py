@@ -8,7 +8,7 @@ from collections import defaultdict
 from bench.proof.cars import ANY_CARS, drive_of
 from bench.proof.drives import simulated
 from bench.proof.truths import INDICATORS, SPANNING, TRUTHS
-from iort_agent.sources.sim.sensors import ALL
+from iort_agent.sources.sim import ALL
 from iort_analysis.process import MINERS, analyse
 from iort_contract.catalog.derived import F1TENTH
 

@@ -6,8 +6,7 @@ import numpy as np
 import pysindy
 import pytest
 
-from iort_agent.sources.sim.parameters import VehicleConfig
-from iort_agent.sources.sim.vehicle import Vehicle
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_analysis.mining import drivetrain
 from tests.unit.analysis.drives import driven
 

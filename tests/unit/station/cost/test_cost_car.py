@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from iort_agent.config import Config, load_config
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
-from iort_agent.sources.sim.source import SimConfig
+from iort_agent.sources.sim import SimConfig
 from iort_station.cli.main import app
 from iort_station.cost.car import _OWN_RATE_HZ, as_configured
 from iort_station.cost.usage import Usage

@@ -16,10 +16,10 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from iort_agent.lanes.batch_encoder import BatchEncoder
+from iort_agent.lanes.streams import BatchEncoder
 from iort_agent.sources import Emit
 from iort_agent.sources.intake import Intake, TopicConfig
-from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.recording import BagConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data.selection import select

@@ -13,6 +13,7 @@ programs that read one port each get half of the bytes.
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import logging
 import os
@@ -25,9 +26,9 @@ from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
 from iort_agent.common.schema import number, setting, text
+from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
-from iort_agent.sources.vesc.port import Library, load_pyserial, why
-from iort_agent.sources.vesc.protocol import (
+from iort_agent.sources.vesc_protocol import (
     COMM_FW_VERSION,
     COMM_GET_VALUES,
     FrameParser,
@@ -39,6 +40,45 @@ from iort_agent.sources.vesc.protocol import (
 )
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
+
+
+class Library:
+    """pyserial, and the errors of a port that is not there, goes away or misbehaves."""
+
+    def __init__(self) -> None:
+        import termios  # noqa: PLC0415 - only where there is a port
+
+        import serial  # noqa: PLC0415 - optional
+
+        self.Serial = serial.Serial
+        self.errors = (OSError, termios.error)
+
+
+def load_pyserial() -> Library:
+    """The library. Raises `SourceError` if it is not installed."""
+    try:
+        # Only a robot that reads its VESC by itself needs it: pip install iort-agent[serial].
+        return Library()
+    except ImportError as error:
+        raise SourceError(
+            "reading a VESC needs the package pyserial: pip install 'iort-agent[serial]'"
+        ) from error
+
+
+def why(error: Exception, *, was_open: bool) -> str:
+    """The operating system's error, in words that help."""
+    # pyserial keeps the number of some errors, and only chains others.
+    numbers = {first for e in (error, error.__context__) if e is not None for first in e.args[:1]}
+    if numbers & {errno.ENOENT, errno.ENODEV, errno.ENXIO}:
+        return "is not there: waiting for it to be plugged in"
+    if numbers & {errno.EACCES, errno.EPERM}:
+        return "may not be opened: add the user to its group, mostly `sudo usermod -aG dialout $USER`"
+    if numbers & {errno.EBUSY, errno.EAGAIN}:
+        return "is in use by another program, perhaps the ROS driver of the VESC"
+    if errno.ENOTTY in numbers:
+        return "is no serial port"
+    return f"went away: {error}" if was_open else f"cannot be opened: {error}"
+
 
 _log = logging.getLogger(__name__)
 

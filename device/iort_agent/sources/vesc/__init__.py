@@ -1,1 +1,0 @@
-"""A VESC motor controller on its serial line: the protocol, and the source that polls it."""
