@@ -6,8 +6,8 @@ import threading
 from functools import partial
 from typing import Callable, NamedTuple, Optional
 
-from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
+from iort_agent.common.threads import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter

@@ -13,7 +13,7 @@ import rospy
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from iort_agent.mqtt.nodelay import send_at_once
+from iort_agent.mqtt.client import send_at_once
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from statistics import quantiles
 from bench.ros.mixed_robot import topics
 from bench.ros.vesc_message import TYPE, body
 from iort_agent.agent import Agent
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.intake import Intake, TopicConfig

@@ -13,7 +13,7 @@ from typing_extensions import Self
 
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.lanes import PingConfig
 from iort_agent.lanes.pings import Pings

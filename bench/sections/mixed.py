@@ -31,7 +31,7 @@ from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import MIXED, topics
 from bench.target import Say, Target
 from iort_agent.errors import AgentError
-from iort_agent.status.server import SOCKET, fetch
+from iort_agent.status import SOCKET, fetch
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import LIVE, RECORD, parse_topic
 

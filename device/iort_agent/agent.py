@@ -1,18 +1,34 @@
-"""Builds the agent's parts around one connection, and connects them. `iort_agent.runtime` runs them."""
+"""Builds the agent's parts around one connection, and tells their status. `iort_agent.runtime` runs them."""
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import uuid
 from dataclasses import replace
-from typing import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Callable, Mapping
 
-from iort_agent.clock import Clock
 from iort_agent.common.logs import Troubles, set_level
-from iort_agent.common.version import agent_version
+from iort_agent.common.state import (
+    Files,
+    Lanes,
+    LiveReport,
+    LiveState,
+    PingState,
+    Queue,
+    QueueReport,
+    RecordState,
+    Report,
+    Status,
+    StreamReport,
+    StreamState,
+)
+from iort_agent.common.threads import WATCH, Clock
 from iort_agent.config import Config
+from iort_agent.control.commands import Operator, refuse_commands
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.motion.commands import Operator, refuse_commands
-from iort_agent.control.motion.kept_stop import KeptStop
+from iort_agent.control.guard import KeptStop
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
@@ -23,16 +39,23 @@ from iort_agent.lanes.pings import OffsetEstimator, Pings
 from iort_agent.lanes.record import RecordLane
 from iort_agent.lanes.streams import Streams
 from iort_agent.lanes.viewers import Viewers
+from iort_agent.metrics import Accounts, AgentMetrics, Rates
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.registry import SourceRun
 from iort_agent.sources.sim import SimSource
 from iort_agent.spool import Spool
-from iort_agent.status.account import Accounts
-from iort_agent.status.metrics import AgentMetrics, Rates
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.cloud import IOT
 from iort_contract.limits import Value
+
+
+def agent_version() -> str:
+    """The version of the distribution iort-agent; a text that says so if it is not installed."""
+    try:
+        return version("iort-agent")
+    except PackageNotFoundError:
+        return "run from a checkout"
 
 
 class Agent:
@@ -153,3 +176,102 @@ class Agent:
         if any(DRIVE_STREAM in source.streams() for source in config.sources):
             return lambda _: None
         return lambda values: self.streams.emit(DRIVE_STREAM, self.clock.now_us(), values, urgent=True)
+
+
+def make_status(agent: Agent) -> Status:
+    """The agent now."""
+    settings, live = agent.streams.settings, agent.live
+    backlog, dropped = agent.spool.backlog(), agent.spool.dropped()
+    return Status(
+        robot=agent.config.robot,
+        boot=agent.boot,
+        pid=os.getpid(),
+        uptime_s=round(agent.clock.monotonic() - agent.began, 1),
+        connection=agent.uplink.status(),
+        lanes=Lanes(
+            record=RecordState(settings.record_enabled),
+            live=LiveState(
+                enabled=settings.live_enabled,
+                rate_hz=settings.live_rate_hz,
+                asked_hz=live.tempo.asked_hz,
+                viewers=agent.viewers.count(),
+                effective_hz=live.tempo.effective_hz,
+                slowed=live.tempo.slowed,
+                published=live.published,
+                refused=live.refused,
+            ),
+            ping=PingState(settings.ping_rate_hz, agent.pings.held_back),
+        ),
+        sources=_sources(agent),
+        streams=_streams(agent),
+        spool=Queue(
+            *backlog,
+            durable=agent.spool.durable,
+            dropped_batches=dropped.batches,
+            dropped_samples=dropped.samples,
+        ),
+        files=_files(agent),
+        clock=agent.offset.estimate(),
+        pings=agent.pings.report(),
+        over_share=agent.shadow.over_share,
+        alarms=_alarms(agent),
+        troubles=agent.troubles.last() if agent.troubles is not None else [],
+    )
+
+
+def make_report(agent: Agent) -> Report:
+    """The whole run, at its end."""
+    left, dropped = agent.spool.backlog(), agent.spool.dropped()
+    return Report(
+        robot=agent.config.robot,
+        boot=agent.boot,
+        streams={
+            name: StreamReport(**vars(counts)) for name, counts in sorted(agent.streams.counts().items())
+        },
+        live_published=agent.live.published,
+        live_refused=agent.live.refused,
+        live=LiveReport(*agent.live.tempo, streams_hz=agent.live.rates_hz()),
+        spool=QueueReport(left.batches, left.samples, dropped.batches, dropped.samples),
+        pings=agent.pings.report() if agent.streams.settings.ping_rate_hz else {},
+        failed_sources=[source.description for source in agent.sources if source.failed],
+        sources=_sources(agent),
+        downlink=agent.downlink.report() if agent.downlink is not None else None,
+        files=_files(agent),
+    )
+
+
+def _streams(agent: Agent) -> dict[str, StreamState]:
+    live_hz, fields = agent.live.rates_hz(), agent.streams.settings.fields
+    return {
+        name: StreamState(
+            **vars(counts),
+            per_s=agent.rates.per_s.get(name, 0.0),
+            live_hz=live_hz.get(name, 0.0),
+            silent_s=agent.rates.silent_s(name),
+            fields=list(fields.get(name, ())),
+        )
+        for name, counts in sorted(agent.streams.counts().items())
+    }
+
+
+def _sources(agent: Agent) -> list[dict[str, Any]]:
+    return [{"source": source.description, **source.report()} for source in agent.sources]
+
+
+def _files(agent: Agent) -> Files | None:
+    if agent.uploads is None:
+        return None
+    large = agent.attachments.report() if agent.attachments is not None else None
+    return dataclasses.replace(agent.uploads.status(), large=large)
+
+
+def _alarms(agent: Agent) -> list[str]:
+    alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm] + WATCH.alarms()
+    alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
+    waits = [source.waits() for source in agent.sources]
+    if agent.downlink is not None:
+        waits.append(agent.downlink.waits())
+        alarms += agent.downlink.alarms()
+        alarms += [agent.kept_stop.alarm] if agent.kept_stop.alarm is not None else []
+    # Without repetitions: sources and commands may share a ROS node.
+    return alarms + [f"source waits: {why}" for why in dict.fromkeys(waits) if why]

@@ -14,20 +14,17 @@ import time
 from pathlib import Path
 from typing import Any, Callable, NoReturn, Sequence
 
-from iort_agent.agent import Agent
-from iort_agent.clock import SystemClock
-from iort_agent.common.log_lines import neutral
-from iort_agent.common.logs import Troubles, set_up
+from iort_agent.agent import Agent, agent_version, make_report, make_status
+from iort_agent.common.logs import Troubles, neutral, set_up
 from iort_agent.common.schema import did_you_mean
 from iort_agent.common.state import document
-from iort_agent.common.version import agent_version
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config, load_config, without_sources
 from iort_agent.errors import AgentError, ConfigError
-from iort_agent.reporting import make_report, make_status
-from iort_agent.runtime import Runtime
+from iort_agent.runtime import Runtime, make_uplink
 from iort_agent.spool.sqlite import make_spool
-from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
-from iort_agent.status.text import render as render_status
+from iort_agent.status import SOCKET, StatusServer, ask, fetch
+from iort_agent.status import render as render_status
 from iort_contract.messages.control.settings import LOG_LEVELS
 
 _log = logging.getLogger("iort-agent")
@@ -182,9 +179,6 @@ def flush(options: argparse.Namespace) -> int:
 
 
 def _run(config: Config, options: argparse.Namespace, troubles: Troubles) -> tuple[int, Agent]:
-    # Reading a configuration must not need the network's library.
-    from iort_agent.verbs.uplink import make_uplink  # noqa: PLC0415 - it loads the library
-
     clock = SystemClock()
     uplink = make_uplink(config, clock)
     spool = make_spool(config.queue, clock)

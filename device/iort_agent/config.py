@@ -24,10 +24,10 @@ from iort_agent.control.config import DownlinkConfig, MotionState, ShareConfig, 
 from iort_agent.errors import ConfigError
 from iort_agent.files.folder import FilesConfig
 from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
+from iort_agent.metrics import MetricsConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.spool import QueueConfig, default_path
-from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.messages.control.settings import SETTINGS

@@ -1,4 +1,4 @@
-"""One run of the agent: its threads, what they do in turn, and the order in which they end."""
+"""One run of the agent: its connection, its threads, what they do in turn, and the order of their ends."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ import threading
 from typing import Callable
 
 from iort_agent.agent import Agent
-from iort_agent.common.threads import WATCH, Supervised
+from iort_agent.common.threads import WATCH, Clock, Supervised
+from iort_agent.config import Config
 from iort_agent.lanes.record import TODO, too_many
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.mqtt.uplink import Uplink
 from iort_agent.sources import Emit
 from iort_agent.sources.registry import SourceRun
 from iort_contract.catalog.streams import AGENT_STREAM, LOG_STREAM, OWN_STREAMS
@@ -23,6 +26,23 @@ _CLOSE_S = 5.0
 # A warm Lambda function answers well within this time.
 _LAST_PONGS_S = 2.0
 _LOOK_S = 0.5
+
+
+def make_uplink(config: Config, clock: Clock) -> Uplink:
+    """The connection of a robot's configuration."""
+    # Reading a configuration must not need the network's library.
+    from iort_agent.mqtt.aws import IotCore  # noqa: PLC0415 - it loads the library
+
+    return IotCore(
+        endpoint=config.endpoint,
+        port=config.port,
+        client_id=config.robot,
+        certificate=config.certificate,
+        private_key=config.private_key,
+        root_ca=config.root_ca,
+        clock=clock,
+        dispatcher=Dispatcher(),
+    )
 
 
 class Runtime:

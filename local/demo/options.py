@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place
+from iort_agent.common.threads import SystemClock
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.recording import BagConfig, BagSource
 from iort_agent.sources.sim.faults import fault_rule

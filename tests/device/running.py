@@ -9,7 +9,7 @@ from typing import Any
 
 from typing_extensions import Self
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_contract.catalog.streams import TYPES_STREAM
 
 

@@ -10,7 +10,7 @@ from typing import Any, Callable
 import pytest
 from awscrt import io, mqtt5
 
-from iort_agent.mqtt.native_thread import keep_state
+from iort_agent.mqtt.client import keep_state
 
 
 def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:

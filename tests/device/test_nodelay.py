@@ -6,7 +6,7 @@ import os
 import socket
 from contextlib import ExitStack
 
-from iort_agent.mqtt.nodelay import send_at_once
+from iort_agent.mqtt.client import send_at_once
 
 
 def nodelay(sock: socket.socket) -> bool:

@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
-from iort_agent.clock import Clock, SystemClock
+from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig

@@ -16,7 +16,7 @@ from iort_agent.files.file import kind_of, read, wire_name
 from iort_agent.files.folder import STATE, Folder, Uploads
 from iort_agent.files.upload import ByteRate, Outcome, Sender, make_uploader, trusting
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.status.server import SOCKET, StatusServer
+from iort_agent.status import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract.limits import SCHEMA_VERSION
 from iort_contract.messages.requests.files import (

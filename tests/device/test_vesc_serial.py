@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import serial
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.vesc import VescConfig, why

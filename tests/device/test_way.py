@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, Finding
-from iort_agent.verbs import tls, way
+from iort_agent.verbs import connectivity
 from tests.ports import free_port
 
 NOW = datetime.now(timezone.utc)
@@ -32,7 +32,7 @@ ROBOTS = trustme.CA()
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (way, tls):
+    for module in (connectivity, connectivity):
         monkeypatch.setattr(module, "TIMEOUT_S", 0.5)
 
 
@@ -104,7 +104,7 @@ def car(folder: Path, authority: trustme.CA, port: int, endpoint: str, signer: t
 
 
 def go(file: Path) -> list[Finding]:
-    return list(way.way(load_config(file)))
+    return list(connectivity.way(load_config(file)))
 
 
 CLOUD, OTHER = trustme.CA(organization_name="lab"), trustme.CA(organization_name="another")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from iort_agent.errors import AgentError
-from iort_agent.status.server import fetch
+from iort_agent.status import fetch
 from tests.local.conftest import until
 from tests.local.faults.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process

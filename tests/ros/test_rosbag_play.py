@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.sources.recording import BagConfig
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.message import RosMessage

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from iort_agent.errors import AgentError
-from iort_agent.status.server import SOCKET, fetch
+from iort_agent.status import SOCKET, fetch
 from tests.local.conftest import until
 from tests.local.faults.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process

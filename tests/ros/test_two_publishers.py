@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from iort_agent.errors import AgentError
-from iort_agent.status.server import SOCKET, fetch
+from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud

@@ -29,14 +29,14 @@ class Connection:
 
 
 @dataclass(frozen=True)
-class RecordLane:
+class RecordState:
     """Whether samples are recorded."""
 
     enabled: bool
 
 
 @dataclass(frozen=True)
-class LiveLane:
+class LiveState:
     """The live lane. ``asked_hz`` is the rate of a stream now, for so many viewers; ``effective_hz`` is that
     of one that the rate limiter slows down."""
 
@@ -51,7 +51,7 @@ class LiveLane:
 
 
 @dataclass(frozen=True)
-class PingLane:
+class PingState:
     """The pings. ``held_back`` counts those that the rate limiter did not let through."""
 
     rate_hz: float
@@ -62,9 +62,9 @@ class PingLane:
 class Lanes:
     """The three lanes."""
 
-    record: RecordLane
-    live: LiveLane
-    ping: PingLane
+    record: RecordState
+    live: LiveState
+    ping: PingState
 
 
 @dataclass(frozen=True)

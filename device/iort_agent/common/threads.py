@@ -1,8 +1,8 @@
-"""The long-lived threads of the process: each runs under one supervised loop, and each is in `THREADS`.
+"""Time as a seam for tests, and the long-lived threads of the process, which are all in `THREADS`.
 
-When a thread's target raises, the log gets an error, the status an alarm, and the agent's metrics a count.
-Then, as `THREADS` says, the target starts again after a wait that doubles from `FIRST_S`, or the process ends
-with status 1, and systemd starts a new one.
+Each runs under one supervised loop. When its target raises, the log gets an error, the status an alarm, and
+the agent's metrics a count. Then, as `THREADS` says, the target starts again after a wait that doubles from
+`FIRST_S`, or the process ends with status 1, and systemd starts a new one.
 
 ```
         ┌──────── start ◄───── wait ◄──┐
@@ -14,8 +14,7 @@ with status 1, and systemd starts a new one.
 ```
 
 Alarms belong to the process, as its threads do. The alarm of a thread ends with the thread, or `SHOWN_S`
-after its last error.
-"""
+after its last error."""
 
 from __future__ import annotations
 
@@ -23,18 +22,56 @@ import logging
 import os
 import threading
 import time
-from typing import Callable, NamedTuple
-
-from iort_agent.clock import Clock, SystemClock
+from typing import Callable, NamedTuple, Protocol
 
 _log = logging.getLogger(__name__)
-
 RESTART, END = "restart", "end"
 FIRST_S, SHOWN_S = 0.1, 600.0
 # A thread that ran for longer has recovered: its next wait is short again.
 _RECOVERED_S = 60.0
 # The same error is logged again after this time.
 _LOG_AGAIN_S = 60.0
+
+
+class Clock(Protocol):
+    """Wall time, monotonic time and waiting; a test needs all three from one clock."""
+
+    def now_us(self) -> int:
+        """Wall time in microseconds since the Unix epoch; may jump."""
+
+    def monotonic(self) -> float:
+        """Seconds from an arbitrary start; never jumps."""
+
+    def wait(self, event: threading.Event, seconds: float | None) -> bool:
+        """Wait until the event is set or the seconds have passed; whether it is set."""
+
+
+class SystemClock:
+    """The machine's own clock."""
+
+    def now_us(self) -> int:
+        return time.time_ns() // 1000
+
+    monotonic = staticmethod(time.monotonic)
+
+    def wait(self, event: threading.Event, seconds: float | None) -> bool:
+        return event.wait(seconds)
+
+
+class Pace:
+    """Deadlines counted from one start, so that small delays do not add up."""
+
+    def __init__(self, clock: Clock, stop: threading.Event) -> None:
+        self._clock = clock
+        self._stop = stop
+        self._start = clock.monotonic()
+
+    def until(self, offset_s: float) -> bool:
+        """Wait until ``offset_s`` after the start. False if ``stop`` is set. A late call returns at once."""
+        remaining = self._start + offset_s - self._clock.monotonic()
+        if remaining <= 0:
+            return not self._stop.is_set()
+        return not self._clock.wait(self._stop, remaining)
 
 
 class Kind(NamedTuple):

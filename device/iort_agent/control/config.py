@@ -45,6 +45,9 @@ from iort_contract.messages.requests.ask import INVALID, MAX_ASK_MS
 from iort_contract.topics import check_stream
 
 ROBOT_IN_TOPIC = "{robot}"
+_STREAM = text(check_stream)
+_COMMANDS = "a mapping of command to ROS topic and type"
+_FLEET = "a mapping of name to ROS topic and type"
 
 
 def _ros_type(value: str) -> str:
@@ -144,11 +147,6 @@ class ShareConfig:
 
     name: str = setting(text(check_stream))
     rate_hz: float = setting(number(0.01, 20, unit="Hz"), 5.0)
-
-
-_STREAM = text(check_stream)
-_COMMANDS = "a mapping of command to ROS topic and type"
-_FLEET = "a mapping of name to ROS topic and type"
 
 
 @dataclass(frozen=True)

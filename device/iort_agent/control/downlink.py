@@ -7,17 +7,15 @@ import threading
 from pathlib import Path
 from typing import Any, Callable, Iterable, Sequence
 
+from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import Supervised
-from iort_agent.common.throttled_log import ThrottledLog
-from iort_agent.control.asks import Asks
-from iort_agent.control.bridge import Bridge
+from iort_agent.control import Bridge
+from iort_agent.control.commands import Commands, Operator
 from iort_agent.control.config import DownlinkConfig, ShareConfig
-from iort_agent.control.motion.commands import Commands, Operator
-from iort_agent.control.motion.guard import Guard
-from iort_agent.control.peers import Peers
-from iort_agent.control.questions import Questions
-from iort_agent.control.shares import Shares
+from iort_agent.control.guard import Guard
+from iort_agent.control.peers import Peers, Shares
+from iort_agent.control.questions import Asks, Questions
 from iort_agent.errors import SourceError
 from iort_agent.files.upload import Uploader, downloader
 from iort_agent.mqtt.uplink import Link

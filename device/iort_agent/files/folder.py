@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, Iterable, Iterator, NamedTuple
 
-from iort_agent.clock import Clock
 from iort_agent.common.private_files import folder_of, open_below, write_below
 from iort_agent.common.schema import Place, any_path, number, setting
 from iort_agent.common.state import Files
+from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, Look, from_json, look_at, read, to_json, unreadable
 from iort_agent.files.upload import Uploader

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Callable, Iterator, NamedTuple
 from urllib.parse import urlsplit
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, changed, look_at, unreadable
 from iort_agent.mqtt.uplink import Link, MqttMessage

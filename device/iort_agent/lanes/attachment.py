@@ -15,9 +15,9 @@ import threading
 from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
-from iort_agent.clock import Clock
+from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.private_files import write_below
-from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.common.threads import Clock
 from iort_agent.files.file import kind_of, wire_name
 from iort_agent.files.folder import FilesConfig, Uploads
 from iort_agent.sources import Emit

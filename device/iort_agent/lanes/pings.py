@@ -6,8 +6,8 @@ import threading
 from collections import deque
 from typing import Callable, NamedTuple, Sequence
 
-from iort_agent.clock import Clock, Pace
 from iort_agent.common.state import ClockOffset, RoundTrips
+from iort_agent.common.threads import Clock, Pace
 from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.uplink import Link, MqttMessage

@@ -19,7 +19,7 @@ import threading
 from collections import deque
 from typing import NamedTuple, Sequence
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.lanes import RecordConfig
 from iort_agent.mqtt.rate_limiter import PUBLISHES_PER_S, SHARE, RateLimiter

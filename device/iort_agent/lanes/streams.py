@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Hashable, Iterable, Mapping, Sequence, Tuple
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool import Spool

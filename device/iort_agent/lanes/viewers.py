@@ -12,7 +12,7 @@ import logging
 import threading
 from typing import NamedTuple
 
-from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.common.logs import ThrottledLog
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import Demand, LiveLane
 from iort_agent.mqtt.uplink import Link, MqttMessage

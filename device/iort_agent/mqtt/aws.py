@@ -2,7 +2,7 @@
 
 The client's own reconnect has no minimum wait (measured: 0.25 s between attempts) and never notices a new
 certificate. So our thread stops the client after every failure and every loss, and starts it again when
-`iort_agent.mqtt.reconnect` says so. When the connection is lost, publishes fail: only the spool keeps
+`iort_agent.mqtt.failures` says so. When the connection is lost, publishes fail: only the spool keeps
 batches. Every session is clean: a broker that lost the session would otherwise send the robot nothing more.
 """
 
@@ -17,17 +17,21 @@ from typing import Any, Callable
 
 from awscrt import mqtt5
 
-from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
-from iort_agent.common.threads import Supervised
+from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.mqtt.client import ClientFactory
-from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
-from iort_agent.mqtt.native_thread import keep_state
-from iort_agent.mqtt.nodelay import send_at_once
-from iort_agent.mqtt.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
-from iort_agent.mqtt.subscriptions import Subscriptions
+from iort_agent.mqtt.client import ClientFactory, keep_state, send_at_once
+from iort_agent.mqtt.dispatch import Dispatcher, Subscriptions
+from iort_agent.mqtt.failures import (
+    SETTLED_S,
+    SHORTEST_S,
+    Backoff,
+    Causes,
+    error_name,
+    explain,
+    said,
+    why_not_connected,
+)
 from iort_agent.mqtt.uplink import Done, MqttMessage, OnConnection, OnMessage
 
 _log = logging.getLogger(__name__)

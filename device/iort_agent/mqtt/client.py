@@ -1,9 +1,15 @@
-"""Makes clients of AWS' MQTT library from the robot's certificate files."""
+"""Makes clients of AWS' MQTT library from the robot's certificate files, and mends two of its costs: threads
+whose Python state is made anew for each call, and small messages that wait for the ones before.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import logging
+import os
+import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +17,18 @@ from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.errors import IdentityError
-from iort_agent.identity.certificate import Certificate, Validity, check_pair, read_certificate, stamp
+from iort_agent.identity import Certificate, Validity, check_pair, read_certificate, stamp
 
 _log = logging.getLogger(__name__)
 
 _ACK_TIMEOUT_S = 20
 # The client's own reconnects come so late that ours are always first.
 _NEVER_MS = 24 * 3600 * 1000
+_thread = threading.local()
+_DESCRIPTORS = Path("/proc/self/fd")
+_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
+# Columns of the tables: the peer's address and port in hexadecimal, and the socket's inode.
+_PEER, _INODE = 2, 9
 
 
 class ClientFactory:
@@ -91,3 +102,54 @@ class ClientFactory:
             return self._certificate.validity() if self._certificate is not None else None
         except IdentityError:
             return None
+
+
+def keep_state() -> None:
+    """Keep Python's state of the calling thread, which C code has started, until the process ends.
+
+    Python makes a state for each call from such a thread and deletes it afterwards. From Python 3.11 on, each
+    time maps and unmaps memory, which costs every other processor core, too: 100 us for each live message at
+    50 Hz, a third of the message's cost (measured).
+    """
+    if not hasattr(_thread, "state"):
+        # Python deletes the state with the last release; this one is never released.
+        _thread.state = ctypes.pythonapi.PyGILState_Ensure()
+
+
+def send_at_once(port: int) -> int:
+    """Set TCP_NODELAY on every socket of this process that is connected to the port; returns how many.
+
+    AWS' client leaves it unset and has no option for it. A message behind another one then waits for the
+    acknowledgement of the first, which the receiver may delay by 40 ms: on loopback, a ping behind a live
+    sample took 23 ms instead of 1 (measured). The kernel's table of connections tells which of this process'
+    descriptors is the socket. No other one is touched: even `socket.socket` would change it, because with a
+    default timeout, which rospy sets, Python makes any descriptor that it is given non-blocking.
+
+    Without /proc (not Linux) it does nothing: messages are slower, and none is lost.
+    """
+    links = {f"socket:[{inode}]" for table in _TABLES for inode in _connected(table, port)}
+    try:
+        return sum(_set(entry, links) for entry in _DESCRIPTORS.iterdir())
+    except OSError:
+        return 0
+
+
+def _connected(table: Path, port: int) -> list[str]:
+    try:
+        rows = [line.split() for line in table.read_text(encoding="ascii").splitlines()[1:]]
+    except OSError:
+        return []
+    return [row[_INODE] for row in rows if int(row[_PEER].rpartition(":")[2], 16) == port]
+
+
+def _set(descriptor: Path, links: set[str]) -> bool:
+    try:
+        if os.readlink(descriptor) not in links:
+            return False
+        # A duplicate shares the socket, and closing it leaves the owner's descriptor open.
+        with socket.socket(fileno=os.dup(int(descriptor.name))) as shared:
+            shared.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return True
+    except OSError:
+        # The descriptor was closed meanwhile.
+        return False

@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from typing import NamedTuple, Tuple
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 
 PUBLISHES_PER_S = 100
 BYTES_PER_S = 512 * 1024

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Callable, NamedTuple, Optional, Protocol
 
-from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
+from iort_agent.common.threads import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_contract.topics import build_topic

@@ -18,8 +18,7 @@ import threading
 import xmlrpc.client
 from typing import Any, Mapping
 
-from iort_agent.clock import Clock, SystemClock
-from iort_agent.common.threads import Supervised
+from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import OnBytes, master
 from iort_agent.ros1.types import Installed, OnTrigger, installed, rospy, trigger

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 from typing import Any, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_contract.limits import Value
 
 # Bytes in a message, such as an image: left out, or uploaded as a file with an attachment in the sample.

@@ -11,9 +11,9 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional
 
-from iort_agent.clock import Clock
+from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import choice, items, setting, text
-from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1.types import installed
 from iort_agent.sources import REFUSE, UPLOAD, Emit

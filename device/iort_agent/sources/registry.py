@@ -6,7 +6,7 @@ import logging
 import threading
 from typing import Any, Mapping, Sequence
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.sources import Emit, SourceConfig
 from iort_agent.sources.recording import BagConfig

@@ -11,8 +11,8 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Iterator, Sequence
 
-from iort_agent.clock import Clock
 from iort_agent.common.schema import Place, choice, pairs, section, setting, text
+from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import master
 from iort_agent.ros1.node import DEFAULT_NODE, Node, shared

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Iterator, Mapping, Sequence
 
-from iort_agent.clock import Clock
 from iort_agent.common.schema import number, setting, text
+from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc_protocol import (

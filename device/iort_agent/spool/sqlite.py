@@ -25,8 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Callable, Iterable
 
-from iort_agent.clock import Clock
-from iort_agent.common.threads import Supervised
+from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import AgentError
 from iort_agent.spool import OVERWRITE_OLDEST, PROCESS, Backlog, Dropped, Entry, OnStored, QueueConfig, Spool
 from iort_agent.spool.file import (

@@ -16,11 +16,11 @@ from typing import Iterator
 from iort_agent.common.state import Status
 from iort_agent.config import Config
 from iort_agent.errors import IdentityError, NotRunningError
-from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
+from iort_agent.identity import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
-from iort_agent.status.server import ask
-from iort_agent.verbs.way import way
+from iort_agent.status import ask
+from iort_agent.verbs.connectivity import way
 from iort_contract.messages.control.driving import NO_MOTION
 
 _EXPIRES_SOON_S = 30 * 86_400

@@ -18,11 +18,9 @@ import yaml
 from iort_agent.common.private_files import write_below
 from iort_agent.config import Config, load_config
 from iort_agent.errors import BusyError, ConfigError, IdentityError, NotRunningError
-from iort_agent.identity.certificate import parse_certificate
-from iort_agent.identity.claim import load_claim
-from iort_agent.identity.pending import forget
-from iort_agent.status.server import ask
-from iort_agent.verbs.registration import SEAMS, Seams, register
+from iort_agent.identity import parse_certificate
+from iort_agent.status import ask
+from iort_agent.verbs.registration import SEAMS, Seams, forget, load_claim, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
@@ -118,7 +116,7 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
 
 def _try_alone(config: Config) -> None:
     from iort_agent.sources import FAIL  # noqa: PLC0415 - only this verb needs it
-    from iort_agent.verbs.way import way  # noqa: PLC0415 - it loads TLS and more
+    from iort_agent.verbs.connectivity import way  # noqa: PLC0415 - it loads TLS and more
 
     for finding in way(config):
         if finding.level == FAIL:

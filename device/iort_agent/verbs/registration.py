@@ -1,29 +1,277 @@
-"""Registers a robot with AWS IoT: a key, its certificate and the thing, resumed after any interruption."""
+"""Registers a robot with AWS IoT over the connection of a claim: a key, its certificate and the thing.
+
+It is resumed after any interruption.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
 import re
+import threading
 import time
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Callable
+import uuid
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePath
+from typing import Any, Callable, Mapping
 
+from iort_agent.common.private_files import open_below, write_below
+from iort_agent.common.schema import Place, any_path, existing_path, load, number, read_yaml, setting, text
 from iort_agent.errors import IdentityError, RefusedError
-from iort_agent.identity.claim import Claim
-from iort_agent.identity.machine_key import machine_serial, make_key
-from iort_agent.identity.pending import Pending, keep, kept
-from iort_agent.mqtt.exchange import Exchange
+from iort_agent.identity import check_pair, load_x509
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
+from iort_contract.topics import check_namespace, check_robot
 
+_WAIT_S = 30.0
+
+
+# Place Linux tells the machine's serial number; the first file that exists counts.
+_SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
+_NAME = PurePath(".provisioning.json")
+_MAX_BYTES = 64 * 1024
+# "The certificateOwnershipToken expires after one hour", and the certificate is deleted then if it was not
+# registered ("Device provisioning MQTT API").
+TOKEN_S = 3600.0
 _log = logging.getLogger(__name__)
-
 # Waits before each further try to register.
 _AGAIN_S = (1.0, 4.0)
 # How AWS IoT's error codes begin for a token or a certificate that is no longer valid.
 _NO_LONGER = ("Invalid", "ResourceNotFound")
 # The characters that RegisterThing allows in a parameter and a thing in an attribute.
 _SERIAL = re.compile(r"[A-Za-z0-9_.,@/:#-]{1,800}")
+
+
+def make_key(robot: str) -> tuple[str, str]:
+    """Make a new private key and its certificate signing request, both as PEM. Writes no file."""
+    x509 = load_x509()
+    from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - as in `load_x509`
+    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - as above
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, robot)])
+    request = x509.CertificateSigningRequestBuilder(subject).sign(key, hashes.SHA256())
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return pem.decode(), request.public_bytes(serialization.Encoding.PEM).decode()
+
+
+def machine_serial() -> str:
+    """The machine's serial number. If the hardware has one, a copy of the disk image does not share it."""
+    for path in _SERIALS:
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            serial = path.read_text(encoding="ascii").strip("\0 \n")
+            if serial:
+                return serial
+    raise IdentityError("this machine has no serial number: set `serial` in the claim's file")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The content of claim.yaml. ``config`` is the configuration file to write or to update."""
+
+    endpoint: str = setting(text())
+    certificate: Path = setting(existing_path())
+    private_key: Path = setting(existing_path())
+    root_ca: Path | None = setting(existing_path(), None)
+    namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
+    port: int = setting(number(1, 65535, whole=True), 8883)
+    robot: str | None = setting(text(check_robot), None)
+    serial: str | None = setting(text(), None)
+    config: Path | None = setting(any_path(), None)
+
+
+def load_claim(file: Path) -> Claim:
+    """Read a claim file. Raises `ConfigError`."""
+    return load(Claim, read_yaml(file), Place(file))
+
+
+@dataclass(frozen=True)
+class Pending:
+    """An issued certificate with its key and token, for whom it is, and this machine's time of the request.
+
+    AWS IoT admits a name for one certificate. A run that stops before the certificate is in its place would
+    otherwise lose the key, and the next run would request a name that is already used.
+    """
+
+    robot: str
+    serial: str
+    endpoint: str
+    namespace: str
+    private_key: str
+    certificate: str
+    token: str
+    asked_s: float
+
+    def is_for(self, robot: str, serial: str, endpoint: str, namespace: str) -> bool:
+        """Whether it was issued for this robot of this deployment."""
+        own = (self.robot, self.serial, self.endpoint, self.namespace)
+        return own == (robot, serial, endpoint, namespace)
+
+    def may_register(self, now_s: float) -> bool:
+        """Whether the token may still be valid. A request from the future means that the clock was set."""
+        return 0 <= now_s - self.asked_s < TOKEN_S
+
+
+def keep(folder: Path, pending: Pending) -> None:
+    """Write it to the disk, readable by its owner only. Raises `OSError`."""
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    write_below(folder, _NAME, json.dumps(asdict(pending)).encode(), sync=True)
+
+
+def kept(folder: Path) -> Pending | None:
+    """What an earlier run left; None if it left nothing readable."""
+    try:
+        with open_below(folder, _NAME) as file:
+            said = json.loads(file.read(_MAX_BYTES))
+        asked_s = float(said.pop("asked_s"))
+        return Pending(asked_s=asked_s, **{name: str(value) for name, value in said.items()})
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        _log.warning("%s is ignored: %s", folder / _NAME, error)
+        return None
+
+
+def forget(folder: Path) -> None:
+    """Delete it."""
+    with contextlib.suppress(FileNotFoundError):
+        (folder / _NAME).unlink()
+
+
+class _Connection:
+    """A connection to the broker that does not reconnect."""
+
+    def __init__(self, claim: Claim, certificate: bytes, private_key: bytes, client_id: str) -> None:
+        # Reading a configuration must not need the network's library.
+        from awscrt import mqtt5  # noqa: PLC0415 - see above
+        from awsiot import mqtt5_client_builder  # noqa: PLC0415 - as above
+
+        self._ended = threading.Event()
+        self._stopped = threading.Event()
+        self._connected = False
+        self.failure = "no answer"
+        self.client: Any = mqtt5_client_builder.mtls_from_bytes(
+            certificate,
+            private_key,
+            endpoint=claim.endpoint,
+            port=claim.port,
+            ca_filepath=None if claim.root_ca is None else str(claim.root_ca),
+            client_id=client_id,
+            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
+            min_reconnect_delay_ms=60_000,
+            max_reconnect_delay_ms=60_000,
+            on_lifecycle_connection_success=self._on_success,
+            on_lifecycle_connection_failure=self._on_failure,
+            on_lifecycle_stopped=lambda _: self._stopped.set(),
+        )
+
+    def open(self) -> bool:
+        """Connect; whether the broker accepted."""
+        self.client.start()
+        return self._ended.wait(_WAIT_S) and self._connected
+
+    def close(self) -> None:
+        """Disconnect, or give up connecting."""
+        self.client.stop()
+        self._stopped.wait(_WAIT_S)
+
+    def _on_success(self, _: Any) -> None:
+        self._connected = True
+        self._ended.set()
+
+    def _on_failure(self, data: Any) -> None:
+        from iort_agent.mqtt.failures import explain, said  # noqa: PLC0415 - it loads the network's library
+
+        packet = data.connack_packet
+        self.failure = said(packet) if packet is not None else explain(data.exception)
+        self._ended.set()
+
+
+class Exchange:
+    """The connection with a claim, open within a `with`."""
+
+    def __init__(self, claim: Claim) -> None:
+        """Raises `IdentityError`, which says which of the claim's files does not fit."""
+        try:
+            # The library's own error names no file.
+            check_pair(claim.certificate, claim.private_key)
+        except IdentityError as error:
+            raise IdentityError(f"the claim: {error}") from error
+        self._claim = claim
+        self._template = fleet_name(claim.namespace)
+        self._connection = _Connection(
+            claim,
+            claim.certificate.read_bytes(),
+            claim.private_key.read_bytes(),
+            f"{claim_name(claim.namespace)}-{uuid.uuid4().hex[:8]}",
+        )
+        self._requests: Any = None
+
+    def __enter__(self) -> Exchange:  # noqa: PYI034 - Self came with Python 3.11
+        from awscrt import mqtt_request_response  # noqa: PLC0415 - the network's library
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
+
+        if not self._connection.open():
+            self.__exit__()
+            raise IdentityError(
+                f"the claim does not connect: {self._connection.failure}. Most claims live for minutes "
+                "only: ask the operator for a new one (`iort robots claim`)"
+            )
+        options = mqtt_request_response.ClientOptions(
+            max_request_response_subscriptions=4, max_streaming_subscriptions=0
+        )
+        options.operation_timeout_in_seconds = int(_WAIT_S)
+        self._requests = iotidentity.IotIdentityClientV2(self._connection.client, options)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._requests = None
+        self._connection.close()
+
+    def certify(self, request: str) -> tuple[str, str]:
+        """Returns the certificate for a signing request, and the token that proves its ownership."""
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
+
+        asked = iotidentity.CreateCertificateFromCsrRequest(certificate_signing_request=request)
+        answer = _result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(asked))
+        return str(answer.certificate_pem), str(answer.certificate_ownership_token)
+
+    def register(self, token: str, parameters: Mapping[str, str]) -> str:
+        """Register the robot with its certificate. Returns the thing's name."""
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
+
+        asked = iotidentity.RegisterThingRequest(
+            template_name=self._template,
+            certificate_ownership_token=token,
+            parameters=dict(parameters),
+        )
+        return str(_result("RegisterThing", self._requests.register_thing(asked)).thing_name)
+
+    def connects(self, robot: str, certificate: str, private_key: str) -> bool:
+        """Whether the broker accepts the robot with this certificate, which it does once it is registered.
+
+        It ends a session that the robot has, as the robot's agent would.
+        """
+        connection = _Connection(self._claim, certificate.encode(), private_key.encode(), robot)
+        try:
+            return connection.open()
+        finally:
+            connection.close()
+
+
+def _result(what: str, future: Any) -> Any:
+    try:
+        return future.result(_WAIT_S + 5)
+    except Exception as error:
+        modeled = getattr(error, "modeled_error", None)
+        if modeled is None:
+            raise IdentityError(f"{what} was refused: {error}") from error
+        code = str(modeled.error_code)
+        raise RefusedError(f"{what} was refused: {code}: {modeled.error_message}", code) from error
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ import threading
 from pathlib import Path, PurePath
 from typing import Iterator, NamedTuple, Sequence
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.logs import set_up
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config
 from iort_agent.errors import NotRunningError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader, make_uploader
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
-from iort_agent.status.server import process_at
+from iort_agent.runtime import make_uplink
+from iort_agent.status import process_at
 
 _CONNECT_S = 30.0
 _LOOK_S = 0.05
@@ -37,9 +38,6 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
     Raises `UploadError` without a connection, and while an agent runs, whose connection this would end.
     """
     _refuse_beside_agent(config, status_socket)
-    # Reading a configuration must not need the network's library.
-    from iort_agent.verbs.uplink import make_uplink  # noqa: PLC0415 - it loads the library
-
     set_up("warning")
     clock, stop = SystemClock(), threading.Event()
     uplink = make_uplink(config, clock)

@@ -10,7 +10,7 @@ import pytest
 
 from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, WARN, Finding
-from iort_agent.verbs import tls, way
+from iort_agent.verbs import connectivity
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, REFUSE, Proxy
@@ -24,7 +24,7 @@ def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
 
 def go(bundle: robots.Bundle, proxy: Proxy) -> dict[str, Finding]:
     robots.configure(bundle, {"port": proxy.port})
-    return {one.what: one for one in way.way(load_config(bundle.config))}
+    return {one.what: one for one in connectivity.way(load_config(bundle.config))}
 
 
 def test_the_way_to_a_cloud_that_works(
@@ -47,7 +47,7 @@ def test_the_way_to_a_cloud_that_works(
     now_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: now_ns() - 100_000_000_000)
     # Files go to another server, which this machine does not trust.
-    monkeypatch.setattr(way, "trusting", lambda _: ssl.create_default_context())
+    monkeypatch.setattr(connectivity, "trusting", lambda _: ssl.create_default_context())
     findings = go(car, proxy)
     assert findings["clock"].level == findings["files"].level == WARN
     assert findings["clock"].text.startswith("is -100.")
@@ -69,8 +69,8 @@ def test_a_broken_network_is_named(
     bundle: Callable[..., robots.Bundle], proxy: Proxy, mode: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if mode == FREEZE:
-        monkeypatch.setattr(tls, "TIMEOUT_S", 0.5)
-        monkeypatch.setattr(way, "TIMEOUT_S", 0.5)
+        monkeypatch.setattr(connectivity, "TIMEOUT_S", 0.5)
+        monkeypatch.setattr(connectivity, "TIMEOUT_S", 0.5)
     proxy.mode = mode
     failed = go(bundle(), proxy)["TLS"]
     assert failed.level == FAIL

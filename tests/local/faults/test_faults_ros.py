@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable
 
 from iort_agent.errors import AgentError
-from iort_agent.status.server import SOCKET, fetch
+from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud

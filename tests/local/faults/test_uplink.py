@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from iort_agent.clock import SystemClock
-from iort_agent.mqtt import aws, subscriptions
+from iort_agent.common.threads import SystemClock
+from iort_agent.mqtt import aws, dispatch
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.reconnect import SLOW_SHORTEST_S
+from iort_agent.mqtt.failures import SLOW_SHORTEST_S
 from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
@@ -239,8 +239,8 @@ def test_the_system_trust_store_applies_without_a_root_ca(bundle, proxy, caplog)
 
 
 def test_a_rejected_subscription_is_logged_once_and_affects_no_other(bundle, proxy, caplog, monkeypatch):
-    monkeypatch.setattr(subscriptions, "_AGAIN_S", 0.1)
-    monkeypatch.setattr(subscriptions, "_AGAIN_SLOWLY_S", 0.1)
+    monkeypatch.setattr(dispatch, "_AGAIN_S", 0.1)
+    monkeypatch.setattr(dispatch, "_AGAIN_SLOWLY_S", 0.1)
     with connecting(bundle(), proxy) as log:
         log.uplink.subscribe("cmd/iort/somebody-else/drive", lambda _: None)
         log.echo(b"good")

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from functions.admit import SETTLED_MS
-from iort_agent.identity.certificate import parse_certificate
+from iort_agent.identity import parse_certificate
 from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
 from iort_station.fleet import registry
 from iort_station.fleet.identity import claims
@@ -28,7 +28,7 @@ from verify.tools.robot import Robot
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from iort_agent.mqtt.exchange import Exchange
+from iort_agent.verbs.registration import Exchange
 from iort_agent.verbs import provision as identity
 from iort_agent.verbs.registration import Seams
 

@@ -24,7 +24,7 @@ from ministack.services import iot
 from PIL import Image
 from rosbags.rosbag1 import Reader
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.files.file import read
 from iort_agent.files.upload import ByteRate, Outcome, Sender, trusting
 from iort_contract.messages.requests.files import (

@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 
 from iort_agent.errors import AgentError
-from iort_agent.status.server import SOCKET, fetch
+from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.network.proxy import PASS, REFUSE, Proxy

@@ -15,8 +15,8 @@ import threading
 from hashlib import sha256
 from pathlib import Path
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place, load
+from iort_agent.common.threads import SystemClock
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.ros1.message import RosMessage
 

@@ -15,13 +15,13 @@ import sys
 import time
 from pathlib import Path
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
+from iort_agent.common.threads import SystemClock
+from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
-from iort_agent.control.motion.commands import Operator
-from iort_agent.control.motion.guard import Guard
+from iort_agent.control.guard import Guard
 from iort_agent.control.questions import Questions
 from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher

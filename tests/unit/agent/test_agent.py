@@ -11,18 +11,18 @@ from unittest.mock import Mock
 
 import pytest
 
-from iort_agent.agent import Agent
+from iort_agent.agent import Agent, make_report, make_status
 from iort_agent.cli import main
-from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import Connection, Status, document, read
+from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.config import Config, without_sources
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import SourceError
 from iort_agent.lanes import PingConfig, RecordConfig
+from iort_agent.metrics import MetricsConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
-from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit, SourceConfig
 from iort_agent.sources.recording import BagConfig
@@ -30,7 +30,6 @@ from iort_agent.sources.sim import SimConfig
 from iort_agent.spool import REJECT_NEW, QueueConfig, Spool
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
-from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.account import lost

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.sources.recording import BagConfig

@@ -18,23 +18,22 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iort_agent import status as status_server
 from iort_agent.cli import main
-from iort_agent.clock import SystemClock
 from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from iort_agent.common.state import Status, read
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import AgentError, BusyError, NotRunningError
 from iort_agent.lanes.pings import OffsetEstimator
 from iort_agent.lanes.streams import StreamCounts
+from iort_agent.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.sources import OK, WARN
+from iort_agent.sources import FAIL, OK, WARN
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
-from iort_agent.status import server as status_server
-from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
-from iort_agent.status.server import StatusServer, ask, fetch
-from iort_agent.status.text import render
-from iort_agent.verbs.check import FAIL, check, emergency_stop
+from iort_agent.status import StatusServer, ask, fetch, render
+from iort_agent.verbs.check import check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
 from iort_contract.messages.control.driving import stick_downlink

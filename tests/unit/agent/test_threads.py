@@ -16,7 +16,7 @@ from unittest.mock import Mock
 import pytest
 
 import iort_agent
-from iort_agent.agent import Agent
+from iort_agent.agent import Agent, make_status
 from iort_agent.common.schema import Place, load
 from iort_agent.common.threads import END, FIRST_S, RESTART, THREADS, WATCH, Kind, Supervised, Watch
 from iort_agent.config import Config
@@ -25,12 +25,11 @@ from iort_agent.errors import AgentError
 from iort_agent.files.folder import FilesConfig
 from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.reporting import make_status
 from iort_agent.ros1.node import Node
 from iort_agent.runtime import Runtime
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
-from iort_agent.status.server import StatusServer, fetch
+from iort_agent.status import StatusServer, fetch
 from iort_contract.messages.batch import decode_batch
 from tests.agent_fakes import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard

@@ -59,10 +59,10 @@ def test_the_imports_keep_all_walls(house: Path) -> None:
 @pytest.mark.parametrize(
     ("contract", "file", "imported"),
     [
-        ("packages", "station/iort_station/cloud.py", "iort_agent.clock"),
+        ("packages", "station/iort_station/cloud.py", "iort_agent.common.threads"),
         ("packages", "station/iort_station/cloud.py", "functions.shared.tables"),
-        ("packages", "device/iort_agent/clock.py", "iort_station.errors"),
-        ("packages", "contract/iort_contract/limits.py", "iort_agent.clock"),
+        ("packages", "device/iort_agent/common/threads.py", "iort_station.errors"),
+        ("packages", "contract/iort_contract/limits.py", "iort_agent.common.threads"),
         ("packages", "functions/live.py", "iort_station.errors"),
         ("packages", "stacks/site.py", "iort_station.page.page"),
         ("packages", "stacks/site.py", "functions.live"),

@@ -12,10 +12,8 @@ import yaml
 
 from bench.target import Target
 from iort_agent.errors import IdentityError
-from iort_agent.identity.claim import load_claim
-from iort_agent.identity.machine_key import make_key
-from iort_agent.mqtt.exchange import Exchange
 from iort_agent.verbs import provision
+from iort_agent.verbs.registration import Exchange, load_claim, make_key
 from iort_contract.cloud import fleet_name
 from iort_contract.tables import (
     ADMIT_CLAIM,

@@ -57,7 +57,7 @@ def another_client_id(target: Target) -> Seen:
     "broker.foreign_topic",
     expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
     source=_MQTT,
-    relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
+    relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/dispatch.py"),
 )
 def foreign_topic(target: Target) -> Seen:
     """A robot's message to its neighbour's commands does not reach the neighbour. AWS has two answers, a

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ContextManager, Iterator, Mapping, Sequence
 
-from iort_agent.clock import Clock, SystemClock
 from iort_agent.common.schema import choice, existing_path, flag, number, pairs, setting, text
+from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, WARN, Emit, Finding, SourceConfig
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, look_into, play

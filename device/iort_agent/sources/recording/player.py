@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Optional
 
-from iort_agent.clock import Clock, Pace
-from iort_agent.common.threads import brief
+from iort_agent.common.threads import Clock, Pace, brief
 from iort_agent.errors import SourceError
 from iort_agent.sources import Emit
 from iort_contract.catalog.streams import TYPES_STREAM

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any, Iterator, Mapping, Sequence
 from urllib.parse import SplitResult, urlsplit
 
-from iort_agent.clock import Clock
 from iort_agent.common.schema import Place, number, pairs, section, setting, text
+from iort_agent.common.threads import Clock
 from iort_agent.ros1.json_message import Writer
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake, Kind

@@ -18,8 +18,8 @@ import random
 import threading
 from typing import Any, Mapping, NamedTuple, Protocol, Sequence
 
-from iort_agent.clock import Clock
-from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.common.logs import ThrottledLog
+from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 
 # A message so soon after a new subscription would have come without it, if the server had not been deaf.

@@ -13,7 +13,7 @@ import logging
 import re
 from typing import Any, Callable, Generator, Mapping, NamedTuple, Optional, Tuple
 
-from iort_agent.clock import Clock
+from iort_agent.common.threads import Clock
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import (
     DURATION,

@@ -8,8 +8,8 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Sequence
 
-from iort_agent.clock import Clock, Pace
 from iort_agent.common.schema import Place, Rule, choice, existing_path, items, number, section, setting, text
+from iort_agent.common.threads import Clock, Pace
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import Graph, OnBytes
 from iort_agent.ros1.json_message import decode

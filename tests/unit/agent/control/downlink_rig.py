@@ -11,10 +11,10 @@ from typing import Any
 
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
+from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
-from iort_agent.control.motion.commands import Operator
-from iort_agent.control.motion.stops import STOP_AHEAD_MS
+from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.types import OnTrigger

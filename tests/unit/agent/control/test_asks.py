@@ -12,12 +12,12 @@ from typing import Any, cast
 
 import pytest
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
+from iort_agent.common.threads import SystemClock
+from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.downlink import Downlink
-from iort_agent.control.motion.commands import Operator
 from iort_agent.control.questions import Questions
 from iort_agent.errors import ConfigError, UploadError
 from iort_agent.files.upload import Uploader

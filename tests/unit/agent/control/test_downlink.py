@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from iort_agent.clock import SystemClock
 from iort_agent.common.state import ClockOffset
-from iort_agent.control.motion.commands import refuse_commands
-from iort_agent.control.motion.stops import STOP_AHEAD_MS
+from iort_agent.common.threads import SystemClock
+from iort_agent.control.commands import refuse_commands
+from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.control.commands import Command, encode_command
 from tests.agent_fakes import Loopback, ManualClock, link_of

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from iort_agent.control.motion.kept_stop import KeptStop
+from iort_agent.control.guard import KeptStop
 from iort_agent.errors import ConfigError
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.control.downlink_rig import T0, FakeGuard, Rig, doubles

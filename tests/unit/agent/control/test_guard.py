@@ -15,9 +15,8 @@ from typing import Any
 
 import pytest
 
-from iort_agent.control.motion import guard_process
-from iort_agent.control.motion.guard import Guard
-from iort_agent.control.motion.kept_stop import KeptStop
+from iort_agent.control import guard as guard_process
+from iort_agent.control.guard import Guard, KeptStop
 from iort_contract.ros1.definition import parse
 from tests.agent_fakes import ManualClock
 

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from iort_agent.control.motion.leases import Leases, Limits
-from iort_agent.control.motion.stops import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS
+from iort_agent.control.leases import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS, Leases, Limits
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.driving import (
     BEGIN_AGAIN,

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.control.runtime_settings import overlay
-from iort_agent.control.shadow import Shadow, _difference, _merged
+from iort_agent.control.shadow import Shadow, _difference, _merged, overlay
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.control.commands import Command

@@ -17,14 +17,12 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.identity.certificate import check_pair, parse_certificate, read_certificate, stamp
-from iort_agent.identity.claim import Claim
-from iort_agent.identity.machine_key import make_key
+from iort_agent.identity import check_pair, parse_certificate, read_certificate, stamp
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.exchange import Exchange
+from iort_agent.verbs.registration import Claim, Exchange, make_key
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:
@@ -86,7 +84,7 @@ def test_a_new_key_and_its_signing_request() -> None:
 def test_the_running_agent_does_not_load_the_library() -> None:
     code = (
         "import sys, iort_agent.cli, iort_agent.mqtt.aws, iort_agent.verbs.check\n"
-        "from iort_agent.identity.certificate import parse_certificate\n"
+        "from iort_agent.identity import parse_certificate\n"
         "parse_certificate(sys.stdin.read()).id\n"
         "assert 'cryptography' not in sys.modules"
     )

@@ -11,10 +11,9 @@ import pytest
 
 from iort_agent.config import load_config
 from iort_agent.errors import BusyError, IdentityError, RefusedError
-from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
 from iort_agent.verbs import provision as provision_module
 from iort_agent.verbs.provision import provision
-from iort_agent.verbs.registration import Seams, register_again
+from iort_agent.verbs.registration import TOKEN_S, Pending, Seams, keep, kept, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.control.driving import DRIVE_LEASE_MS
 

@@ -13,19 +13,18 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from iort_agent.agent import Agent
-from iort_agent.clock import Clock, SystemClock
+from iort_agent.agent import Agent, make_report, make_status
 from iort_agent.common.state import document
+from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.config import Config
 from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
 from iort_agent.lanes.record import Production, Rate, too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
-from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.status.text import render
+from iort_agent.status import render
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.control.settings import ALWAYS
 from iort_contract.topics import BROKER, LIVE

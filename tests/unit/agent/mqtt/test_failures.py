@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 from awscrt import mqtt5
 
-from iort_agent.identity.certificate import Validity
-from iort_agent.mqtt.failures import why_not_connected
-from iort_agent.mqtt.reconnect import Cause, Causes, Hangups
+from iort_agent.identity import Validity
+from iort_agent.mqtt.failures import Cause, Causes, Hangups, why_not_connected
 
 NOW_S = 1_700_000_000
 GOOD = Validity(not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.mqtt.reconnect import HANGUPS, Backoff, Cause, Causes
+from iort_agent.mqtt.failures import HANGUPS, Backoff, Cause, Causes
 
 
 class Least(random.Random):

@@ -6,8 +6,7 @@ from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any, Callable
 
-from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.subscriptions import Subscriptions
+from iort_agent.mqtt.dispatch import Dispatcher, Subscriptions
 
 FILTER = "cmd/iort/car/#"
 

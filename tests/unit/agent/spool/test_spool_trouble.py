@@ -229,7 +229,7 @@ def test_a_part_that_cannot_be_read_is_damage_if_the_disk_works(path: Path) -> N
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.spool.sqlite import SqliteSpool
 
 spool = SqliteSpool(Path(sys.argv[1]), max_bytes=2**30, clock=SystemClock())
@@ -527,7 +527,7 @@ def test_a_newer_format_is_refused(path: Path) -> None:
 def test_a_second_agent_is_refused_and_told_what_to_do(path: Path) -> None:
     with running(path):
         code = (
-            "import sys; from pathlib import Path; from iort_agent.clock import SystemClock\n"
+            "import sys; from pathlib import Path; from iort_agent.common.threads import SystemClock\n"
             "from iort_agent.spool.sqlite import SqliteSpool\n"
             "SqliteSpool(Path(sys.argv[1]), max_bytes=1000, clock=SystemClock())"
         )

@@ -19,7 +19,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.spool import FULL, PROCESS, REJECT_NEW, Entry, QueueConfig
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.memory import MemorySpool
@@ -391,7 +391,7 @@ TestLife.settings = settings(examples(150), stateful_step_count=40)
 VICTIM = """
 import os, sys, threading
 from pathlib import Path
-from iort_agent.clock import SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.spool.sqlite import SqliteSpool
 
 path, run = Path(sys.argv[1]), sys.argv[2]

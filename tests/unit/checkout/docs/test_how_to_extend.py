@@ -248,7 +248,7 @@ def test_the_way_to_add_a_source_works(copy: Copy, tmp_path: Path) -> None:
         "run()",
         "import threading",
         "from pathlib import Path",
-        "from iort_agent.clock import SystemClock",
+        "from iort_agent.common.threads import SystemClock",
         "from iort_agent.config import load_config",
         "def run():",
         f"    (source,) = load_config(Path({str(tmp_path / 'car.yaml')!r})).sources",

@@ -11,7 +11,8 @@ import pytest
 from awsiot import iotidentity
 
 from functions.echo import pong
-from iort_agent.control.runtime_settings import RuntimeSettings, overlay
+from iort_agent.control.shadow import overlay
+from iort_agent.lanes import RuntimeSettings
 from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts

@@ -12,7 +12,7 @@ from functions.shared.metrics import emit
 from iort_agent.agent import Agent
 from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.reconnect import SHORTEST_S
+from iort_agent.mqtt.failures import SHORTEST_S
 from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import SHADOW

@@ -2,7 +2,18 @@
 
 A motion command is valid for a lease, counted from when it was sent. A command that was long on its way, or
 that waited in a frozen robot, has less of its lease left, or nothing. `STOP_AHEAD_MS` before the lease ends
-without a newer command, a stop is due (`iort_agent.control.motion.stops`).
+without a newer command, a stop is due. It is repeated a few times, because a single message may miss a node
+that is just starting. Then it ends, so that another driver (a joystick, a planner on board) is not blocked
+for ever. An emergency stop is repeated for as long as it holds, so that it keeps its place before other
+drivers of the topic.
+
+```
+          a motion passes                    the lease ends, or is cut
+    still ───────────────► moving (lease) ──────────────────────────► stops, STOP_REPEATS more ──► still
+      │                      │ ▲                                         │              ▲
+      │                      │ └──────────── a newer motion ─────────────┘              │ free
+      └──────── hold ────────┴───────────────── hold ──────────► held: stops for ever ──┘
+```
 
 One session drives at a time: while its lease holds, another one is refused unless it takes over. A session
 that was refused so, or that an emergency stop ended, stays refused: a stick that is still held must not move
@@ -18,10 +29,10 @@ as it may be. Without a known offset, no motion command passes. Leases run on th
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
-from iort_agent.control.motion.stops import STOP_AHEAD_MS, Stops
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.driving import (
     BEGIN_AGAIN,
@@ -37,8 +48,77 @@ from iort_contract.messages.control.driving import (
     SUPERSEDED,
 )
 
+# Repetitions of a stop after the first one.
+STOP_REPEATS = 4
+STOP_REPEAT_S = 0.25
+# Between the stops of an emergency stop. A multiplexer that ranks drivers forgets one after some 200 ms.
+STOP_HOLD_S = 0.1
+# The agent ends a lease this much early. At its very end the guard publishes the stop, if the agent has not:
+# two processes that publish at one moment are heard in any order, and a stop could seem to precede a motion.
+STOP_AHEAD_MS = 30
 # Refused sessions to remember.
 _MAX_REFUSED = 64
+
+
+class Stops:
+    """The stops of one motion. Times are of the monotonic clock. Not for several threads at once."""
+
+    def __init__(self) -> None:
+        # The end of the current lease.
+        self.ends: float | None = None
+        # When the newest lease was over and the first stop was due.
+        self.ended = -math.inf
+        # Whether an emergency stop holds.
+        self.held = False
+        # The stops still to publish: infinitely many in an emergency stop.
+        self._stops = 0.0
+        self._next_stop = 0.0
+
+    def move(self, until: float) -> None:
+        """Begin a lease, or renew it; no stop is due before its end."""
+        self.ends, self._stops = until, 0
+
+    def expire(self, now: float) -> None:
+        """Note the end of a lease that is over."""
+        if self.ends is not None and now >= self.ends:
+            self.ends, self.ended = None, now
+            self._stops, self._next_stop = STOP_REPEATS + 1, now
+
+    def stop_due(self, now: float) -> bool:
+        """Whether the caller must publish a stop now."""
+        self.expire(now)
+        if not self._stops or now < self._next_stop:
+            return False
+        self._stops -= 1
+        self._next_stop = now + (STOP_HOLD_S if self.held else STOP_REPEAT_S)
+        return True
+
+    def next_due(self) -> float | None:
+        """When to call `stop_due` next; None while nothing moves."""
+        if self.ends is not None:
+            return self.ends
+        return self._next_stop if self._stops else None
+
+    def cut(self, now: float) -> None:
+        """End the lease now: its sender cannot be heard any more."""
+        if self.ends is not None:
+            self.ends = now
+
+    def hold(self, now: float) -> None:
+        """End the lease, and repeat the stop until `free`."""
+        if not self.held:
+            self.held, self.ends = True, None
+            self._stops, self._next_stop = math.inf, now
+
+    def put_off(self, until: float) -> None:
+        """Publish no stop of an emergency stop before then: somebody else does."""
+        if self.held:
+            self._next_stop = until
+
+    def free(self) -> None:
+        """Repeat the stop a few times more."""
+        if self.held:
+            self.held, self._stops = False, STOP_REPEATS
 
 
 class Limits(NamedTuple):

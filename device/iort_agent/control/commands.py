@@ -1,33 +1,166 @@
-"""Commands from the broker to ROS topics. `iort_agent.control.motion.leases` decides which may pass."""
+"""Commands from the broker to ROS topics, and who drove. `iort_agent.control.leases` tells which may pass."""
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from dataclasses import dataclass, replace
 from typing import Any, Callable, Mapping, Sequence
 
+from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import did_you_mean
-from iort_agent.common.throttled_log import ThrottledLog
-from iort_agent.control.bridge import Bridge
-from iort_agent.control.config import DownlinkConfig
-from iort_agent.control.motion.driving import limited
-from iort_agent.control.motion.guard import Guard
-from iort_agent.control.motion.named import Motion, Named
-from iort_agent.control.motion.stops import STOP_AHEAD_MS
+from iort_agent.control import Bridge
+from iort_agent.control.config import CommandConfig, DownlinkConfig
+from iort_agent.control.guard import Guard
+from iort_agent.control.leases import STOP_AHEAD_MS, Leases, Limits
+from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import Link, MqttMessage
+from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.control.commands import Command, decode_command
-from iort_contract.messages.control.driving import NO_COMMAND, NO_GUARD, NO_ROS, SETTINGS_UNKNOWN, STOPPED
+from iort_contract.messages.control.driving import (
+    NO_COMMAND,
+    NO_GUARD,
+    NO_ROS,
+    SETTINGS_UNKNOWN,
+    STOPPED,
+    DriveLimits,
+)
+from iort_contract.ros1.definition import Definition
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)
-
 # Between two samples of refused motions: others drive meanwhile.
 _REFUSED_S = 0.1
 # rospy hands a stop to threads of its own. An agent that is killed before it is written must leave it to the
 # guard, which publishes its own `STOP_AHEAD_MS` after the agent's.
 _WRITTEN_S = 0.02
+
+
+def limited(message: Mapping[str, Any], limits: DriveLimits) -> tuple[Mapping[str, Any], bool]:
+    """The message with speed and steering within the limits, and whether one was beyond.
+
+    What is no finite number stays, as it does not fit the ROS type either.
+    """
+    beyond = False
+    for path, most in ((limits.speed, limits.max_speed_mps), (limits.steering, limits.max_steering_rad)):
+        value = _number_at(message, path)
+        if value is not None and not -most <= value <= most:
+            message, beyond = _with(message, path.split("."), max(-most, min(most, value))), True
+    return message, beyond
+
+
+def drive_sample(
+    command: Command, outcome: str, driver: Command | None, left_s: float, limits: DriveLimits | None
+) -> dict[str, Value]:
+    """A sample of the stream `DRIVE_STREAM`; speed and steering are what the robot was told."""
+    speed = steering = None
+    if limits is not None and outcome in (ACCEPTED, STOPPED):
+        # A field that the message leaves out is zero; a stop is.
+        told = {} if outcome == STOPPED else command.message
+        speed, steering = (_number_at(told, path) or 0.0 for path in (limits.speed, limits.steering))
+    return {
+        "session": command.session,
+        "by": command.by,
+        "seq": command.seq,
+        "sent_us": command.sent_us,
+        "outcome": outcome,
+        "driver": driver.session if driver is not None else None,
+        "driver_by": driver.by if driver is not None else None,
+        "lease_left_ms": round(left_s * 1000),
+        "speed": speed,
+        "steering": steering,
+    }
+
+
+def _number_at(message: Any, path: str) -> float | None:
+    for name in path.split("."):
+        message = message.get(name) if isinstance(message, dict) else None
+    number = type(message) in (int, float) and abs(message) != math.inf
+    return message if number else None
+
+
+def _with(message: Mapping[str, Any], path: list[str], value: float) -> dict[str, Any]:
+    name, *below = path
+    return {**message, name: _with(message[name], below, value) if below else value}
+
+
+class Motion:
+    """What moves the robot by one ROS topic: its lease, whichever commands renew it, and its stop."""
+
+    def __init__(self, topic: str, stop: Mapping[str, Any], definition: Definition) -> None:
+        self.topic, self.leases = topic, Leases()
+        self._stop, self._definition = stop, definition
+        self.stopping = False
+        # What the guard knows: the lease's end, and whether an emergency stop holds.
+        self.guarded: tuple[float | None, bool] = (None, False)
+        # The name of the newest command that passed.
+        self.last: Named | None = None
+        self.stops = 0
+        # The newest stop could not be published: the agent is not in the ROS graph.
+        self.unheard = False
+        # When the first stop is written, for sure.
+        self.written = 0.0
+
+    def next_due(self, now: float) -> float | None:
+        """When something is to be done next; None while nothing moves."""
+        due = self.leases.next_due()
+        return self.written if now < self.written and (due is None or self.written < due) else due
+
+    def stop(self, now_us: int) -> bytes:
+        return encode(self._definition, self._stop, now_us=now_us, partial=True)
+
+
+class Named:
+    """The commands of one name. ``motion`` is what they move, ``limits`` are those of a stick, if it drives
+    this command."""
+
+    def __init__(
+        self,
+        name: str,
+        config: CommandConfig,
+        definition: Definition,
+        *,
+        skew_s: float,
+        motion: Motion | None,
+        limits: DriveLimits | None,
+    ) -> None:
+        self.name, self.config, self.definition = name, config, definition
+        self.motion, self.limits = motion, limits
+        lease_s = config.motion.lease_s if config.motion is not None else None
+        self.allowed = Limits(config.max_age_s, skew_s, lease_s)
+        self.leases = motion.leases if motion is not None else Leases()
+        self.passed = self.limited = 0
+        # When the next refused motion becomes a sample.
+        self.refused_due = 0.0
+
+    def check(self, now_us: int) -> None:
+        """Raise `ConfigError` if the stop, or what a stick drives, does not fit the ROS type."""
+        try:
+            if self.motion is not None:
+                self.motion.stop(now_us)
+        except MessageError as error:
+            raise ConfigError(f"downlink.cmd.{self.name}.motion.stop: {error}") from error
+        if self.limits is not None:
+            try:
+                self.data(self.limits.message(0.0, 0.0), now_us)
+            except MessageError as error:
+                raise ConfigError(
+                    f"downlink.drive: {error}; downlink.cmd.{self.name}.partial must be true if the message "
+                    "has other fields"
+                ) from error
+
+    def data(self, message: Mapping[str, Any], now_us: int) -> bytes:
+        return encode(self.definition, message, now_us=now_us, partial=self.config.partial)
+
+    def sample(self, command: Command, outcome: str, now: float) -> Mapping[str, Value]:
+        left_s = self.leases.left_s(now)
+        return drive_sample(command, outcome, self.leases.driver(now), left_s, self.limits)
+
+    def report(self) -> dict[str, int]:
+        counts = {"passed": self.passed, "stops": self.motion.stops if self.motion is not None else 0}
+        return {**counts, "limited": self.limited} if self.limits is not None else counts
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,0 @@
-"""Commands to ROS topics: which may pass, who drives, and what stops the robot in time."""

@@ -1,1 +1,0 @@
-"""The robot's certificate: how it is obtained, renewed and checked. It uses only common helpers."""

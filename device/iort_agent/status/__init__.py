@@ -1,1 +1,0 @@
-"""The agent's reports about itself: accounts, metrics and the status socket. It uses every lane."""
