@@ -1,29 +1,30 @@
 // The page: listens to the whole fleet, shows one view of it, and costs nothing while hidden.
 
-import { FIELD_TABLE, LIVE_MAX_RATE_HZ, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
-import { invited, readOnly } from "./server/admission";
-import { load } from "./server/config";
-import { byId, byName, el, setAttribute } from "./base/dom";
-import { Alarms } from "./live/alarms";
-import { Feed } from "./live/feed";
-import { Fleet } from "./live/fleet";
-import { Registry } from "./live/registry";
-import { observer } from "./live/observer";
-import { GLANCE_HZ, NONE, Viewing, type Looks } from "./link/viewing";
-import { readRoute, route, unread, type Route } from "./base/route";
-import { StatusBar } from "./widgets/status_bar";
-import { Waiting } from "./widgets/waiting";
+import { type Config, FIELD_TABLE, type FieldTable } from "./base/contract";
+import { byId, el, setAttribute } from "./base/dom";
+import { type Route, type RouteTo, readRoute, route, unread } from "./base/route";
 import { startTheme } from "./base/theme";
 import { DrivePanel } from "./drive/panel";
 import { StopControl } from "./drive/stop_control";
+import { NONE, Viewing } from "./link/viewing";
+import { Alarms } from "./live/alarms";
+import { Feed } from "./live/feed";
+import { Fleet } from "./live/fleet";
+import { observer } from "./live/observer";
+import { Registry } from "./live/registry";
+import { invited, readOnly } from "./server/admission";
+import { load } from "./server/config";
 import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
-import { CompareView } from "./views/compare";
 import { CloudWatchView } from "./views/cloudwatch";
+import { CompareView } from "./views/compare";
 import { FleetView } from "./views/fleet";
 import { HistoryView } from "./views/history";
 import { InsightsView } from "./views/insights";
+import type { Services, View } from "./views/view";
+import { StatusBar } from "./widgets/status_bar";
+import { Waiting } from "./widgets/waiting";
 
 // The period of ages and states, and the shortest period of values and charts.
 const CLOCK_S = 0.25;
@@ -32,6 +33,18 @@ const VALUES_S = 0.04;
 /** The views that the bar above links to. */
 const TABS = ["fleet", "insights", "alarms", "cloudwatch"] as const;
 
+/** Every view by its name in an address: a new one is a line here, and its parameters in base/route.ts. */
+const VIEWS: { readonly [V in Route["view"]]: new (services: Services) => View<RouteTo<V>> } = {
+  fleet: FleetView,
+  car: CarView,
+  history: HistoryView,
+  insights: InsightsView,
+  compare: CompareView,
+  cloudwatch: CloudWatchView,
+  alarms: AlarmsView,
+};
+type Views = Readonly<Record<Route["view"], View>>;
+
 class Page {
   private readonly fleet: Fleet;
   private readonly feed: Feed;
@@ -39,27 +52,18 @@ class Page {
   private readonly viewing: Viewing;
   private readonly waiting: Waiting;
   private readonly bar: StatusBar;
-  private readonly fleetView: FleetView;
-  private readonly carView: CarView;
-  private readonly historyView: HistoryView;
-  private readonly insightsView: InsightsView;
-  private readonly compareView: CompareView;
-  private readonly cloudWatchView: CloudWatchView;
-  private readonly alarmsView: AlarmsView;
+  private readonly views: Views;
   private readonly stops: StopControl;
   private readonly drive: DrivePanel;
   private readonly stage = byId("stage");
-  private readonly tools = el("p", { class: "tools" });
   private readonly ignored = el("p", { class: "ignored", role: "status", hidden: "" });
   private route: Route = { view: "fleet" };
+  private view: View;
   private shape = -1;
   private clockAt = -Infinity;
   private valuesAt = -Infinity;
 
-  constructor(
-    config: Config,
-    table: FieldTable,
-  ) {
+  constructor(config: Config, table: FieldTable) {
     this.fleet = new Fleet(config, table);
     this.feed = new Feed(config, table, this.fleet, (state) => {
       this.bar.linked(state);
@@ -69,25 +73,49 @@ class Page {
     this.registry = new Registry(config);
     this.viewing = new Viewing(config, (lease) => this.feed.lease(lease));
     this.waiting = new Waiting(config, this.registry, this.fleet);
-    this.stops = new StopControl(config, (robot) => this.registry.presence(robot)?.online, () => this.drive?.show());
+    this.stops = new StopControl(
+      config,
+      (robot) => this.registry.presence(robot)?.online,
+      () => this.drive?.show(),
+    );
     this.drive = new DrivePanel(config, this.stops.stops);
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
-    this.fleetView = new FleetView(config, this.fleet, table, this.registry, this.stops.stops);
-    this.carView = new CarView(config, this.fleet, table, this.tools, this.drive.node, () => this.arrange());
-    this.historyView = new HistoryView(config, table, this.fleet);
-    this.insightsView = new InsightsView(config);
-    this.compareView = new CompareView(config, table, this.fleet);
-    this.cloudWatchView = new CloudWatchView(config);
-    this.alarmsView = new AlarmsView(config, alarms);
+    const services: Services = {
+      config,
+      table,
+      fleet: this.fleet,
+      registry: this.registry,
+      alarms,
+      stops: this.stops,
+      drive: this.drive,
+      changed: () => this.arrange(),
+    };
+    this.views = Object.fromEntries(
+      Object.entries(VIEWS).map(([name, MadeView]) => [name, new MadeView(services)]),
+    ) as unknown as Views;
+    this.view = this.views.fleet;
     byId("over").after(this.ignored);
     const why = readOnly(config);
-    if (why) byId("over").after(el("p", { class: "read-only", role: "status" }, el("b", {}, "Read-only"), `: ${why.replace(/\.$/, "")}. The command `, el("code", {}, "iort invite"), " prints a link that gives one more browser the stop, the wheel and every other action."));
+    if (why)
+      byId("over").after(
+        el(
+          "p",
+          { class: "read-only", role: "status" },
+          el("b", {}, "Read-only"),
+          `: ${why.replace(/\.$/, "")}. The command `,
+          el("code", {}, "iort invite"),
+          " prints a link that gives one more browser the stop, the wheel and every other action.",
+        ),
+      );
     for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));
     window.addEventListener("hashchange", () => (invited(location.hash) ? location.reload() : this.go()));
     window.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("visibilitychange", () => !document.hidden && this.frame());
-    Object.defineProperty(window, "iort", { value: observer(this.fleet, this.feed, GONE_SHOWN_S), writable: false });
+    Object.defineProperty(window, "iort", {
+      value: observer(this.fleet, this.feed, CLOCK_S),
+      writable: false,
+    });
     this.go();
     this.frame();
   }
@@ -98,82 +126,58 @@ class Page {
     this.ignored.hidden = ignored.length === 0;
     this.ignored.textContent = ignored.length > 0 ? `Ignored in the address: ${ignored.join("; ")}.` : "";
     const { view } = this.route;
-    const robot = "robot" in this.route ? this.route.robot : undefined;
-    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, insights: this.insightsView, compare: this.compareView, cloudwatch: this.cloudWatchView, alarms: this.alarmsView }[view];
-    document.body.dataset["view"] = view;
-    document.title = robot ? `${robot} · iort` : { fleet: "iort live", cloudwatch: "CloudWatch · iort", alarms: "Alarms · iort", compare: "Compare · iort", insights: "Insights · iort", car: "iort live", history: "iort live" }[view];
-    if (this.stage.firstElementChild !== shown.node) {
-      this.stage.replaceChildren(shown.node);
+    const next = this.views[view];
+    if (this.view !== next) this.view.leave?.();
+    this.view = next;
+    document.body.dataset.view = view;
+    document.title = next.title(this.route);
+    if (this.stage.firstElementChild !== next.node) {
+      this.stage.replaceChildren(next.node);
       window.scrollTo(0, 0);
     }
     for (const tab of TABS) {
       if (view === tab) byId(`to-${tab}`).setAttribute("aria-current", "page");
       else byId(`to-${tab}`).removeAttribute("aria-current");
     }
-    if (this.route.view === "history") this.historyView.show(this.route.robot, this.route.query);
-    else this.historyView.show(undefined);
-    this.compareView.show(this.route.view === "compare" ? this.route.query : undefined);
-    if (this.route.view === "insights") this.insightsView.show(this.route.robot, this.route.query);
-    else this.insightsView.leave();
-    this.cloudWatchView.show(view === "cloudwatch");
-    this.stops.of(view === "car" ? robot : undefined);
-    this.drive.of(view === "car" ? robot : undefined);
-    this.viewing.look(this.looks());
     this.registry.watch(view === "fleet" || view === "car");
-    if (this.route.view === "fleet") this.fleetView.show(this.route.query ?? {});
-    if (this.route.view === "car") this.carView.open(this.route.robot, this.route.query);
-    else this.carView.open(undefined);
+    const car = view === "car" ? this.robot : undefined;
+    this.stops.of(car);
+    this.drive.of(car);
+    next.show(this.route);
+    this.look();
     this.arrange();
   }
 
-  /** The cars that the viewer sees, and how closely: alarms, the past and dashboards need no more than a car sends by itself. */
-  private looks(): Looks {
-    if (this.route.view === "car") return new Map([[this.route.robot, LIVE_MAX_RATE_HZ]]);
-    if (this.route.view === "history") return new Map([[this.route.robot, GLANCE_HZ]]);
-    return this.route.view === "fleet" ? new Map(this.fleetView.looked.map((robot) => [robot, GLANCE_HZ])) : NONE;
+  private get robot(): string | undefined {
+    return "robot" in this.route ? this.route.robot : undefined;
+  }
+
+  /** Alarms, findings and dashboards need no more than a car sends by itself. */
+  private look(): void {
+    this.viewing.look(this.view.looks?.() ?? NONE);
   }
 
   /** Called for a new car, a new stream and another view. */
   private arrange(): void {
     this.shape = this.fleet.shape;
-    const robot = "robot" in this.route ? this.route.robot : undefined;
-    this.fleetView.arrange();
-    if (this.route.view === "car" && robot) {
-      this.carView.show(this.fleet.robots.get(robot));
-      const link = (text: string, label: string, name: string): HTMLElement =>
-        el("a", { class: "tool", href: route({ view: "car", robot: name, query: this.carView.query }), "aria-label": label }, text);
-      const [before, after] = this.neighbours(robot);
-      this.tools.replaceChildren(
-        el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
-        el("a", { class: "tool", href: route({ view: "insights", robot }) }, "Insights"),
-        ...(before && after ? [link("‹", `Previous car, ${before}`, before), link("›", `Next car, ${after}`, after)] : []),
-      );
-    }
+    this.view.arrange?.();
     // The view of a car waits for its car, as the fleet's view waits for the first.
-    const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
-    document.body.dataset["empty"] = String(waits);
-    this.waiting.show(robot);
+    document.body.dataset.empty = String(this.view.waits?.() ?? false);
+    this.waiting.show(this.robot);
     this.clockAt = -Infinity;
   }
 
-  private neighbours(robot: string): [string | undefined, string | undefined] {
-    const names = [...this.fleet.robots.keys()].sort(byName);
-    const at = names.indexOf(robot);
-    if (names.length < 2 || at < 0) return [undefined, undefined];
-    return [names.at(at - 1), names[(at + 1) % names.length]];
-  }
-
-  /** Left and right change the car; Escape leaves it. */
+  /** Escape leaves a view; what other keys do is the view's. */
   private key(event: KeyboardEvent): void {
-    const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (this.route.view === "fleet") this.fleetView.key(event);
-    if (this.route.view === "fleet" || inField) return;
-    if (event.key === "Escape") location.hash = "robot" in this.route && this.route.view === "history" ? route({ view: "car", robot: this.route.robot }) : route({ view: "fleet" });
-    if (this.route.view !== "car") return;
-    const [before, after] = this.neighbours(this.route.robot);
-    const to = { ArrowLeft: before, ArrowRight: after }[event.key];
-    if (to !== undefined) location.hash = route({ view: "car", robot: to, query: this.carView.query });
+    const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
+    if (this.route.view !== "fleet" && inField) return;
+    this.view.key?.(event);
+    if (event.key !== "Escape" || this.route.view === "fleet") return;
+    location.hash =
+      this.route.view === "history"
+        ? route({ view: "car", robot: this.route.robot })
+        : route({ view: "fleet" });
   }
 
   private readonly frame = (): void => {
@@ -181,33 +185,19 @@ class Page {
     requestAnimationFrame(this.frame);
     const at = now();
     if (this.fleet.shape !== this.shape) this.arrange();
-    const { view } = this.route;
     if (at - this.valuesAt >= VALUES_S) {
       this.valuesAt = at;
-      if (view === "car") {
-        this.carView.values(at);
-        this.carView.draw(at);
-      }
-      this.bar.speed(view === "car" ? this.carView.speed(at) : undefined);
+      this.view.values?.(at);
+      this.bar.speed(this.view.speed?.(at));
     }
     if (at - this.clockAt < CLOCK_S) return;
     this.clockAt = at;
-    this.viewing.look(this.looks());
-    const linked = this.feed.state.kind === "live";
+    this.look();
     this.bar.clock(at, this.feed.state);
-    if (document.body.dataset["empty"] === "true") this.waiting.show("robot" in this.route ? this.route.robot : undefined);
-    if (view === "fleet") this.fleetView.clock(at, linked);
-    if (view === "car") {
-      this.carView.clock(at, linked);
-      this.drive.driven(this.carView.driver(at));
-    }
-    if (view === "history") this.historyView.clock(at);
-    if (view === "alarms") this.alarmsView.clock(at);
+    if (document.body.dataset.empty === "true") this.waiting.show(this.robot);
+    this.view.clock?.(at, this.feed.state.kind === "live");
   };
 }
-
-/** The longest delay until a car that is gone is shown so. */
-const GONE_SHOWN_S = CLOCK_S;
 
 load()
   .then((config) => {
@@ -218,6 +208,7 @@ load()
     setAttribute(byId("link"), "data-state", "lost");
     byId("link-text").textContent = "Not started";
     byId("banner").hidden = false;
-    byId("banner").dataset["state"] = "lost";
-    byId("banner-text").textContent = `The page could not start: ${error instanceof Error ? error.message : String(error)}`;
+    byId("banner").dataset.state = "lost";
+    byId("banner-text").textContent =
+      `The page could not start: ${error instanceof Error ? error.message : String(error)}`;
   });

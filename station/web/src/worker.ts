@@ -18,18 +18,22 @@ const MOST_NAMED = 200;
 let link: IotLink | PubNubLink | undefined;
 let arrivals: Arrival[] = [];
 const refused = new Map<string, Refused>();
-let handing: number | undefined;
+let timer: number | undefined;
 let taking = false;
 
 const tell = (message: FromWorker): void => self.postMessage(message);
 
 function hand(): void {
-  handing = undefined;
+  timer = undefined;
   if (taking) return;
   taking = true;
   tell({ kind: "arrivals", arrivals, refused: [...refused.values()] });
   arrivals = [];
   refused.clear();
+}
+
+function handSoon(): void {
+  if (timer === undefined) timer = self.setTimeout(hand, TOGETHER_MS);
 }
 
 function refuse(robot: string, reason: string): void {
@@ -47,7 +51,7 @@ function take(update: Update | string, from: string, pubnub_us?: number): void {
     const dropped = arrivals.shift();
     refuse(dropped?.update.robot ?? "", "more than this device can show");
   }
-  handing ??= self.setTimeout(hand, TOGETHER_MS);
+  handSoon();
 }
 
 function start(listening: Listening): void {
@@ -55,9 +59,24 @@ function start(listening: Listening): void {
   const onState = (state: LinkState): void => tell({ kind: "state", state });
   link =
     listening.live === "iot"
-      ? new IotLink(listening, now, (topic, payload) => take(parseLive(namespace, version, topic, payload), topic.split("/")[2] ?? ""), onState)
+      ? new IotLink(
+          listening,
+          now,
+          (topic, payload) => take(parseLive(namespace, version, topic, payload), topic.split("/")[2] ?? ""),
+          onState,
+        )
       : // A timetoken counts 100 ns.
-        new PubNubLink(listening, now, (channel, message, timetoken) => take(parseUpdate(namespace, version, channel, message), channel.slice(namespace.length + 1), Number(timetoken) / 10), onState);
+        new PubNubLink(
+          listening,
+          now,
+          (channel, message, timetoken) =>
+            take(
+              parseUpdate(namespace, version, channel, message),
+              channel.slice(namespace.length + 1),
+              Number(timetoken) / 10,
+            ),
+          onState,
+        );
   link.connect();
 }
 
@@ -67,9 +86,8 @@ self.addEventListener("message", (event: MessageEvent<ToWorker>) => {
   else if (data.kind === "visible") link?.seen(data.visible);
   else if (data.kind === "lease") {
     if (link instanceof IotLink) link.lease(data.lease);
-  }
-  else {
+  } else {
     taking = false;
-    if (arrivals.length > 0 || refused.size > 0) handing ??= self.setTimeout(hand, TOGETHER_MS);
+    if (arrivals.length > 0 || refused.size > 0) handSoon();
   }
 });

@@ -139,7 +139,7 @@ def test_a_car_that_does_not_stand_is_named_before_and_after_a_stop(
     lab.confirms = False
     page.get_by_role("button", name="Stop all").click()
     until(lambda: "car-1 (not confirmed)" in moves.inner_text(), "the car that has not confirmed it")
-    assert f"car-9 ({WHY_NOT})" in moves.inner_text()
+    until(lambda: f"car-9 ({WHY_NOT})" in moves.inner_text(), "the car that cannot be stopped")
     lab.cars["car-1"][1] = True
     until(lambda: words.inner_text() == "Emergency stop: car-1 stands.", "the word of the other car")
     assert moves.inner_text() == f"NOT standing: car-9 ({WHY_NOT})."

@@ -26,10 +26,44 @@ export interface Spec extends Linear {
 export const NOTHING = "–";
 
 const DIGITS: Readonly<Record<string, number>> = {
-  V: 2, A: 2, degC: 1, erpm: 0, deg: 1, counts: 0, Ah: 4, Wh: 3, id: 0, "m/s": 2, W: 1, ms: 0, "%": 1, "m/s^2": 2, "rad/s": 2, m: 2, rad: 3, MB: 1, batches: 0, bytes: 0,
+  V: 2,
+  A: 2,
+  degC: 1,
+  erpm: 0,
+  deg: 1,
+  counts: 0,
+  Ah: 4,
+  Wh: 3,
+  id: 0,
+  "m/s": 2,
+  W: 1,
+  ms: 0,
+  "%": 1,
+  "m/s^2": 2,
+  "rad/s": 2,
+  m: 2,
+  rad: 3,
+  MB: 1,
+  batches: 0,
+  bytes: 0,
 };
 const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "", "m/s^2": "m/s²" };
-const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
+const CAPITALS = new Set([
+  "pcb",
+  "fet",
+  "ntc",
+  "pid",
+  "id",
+  "iq",
+  "vd",
+  "vq",
+  "imu",
+  "gps",
+  "cpu",
+  "mos1",
+  "mos2",
+  "mos3",
+]);
 
 /** The format of a field of a stream; `ros2` selects the ROS 2 driver's units. */
 export function spec(field: string, table: FieldTable, ros2 = false, stream = ""): Spec {
@@ -42,7 +76,8 @@ export function spec(field: string, table: FieldTable, ros2 = false, stream = ""
   }
   const { meaning } = known;
   const unit = (ros2 ? known.ros2_unit : undefined) ?? known.unit;
-  if (field === "fault_code") return { label, meaning: "", unit: "", ...AS_SENT, digits: 0, texts: table.faults };
+  if (field === "fault_code")
+    return { label, meaning: "", unit: "", ...AS_SENT, digits: 0, texts: table.faults };
   if (unit === "us") return { label, meaning, unit: "", ...AS_SENT, digits: 0, time: true };
   // Shares are shown in percent, and 1e-4 Ah in Ah.
   if (unit === "1") return { label, meaning, unit: "%", ...times(100), digits: 1 };
@@ -59,13 +94,16 @@ export function spec(field: string, table: FieldTable, ros2 = false, stream = ""
 
 function rosUnit(field: string, { ros_units }: FieldTable): string {
   const within = /^(.+)\.[xyz]$/.exec(field)?.[1];
-  const name = within && Object.keys(ros_units).find((each) => within === each || within.endsWith(`.${each}`));
+  const name =
+    within && Object.keys(ros_units).find((each) => within === each || within.endsWith(`.${each}`));
   return name ? ros_units[name]! : "";
 }
 
 /** The format of the motor's speed as the car's speed, if the car's parameters are known; else `spec`. */
 export function asSpeed(field: string, spec: Spec, speed: Linear | undefined): Spec {
-  return field === "speed" && spec.unit === "erpm" && speed ? { ...spec, ...speed, unit: "m/s", digits: 2 } : spec;
+  return field === "speed" && spec.unit === "erpm" && speed
+    ? { ...spec, ...speed, unit: "m/s", digits: 2 }
+    : spec;
 }
 
 export function write(value: Value | undefined, spec: Spec): string {
@@ -83,9 +121,11 @@ export function number(value: number, digits?: number): string {
   let text: string;
   if (digits !== undefined && magnitude < 1e12) text = magnitude.toFixed(digits);
   else if (magnitude !== 0 && (magnitude >= 1e12 || magnitude < 1e-4)) text = magnitude.toExponential(3);
-  else text = Number.isInteger(magnitude) ? String(magnitude) : magnitude.toPrecision(6).replace(/\.?0+$/, "");
+  else
+    text = Number.isInteger(magnitude) ? String(magnitude) : magnitude.toPrecision(6).replace(/\.?0+$/, "");
   const [whole = "", rest] = text.split(".");
-  if (whole.length > 4 && !text.includes("e")) text = whole.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (rest ? `.${rest}` : "");
+  if (whole.length > 4 && !text.includes("e"))
+    text = whole.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (rest ? `.${rest}` : "");
   return value < 0 && /[1-9]/.test(text) ? `\u2212${text}` : text;
 }
 
@@ -123,8 +163,16 @@ export function clockTime(seconds: number): string {
 /** The local time of day, with the date unless it is today: Fri 20 Nov 14:03:27. */
 export function dayTime(seconds: number, options: Intl.DateTimeFormatOptions = {}): string {
   const at = new Date(seconds * 1000);
-  const time = at.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", ...options });
-  const day = at.toDateString() === new Date().toDateString() ? "" : `${at.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short" })} `;
+  const time = at.toLocaleTimeString("en-GB", {
+    hour: "2-digit",
+    minute: "2-digit",
+    second: "2-digit",
+    ...options,
+  });
+  const day =
+    at.toDateString() === new Date().toDateString()
+      ? ""
+      : `${at.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short" })} `;
   return day + time;
 }
 

@@ -27,4 +27,7 @@ export const same = (one: Range | undefined, other: Range | undefined): boolean 
   one === other || (one !== undefined && other !== undefined && one[0] === other[0] && one[1] === other[1]);
 
 /** The range with ends at whole milliseconds, as an address has them. */
-export const rounded = ([from, to]: Range): Range => [Math.floor(from * 1000) / 1000, Math.ceil(to * 1000) / 1000];
+export const rounded = ([from, to]: Range): Range => [
+  Math.floor(from * 1000) / 1000,
+  Math.ceil(to * 1000) / 1000,
+];

@@ -2,7 +2,7 @@
 // static site serves them all, and a link shows what its sender saw.
 
 import { NAME } from "./contract";
-import { readRange, readTime, writeTime, type Range } from "./range";
+import { type Range, readRange, readTime, writeTime } from "./range";
 
 /** Each view's parameters. To add one, add its name. */
 const PARAMETERS = {
@@ -25,7 +25,9 @@ export interface Part {
 export const MOST_PARTS = 6;
 
 type View = keyof typeof PARAMETERS;
-export type Query<V extends View> = Readonly<Partial<Record<(typeof PARAMETERS)[V][number], string | undefined>>>;
+export type Query<V extends View> = Readonly<
+  Partial<Record<(typeof PARAMETERS)[V][number], string | undefined>>
+>;
 
 interface Address<V extends View> {
   readonly view: V;
@@ -34,23 +36,39 @@ interface Address<V extends View> {
 interface RobotAddress<V extends View> extends Address<V> {
   readonly robot: string;
 }
-export type Route = Address<"fleet"> | Address<"cloudwatch"> | Address<"alarms"> | Address<"compare"> | RobotAddress<"car"> | RobotAddress<"history"> | (Address<"insights"> & { readonly robot?: string });
+export type Route =
+  | Address<"fleet">
+  | Address<"cloudwatch">
+  | Address<"alarms">
+  | Address<"compare">
+  | RobotAddress<"car">
+  | RobotAddress<"history">
+  | (Address<"insights"> & { readonly robot?: string });
+
+export type RouteTo<V extends View> = Extract<Route, { readonly view: V }>;
 
 export function route(to: Route): string {
   const view = to.view === "fleet" ? "" : to.view;
   const robot = "robot" in to && to.robot !== undefined ? `/${encodeURIComponent(to.robot)}` : "";
   const pairs = Object.entries<string | undefined>(to.query ?? {}).filter(([, value]) => value !== undefined);
-  const query = pairs.map(([name, value]) => `${name}=${encodeURIComponent(value!).replace(/%(2C|2F|3A)/g, decodeURIComponent)}`);
+  const query = pairs.map(
+    ([name, value]) => `${name}=${encodeURIComponent(value!).replace(/%(2C|2F|3A)/g, decodeURIComponent)}`,
+  );
   return `#/${view}${robot}${query.length > 0 ? `?${query.join("&")}` : ""}`;
 }
 
 export function readRoute(hash: string): Route {
-  const [, name = "", robot, query = ""] = /^#\/([a-z]*)(?:\/([A-Za-z0-9_-]{1,64}))?(?:\?(.*))?$/.exec(hash) ?? [];
+  const [, name = "", robot, query = ""] =
+    /^#\/([a-z]*)(?:\/([A-Za-z0-9_-]{1,64}))?(?:\?(.*))?$/.exec(hash) ?? [];
   const values = new URLSearchParams(query);
   const read = <V extends View>(view: V): Query<V> =>
-    Object.fromEntries(PARAMETERS[view].flatMap((key) => (values.has(key) ? [[key, values.get(key)]] : []))) as Query<V>;
-  if ((name === "car" || name === "history") && robot !== undefined) return { view: name, robot, query: read(name) };
-  if (name === "insights") return { view: name, ...(robot === undefined ? {} : { robot }), query: read(name) };
+    Object.fromEntries(
+      PARAMETERS[view].flatMap((key) => (values.has(key) ? [[key, values.get(key)]] : [])),
+    ) as Query<V>;
+  if ((name === "car" || name === "history") && robot !== undefined)
+    return { view: name, robot, query: read(name) };
+  if (name === "insights")
+    return { view: name, ...(robot === undefined ? {} : { robot }), query: read(name) };
   if (name === "cloudwatch") return { view: name, query: read(name) };
   if (name === "alarms") return { view: name, query: read(name) };
   if (name === "compare") return { view: name, query: read(name) };
@@ -58,9 +76,19 @@ export function readRoute(hash: string): Route {
 }
 
 const WORDS: Readonly<Record<string, readonly [reads: (value: string) => boolean, must: string]>> = {
-  ...Object.fromEntries(["from", "to", "at"].map((name) => [name, [(value: string) => !Number.isNaN(readTime(value)), "be a time like 2026-05-04T10:00:00.000Z"]])),
+  ...Object.fromEntries(
+    ["from", "to", "at"].map((name) => [
+      name,
+      [(value: string) => !Number.isNaN(readTime(value)), "be a time like 2026-05-04T10:00:00.000Z"],
+    ]),
+  ),
   stream: [(value) => NAME.test(value), "be a stream's name"],
-  runs: [(value) => value === "" || (readParts(value).length === value.split(",").length && readParts(value).length <= MOST_PARTS), `be at most ${MOST_PARTS} ranges like car1/2026-05-04T10:00:00.000Z/2026-05-04T10:05:00.000Z`],
+  runs: [
+    (value) =>
+      value === "" ||
+      (readParts(value).length === value.split(",").length && readParts(value).length <= MOST_PARTS),
+    `be at most ${MOST_PARTS} ranges like car1/2026-05-04T10:00:00.000Z/2026-05-04T10:05:00.000Z`,
+  ],
   x: [(value) => value === "time" || value === "distance", "be time or distance"],
   zoom: [(value) => /^[-\d.]+,[-\d.]+$/.test(value), "be two numbers"],
   window: [(value) => /^\d+$/.test(value), "be a number of seconds"],
@@ -71,7 +99,8 @@ export function unread(hash: string): string[] {
   const { view, query = {} } = readRoute(hash);
   const [path = "", given = ""] = hash.replace(/^#\/?/, "").split(/\?(.*)/);
   const robot = path.split("/")[1];
-  if (path !== "" && (path.split("/")[0] !== view || (robot !== undefined && !NAME.test(robot)))) return [`there is no view "${path}"`];
+  if (path !== "" && (path.split("/")[0] !== view || (robot !== undefined && !NAME.test(robot))))
+    return [`there is no view "${path}"`];
   const names: readonly string[] = PARAMETERS[view];
   const values = [...new URLSearchParams(given)].map(([name, value]) => {
     if (!names.includes(name)) return `${view} has no parameter ${name}`;
@@ -79,7 +108,13 @@ export function unread(hash: string): string[] {
     return reads && !reads(value) ? `${name} must ${must}, got "${value}"` : "";
   });
   const { from, to } = query as Query<"history">;
-  const order = view === "history" && (from ?? to) !== undefined && values.every((text) => text === "") && !readRange(from, to) ? ["from and to must be two times in their order"] : [];
+  const order =
+    view === "history" &&
+    (from ?? to) !== undefined &&
+    values.every((text) => text === "") &&
+    !readRange(from, to)
+      ? ["from and to must be two times in their order"]
+      : [];
   return [...values.filter((text) => text !== ""), ...order];
 }
 

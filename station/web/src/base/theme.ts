@@ -6,16 +6,14 @@ const CHOICES = ["auto", "light", "dark"] as const;
 type Choice = (typeof CHOICES)[number];
 
 const listeners = new Set<() => void>();
-const probe = document.createElement("span");
+let probe: HTMLElement | undefined;
 
 export function startTheme(button: HTMLElement): void {
-  probe.hidden = true;
-  document.body.append(probe);
   let choice = stored();
   const apply = (): void => {
-    if (choice === "auto") delete document.documentElement.dataset["theme"];
-    else document.documentElement.dataset["theme"] = choice;
-    button.dataset["choice"] = choice;
+    if (choice === "auto") delete document.documentElement.dataset.theme;
+    else document.documentElement.dataset.theme = choice;
+    button.dataset.choice = choice;
     button.setAttribute("aria-label", `Theme: ${choice}`);
     button.title = `Theme: ${choice}`;
     for (const listener of listeners) listener();
@@ -37,6 +35,11 @@ export function onTheme(listener: () => void): () => void {
 
 /** A custom property's colour in a form that a canvas accepts. */
 export function colour(property: string): string {
+  if (!probe) {
+    probe = document.createElement("span");
+    probe.hidden = true;
+    document.body.append(probe);
+  }
   probe.style.color = `var(${property})`;
   return getComputedStyle(probe).color;
 }

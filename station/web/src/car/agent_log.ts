@@ -1,11 +1,11 @@
 // The warnings and errors of a car's agent: those that come live, and those of the last hour from the page's server.
 
-import { LOG_STREAM, type Config, type HistoryAnswer, type StreamsAnswer } from "../base/contract";
+import { type Config, type HistoryAnswer, LOG_STREAM, type StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
-import { lineOf, type Line } from "../live/lines";
+import { type Line, lineOf } from "../live/lines";
 import type { Robot } from "../live/robot";
-import { ask, AnswerError } from "../server/answers";
+import { AnswerError, ask } from "../server/answers";
 
 const BACK_S = 3600;
 // More than an agent sends in an hour: a row of several lines would have the last one alone.
@@ -21,7 +21,12 @@ export class AgentLog {
   private drawn = "";
 
   constructor(private readonly config: Config) {
-    this.node = el("section", { class: "panel agent-log", "aria-label": "Agent's log" }, el("header", {}, el("h3", {}, "Agent's log"), this.note.node), this.list);
+    this.node = el(
+      "section",
+      { class: "panel agent-log", "aria-label": "Agent's log" },
+      el("header", {}, el("h3", {}, "Agent's log"), this.note.node),
+      this.list,
+    );
   }
 
   /** Show this car's lines from now on. */
@@ -37,21 +42,35 @@ export class AgentLog {
     this.drawn = key;
     const first = robot.lines[0]?.t_us ?? Infinity;
     const lines = [...this.past.filter(({ t_us }) => t_us < first), ...robot.lines].slice(-SHOWN).reverse();
-    this.note.set(lines.length > 0 ? "warnings and errors" : this.config.answers ? "no warnings in the last hour" : "no warnings since this page was opened");
+    this.note.set(
+      lines.length > 0
+        ? "warnings and errors"
+        : this.config.answers
+          ? "no warnings in the last hour"
+          : "no warnings since this page was opened",
+    );
     this.list.replaceChildren(...lines.map(row));
   }
 
   private async find(robot: string): Promise<void> {
     // Not a microsecond over an hour: longer ranges are answered from the summaries, which have no texts.
     const to_us = Date.now() * 1000;
-    const asked = { robot, stream: LOG_STREAM, from_us: String(to_us - BACK_S * 1e6), to_us: String(to_us), rows: String(ROWS) };
+    const asked = {
+      robot,
+      stream: LOG_STREAM,
+      from_us: String(to_us - BACK_S * 1e6),
+      to_us: String(to_us),
+      rows: String(ROWS),
+    };
     try {
       // A car that never warned has no such stream.
       const { streams } = await ask<StreamsAnswer>("streams", { robot });
       if (!streams.includes(LOG_STREAM)) return;
       const { times_s, fields } = await ask<HistoryAnswer>("history", asked);
       if (robot !== this.robot) return;
-      this.past = times_s.flatMap((at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? []);
+      this.past = times_s.flatMap(
+        (at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? [],
+      );
     } catch (error) {
       // What comes live is shown all the same.
       if (!(error instanceof AnswerError)) throw error;
@@ -60,6 +79,13 @@ export class AgentLog {
 }
 
 function row({ t_us, level, logger, text, leftOut }: Line): HTMLElement {
-  const left = leftOut > 0 ? [" ", el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
-  return el("li", { "data-level": level, title: logger }, el("span", { class: "line-head" }, el("b", {}, level), " ", when(t_us / 1e6)), text, ...left);
+  const left =
+    leftOut > 0 ? [" ", el("span", { class: "note" }, `${leftOut} lines before were left out`)] : [];
+  return el(
+    "li",
+    { "data-level": level, title: logger },
+    el("span", { class: "line-head" }, el("b", {}, level), " ", when(t_us / 1e6)),
+    text,
+    ...left,
+  );
 }

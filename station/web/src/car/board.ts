@@ -3,10 +3,10 @@
 import type { FieldTable, TrackMap } from "../base/contract";
 import { el } from "../base/dom";
 import type { Linear } from "../base/format";
-import type { Robot } from "../live/robot";
-import { panelOf, type BoardPanel } from "./board_panels";
-import { BOARD } from "./car_charts";
 import { WINDOWS } from "../charts/windows";
+import type { Robot } from "../live/robot";
+import { type BoardPanel, panelOf } from "./board_panels";
+import { BOARD } from "./car_charts";
 
 const MOST = 24;
 const STEPS: Readonly<Record<string, number>> = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };
@@ -70,12 +70,24 @@ export class Board {
     const panel = panelOf(key, this.table, this.track);
     if (!panel) return false;
     panel.span(this.window_s);
-    const grip = el("button", { type: "button", class: "grip", "aria-label": `Move ${panel.title}`, title: "Drag, or press the arrow keys" }, "\u283f");
+    const grip = el(
+      "button",
+      {
+        type: "button",
+        class: "grip",
+        "aria-label": `Move ${panel.title}`,
+        title: "Drag, or press the arrow keys",
+      },
+      "\u283f",
+    );
     const close = el("button", { type: "button", class: "close", "aria-label": `Close ${panel.title}` }, "×");
     close.addEventListener("click", () => this.toggle(key));
     grip.addEventListener("keydown", (event) => this.step(event, key));
     grip.addEventListener("pointerdown", (event) => grip.setPointerCapture(event.pointerId));
-    grip.addEventListener("pointermove", (event) => grip.hasPointerCapture(event.pointerId) && this.drag(event, key));
+    grip.addEventListener(
+      "pointermove",
+      (event) => grip.hasPointerCapture(event.pointerId) && this.drag(event, key),
+    );
     grip.addEventListener("lostpointercapture", () => this.changed());
     const header = panel.node.querySelector("header")!;
     header.prepend(grip);

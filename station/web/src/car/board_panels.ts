@@ -2,14 +2,14 @@
 
 import type { FieldTable, TrackMap } from "../base/contract";
 import { el } from "../base/dom";
-import { AS_SENT, linear, spec, type Linear } from "../base/format";
+import { AS_SENT, type Linear, linear, spec } from "../base/format";
+import { ChartPanel } from "../charts/chart_panel";
+import { WINDOWS, windowLabel } from "../charts/windows";
+import { type Track, XYChart } from "../charts/xy_chart";
 import type { Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { BOARD, type DelaySpec, type LineSpec, type XYChartSpec } from "./car_charts";
-import { ChartPanel } from "../charts/chart_panel";
 import { edges } from "./track_map";
-import { windowLabel, WINDOWS } from "../charts/windows";
-import { XYChart, type Track } from "../charts/xy_chart";
 
 const MOST_POINTS = 4000;
 
@@ -42,7 +42,10 @@ abstract class TimePanel implements BoardPanel {
   readonly title: string;
   readonly node: HTMLElement;
 
-  constructor(protected readonly panel: ChartPanel, title: string) {
+  constructor(
+    protected readonly panel: ChartPanel,
+    title: string,
+  ) {
     this.title = title;
     this.node = panel.node;
   }
@@ -77,7 +80,10 @@ class LinePanel extends TimePanel {
   values(robot: Robot, speed: Linear | undefined): boolean {
     const { fields, as } = this.spec;
     const vesc = robot.vesc(this.table);
-    this.panel.show(vesc && { history: vesc.history, columns: fields.map((field) => vesc.columns.get(field)) }, ...as(speed));
+    this.panel.show(
+      vesc && { history: vesc.history, columns: fields.map((field) => vesc.columns.get(field)) },
+      ...as(speed),
+    );
     this.panel.update(fields.map((field) => numeric(vesc?.sample.get(field))));
     return vesc !== undefined;
   }
@@ -102,14 +108,30 @@ class FieldPanel extends TimePanel {
     private readonly table: FieldTable,
   ) {
     const { label, unit, digits } = spec(field, table, false, stream);
-    const reading = { name: fieldKey(stream, field), unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
-    super(new ChartPanel({ title: label, readings: [reading], chart: { lines: [{ colour: "--accent" }], span: 1e-3 } }), label);
+    const reading = {
+      name: fieldKey(stream, field),
+      unit,
+      from: ([value = NaN]: readonly number[]) => value,
+      ...(digits === undefined ? {} : { digits }),
+    };
+    super(
+      new ChartPanel({
+        title: label,
+        readings: [reading],
+        chart: { lines: [{ colour: "--accent" }], span: 1e-3 },
+      }),
+      label,
+    );
   }
 
   values(robot: Robot): boolean {
     const stream = robot.streams.get(this.stream);
     const as = spec(this.field, this.table, stream?.ros2, this.stream);
-    this.panel.show(stream && { history: stream.history, columns: [stream.columns.get(this.field)] }, as, as.unit);
+    this.panel.show(
+      stream && { history: stream.history, columns: [stream.columns.get(this.field)] },
+      as,
+      as.unit,
+    );
     this.panel.update([numeric(stream?.sample.get(this.field))]);
     return stream?.columns.has(this.field) ?? false;
   }
@@ -120,7 +142,9 @@ class XYPanel implements BoardPanel {
   readonly node: HTMLElement;
   private readonly chart: XYChart;
   private readonly note = el("p", { class: "note" });
-  private source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
+  private source:
+    | { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear }
+    | undefined;
   private unit = "";
   private window_s = 0;
 
@@ -130,8 +154,17 @@ class XYPanel implements BoardPanel {
   ) {
     const host = el("div", { class: "plot" });
     this.title = spec.title;
-    this.node = el("section", { class: "panel xy", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), this.note), host);
-    this.chart = new XYChart(host, { ...spec, x: () => spec.x + this.unit, ...(spec.map && track ? { ground: edges(track) } : {}) });
+    this.node = el(
+      "section",
+      { class: "panel xy", "aria-label": spec.title },
+      el("header", {}, el("h3", {}, spec.title), this.note),
+      host,
+    );
+    this.chart = new XYChart(host, {
+      ...spec,
+      x: () => spec.x + this.unit,
+      ...(spec.map && track ? { ground: edges(track) } : {}),
+    });
     this.span(WINDOWS[0]);
   }
 
@@ -171,6 +204,7 @@ function track({ stream, x, y, as }: NonNullable<XYPanel["source"]>, from: numbe
   const [across, up] = [column(x), column(y)];
   // A long window has more points than the chart has pixels.
   const step = Math.ceil(across.length / MOST_POINTS);
-  const thin = (values: Float64Array): Float64Array => (step > 1 ? values.filter((_, i) => (values.length - 1 - i) % step === 0) : values);
+  const thin = (values: Float64Array): Float64Array =>
+    step > 1 ? values.filter((_, i) => (values.length - 1 - i) % step === 0) : values;
   return { x: as === AS_SENT ? thin(across) : thin(across).map((value) => linear(value, as)), y: thin(up) };
 }

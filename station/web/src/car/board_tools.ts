@@ -5,18 +5,24 @@ import { el } from "../base/dom";
 import { spec } from "../base/format";
 import { keep, kept } from "../base/kept";
 import type { Query } from "../base/route";
+import { WINDOWS, windowLabel } from "../charts/windows";
+import type { Robot } from "../live/robot";
 import type { Board } from "./board";
 import { fieldKey } from "./board_panels";
 import { BOARD } from "./car_charts";
-import { windowLabel, WINDOWS } from "../charts/windows";
-import type { Robot } from "../live/robot";
 
 const EVERY = [...BOARD.keys()].join(",");
 
 export class BoardTools {
   readonly node: HTMLElement;
   window_s: number = WINDOWS[0];
-  private readonly window = el("select", { name: "window" }, ...[...WINDOWS].sort((a, b) => a - b).map((each) => el("option", { value: String(each) }, windowLabel(each))));
+  private readonly window = el(
+    "select",
+    { name: "window" },
+    ...[...WINDOWS]
+      .sort((a, b) => a - b)
+      .map((each) => el("option", { value: String(each) }, windowLabel(each))),
+  );
   private readonly more = el("select", { name: "chart", "aria-label": "Add a chart" });
   private readonly reset = el("button", { type: "button", class: "tool" }, "Reset");
   private charts = EVERY;
@@ -27,7 +33,13 @@ export class BoardTools {
     private readonly table: FieldTable,
     private readonly changed: () => void,
   ) {
-    this.node = el("form", { class: "range board-tools" }, el("label", {}, "Last ", this.window), this.more, this.reset);
+    this.node = el(
+      "form",
+      { class: "range board-tools" },
+      el("label", {}, "Last ", this.window),
+      this.more,
+      this.reset,
+    );
     this.node.addEventListener("submit", (event) => event.preventDefault());
     this.window.addEventListener("input", () => this.choose(Number(this.window.value), this.charts));
     this.more.addEventListener("input", () => board.toggle(this.more.value));
@@ -77,15 +89,25 @@ export class BoardTools {
   /** Offer the charts that are not shown, and the numbers of every stream. */
   private offer(): void {
     const shown = new Set(this.board.charts);
-    const option = (value: string, text: string): HTMLElement[] => (shown.has(value) ? [] : [el("option", { value }, text)]);
-    const group = (label: string, options: HTMLElement[]): HTMLElement[] => (options.length > 0 ? [el("optgroup", { label }, ...options)] : []);
+    const option = (value: string, text: string): HTMLElement[] =>
+      shown.has(value) ? [] : [el("option", { value }, text)];
+    const group = (label: string, options: HTMLElement[]): HTMLElement[] =>
+      options.length > 0 ? [el("optgroup", { label }, ...options)] : [];
     const streams = [...(this.robot?.streams.values() ?? [])];
     const first = el("option", { value: "", selected: "", disabled: "", hidden: "" }, "Add a chart");
     this.more.replaceChildren(
       first,
-      ...group("Charts", [...BOARD].flatMap(([key, { title }]) => option(key, title))),
+      ...group(
+        "Charts",
+        [...BOARD].flatMap(([key, { title }]) => option(key, title)),
+      ),
       ...streams.flatMap(({ name, columns, ros2 }) =>
-        group(name, [...columns.keys()].flatMap((field) => option(fieldKey(name, field), spec(field, this.table, ros2, name).label))),
+        group(
+          name,
+          [...columns.keys()].flatMap((field) =>
+            option(fieldKey(name, field), spec(field, this.table, ros2, name).label),
+          ),
+        ),
       ),
     );
     first.selected = true;

@@ -1,11 +1,11 @@
 // The charts of a car's view. To add one, add an entry to `CHARTS`.
 
 import { power_w } from "../base/contract";
-import { AS_SENT, linear, times, type Linear } from "../base/format";
-import { hottest, type Robot } from "../live/robot";
+import { AS_SENT, type Linear, linear, times } from "../base/format";
 import type { ChartPanelOptions } from "../charts/chart_panel";
 import type { GaugeOptions } from "../charts/gauge";
 import type { XYChartOptions } from "../charts/xy_chart";
+import { hottest, type Robot } from "../live/robot";
 
 /** A number with a bar. */
 export interface GaugeSpec extends GaugeOptions {
@@ -63,31 +63,92 @@ const first = ([value = NaN]: readonly number[]): number => value;
 const asSent = (): readonly [Linear] => [AS_SENT];
 
 // The paths of positions in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages.
-const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
+const POSITIONS = [
+  "pose.pose.position.",
+  "pose.position.",
+  "position.",
+  "transform.translation.",
+  "translation.",
+  "pose.",
+  "",
+];
 
 const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   {
-    kind: "gauge", name: "speed_mps", label: "Speed", unit: "m/s", digits: 2, from: 0, to: 4,
+    kind: "gauge",
+    name: "speed_mps",
+    label: "Speed",
+    unit: "m/s",
+    digits: 2,
+    from: 0,
+    to: 4,
     fields: [],
     extent: "speed",
     show: (newest, _, speed) =>
-      speed ? { value: linear(newest("speed"), speed), as: speed } : { value: newest("speed"), unit: "erpm", digits: 0 },
+      speed
+        ? { value: linear(newest("speed"), speed), as: speed }
+        : { value: newest("speed"), unit: "erpm", digits: 0 },
   },
-  { kind: "gauge", name: "voltage_input", label: "Battery", unit: "V", digits: 2, from: 9, to: 13, ...plain("voltage_input") },
   {
-    kind: "gauge", name: "temperature", label: "Temperature, hottest", unit: "°C", digits: 1, from: 0, to: 100,
+    kind: "gauge",
+    name: "voltage_input",
+    label: "Battery",
+    unit: "V",
+    digits: 2,
+    from: 9,
+    to: 13,
+    ...plain("voltage_input"),
+  },
+  {
+    kind: "gauge",
+    name: "temperature",
+    label: "Temperature, hottest",
+    unit: "°C",
+    digits: 1,
+    from: 0,
+    to: 100,
     fields: [],
     show: (newest) => ({ value: hottest(newest) }),
   },
-  { kind: "gauge", name: "current_motor", label: "Motor current", unit: "A", digits: 2, from: -20, to: 40, ...plain("current_motor") },
   {
-    kind: "gauge", name: "power_w", label: "Battery power", unit: "W", digits: 1, from: -100, to: 200,
+    kind: "gauge",
+    name: "current_motor",
+    label: "Motor current",
+    unit: "A",
+    digits: 2,
+    from: -20,
+    to: 40,
+    ...plain("current_motor"),
+  },
+  {
+    kind: "gauge",
+    name: "power_w",
+    label: "Battery power",
+    unit: "W",
+    digits: 1,
+    from: -100,
+    to: 200,
     fields: [],
     show: (newest) => ({ value: power_w(newest("voltage_input"), newest("current_input")) }),
   },
-  { kind: "gauge", name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
   {
-    kind: "gauge", name: "delay", label: "Delay of the newest message", unit: "ms", digits: 0, from: 0, to: 100,
+    kind: "gauge",
+    name: "duty_cycle",
+    label: "Duty cycle",
+    unit: "%",
+    digits: 1,
+    from: -20,
+    to: 100,
+    ...plain("duty_cycle", 100),
+  },
+  {
+    kind: "gauge",
+    name: "delay",
+    label: "Delay of the newest message",
+    unit: "ms",
+    digits: 0,
+    from: 0,
+    to: 100,
     fields: [],
     show: (_, robot) => ({ value: robot.newestDelay()?.total ?? NaN }),
   },
@@ -116,7 +177,14 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
     fields: ["current_motor", "current_input"],
     readings: [
       { name: "current_motor", label: "motor", unit: "A", digits: 2, line: 0, from: first },
-      { name: "current_input", label: "battery", unit: "A", digits: 2, line: 1, from: ([, input = NaN]) => input },
+      {
+        name: "current_input",
+        label: "battery",
+        unit: "A",
+        digits: 2,
+        line: 1,
+        from: ([, input = NaN]) => input,
+      },
     ],
     chart: { lines: [{ colour: "--motor" }, { colour: "--battery", dash: [5, 3] }], span: 4, zero: true },
     as: asSent,
@@ -139,7 +207,8 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
     span: [1, 10],
     zero: true,
     speed: true,
-    axes: (fields) => (fields.has("speed") && fields.has("current_motor") ? ["speed", "current_motor"] : undefined),
+    axes: (fields) =>
+      fields.has("speed") && fields.has("current_motor") ? ["speed", "current_motor"] : undefined,
   },
   {
     kind: "xy",
@@ -150,7 +219,9 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
     span: [10, 10],
     equal: true,
     axes: (fields) => {
-      const at = ["linear_acceleration.", "imu.linear_acceleration."].find((path) => fields.has(`${path}x`) && fields.has(`${path}y`));
+      const at = ["linear_acceleration.", "imu.linear_acceleration."].find(
+        (path) => fields.has(`${path}x`) && fields.has(`${path}y`),
+      );
       return at === undefined ? undefined : [`${at}y`, `${at}x`];
     },
   },

@@ -4,29 +4,75 @@ import { MAX_LEASE_MS, type SendAnswer } from "../base/contract";
 import { el } from "../base/dom";
 import { age } from "../base/format";
 import { keep, kept } from "../base/kept";
-import { act, AnswerError } from "../server/answers";
+import { AnswerError, act } from "../server/answers";
 
 type Message = Readonly<Record<string, unknown>>;
 
 /** The ROS messages that drive a car, and the unit of their second number. Any other message is typed as JSON. */
-const MESSAGES: Readonly<Record<string, { readonly turn: string; readonly unit: string; readonly of: (speed: number, turn: number) => Message }>> = {
-  AckermannDriveStamped: { turn: "Steering", unit: "rad", of: (speed, turn) => ({ drive: { speed, steering_angle: turn } }) },
+const MESSAGES: Readonly<
+  Record<
+    string,
+    { readonly turn: string; readonly unit: string; readonly of: (speed: number, turn: number) => Message }
+  >
+> = {
+  AckermannDriveStamped: {
+    turn: "Steering",
+    unit: "rad",
+    of: (speed, turn) => ({ drive: { speed, steering_angle: turn } }),
+  },
   AckermannDrive: { turn: "Steering", unit: "rad", of: (speed, turn) => ({ speed, steering_angle: turn }) },
-  Twist: { turn: "Turn", unit: "rad/s", of: (speed, turn) => ({ linear: { x: speed }, angular: { z: turn } }) },
+  Twist: {
+    turn: "Turn",
+    unit: "rad/s",
+    of: (speed, turn) => ({ linear: { x: speed }, angular: { z: turn } }),
+  },
 };
 const FIRST = "AckermannDriveStamped";
 const LEASE_MS = 500;
 
 export class Commands {
   readonly node: HTMLElement;
-  private readonly command = el("input", { name: "command", value: kept("car.command") ?? "drive", required: "", pattern: "[A-Za-z0-9_\\-]{1,64}", autocomplete: "off" });
-  private readonly type = el("select", { name: "type" }, ...[...Object.keys(MESSAGES), "JSON"].map((value) => el("option", { value }, value)));
-  private readonly speed = el("input", { type: "number", name: "speed", value: "0.5", step: "0.1", required: "" });
-  private readonly turn = el("input", { type: "number", name: "turn", value: "0", step: "0.05", required: "" });
+  private readonly command = el("input", {
+    name: "command",
+    value: kept("car.command") ?? "drive",
+    required: "",
+    pattern: "[A-Za-z0-9_\\-]{1,64}",
+    autocomplete: "off",
+  });
+  private readonly type = el(
+    "select",
+    { name: "type" },
+    ...[...Object.keys(MESSAGES), "JSON"].map((value) => el("option", { value }, value)),
+  );
+  private readonly speed = el("input", {
+    type: "number",
+    name: "speed",
+    value: "0.5",
+    step: "0.1",
+    required: "",
+  });
+  private readonly turn = el("input", {
+    type: "number",
+    name: "turn",
+    value: "0",
+    step: "0.05",
+    required: "",
+  });
   private readonly turnLabel = el("span");
   private readonly turnUnit = el("span", { class: "unit" });
-  private readonly lease = el("input", { type: "number", name: "lease", value: String(LEASE_MS), min: "1", max: String(MAX_LEASE_MS), step: "1" });
-  private readonly json = el("textarea", { name: "message", rows: "3", spellcheck: "false", "aria-label": "ROS message as JSON" }, "{}");
+  private readonly lease = el("input", {
+    type: "number",
+    name: "lease",
+    value: String(LEASE_MS),
+    min: "1",
+    max: String(MAX_LEASE_MS),
+    step: "1",
+  });
+  private readonly json = el(
+    "textarea",
+    { name: "message", rows: "3", spellcheck: "false", "aria-label": "ROS message as JSON" },
+    "{}",
+  );
   private readonly drive: HTMLElement;
   private readonly stop = el("button", { type: "button", class: "tool stop" }, "Stop");
   private readonly said = el("p", { class: "note said", role: "status" });
@@ -36,24 +82,57 @@ export class Commands {
   constructor() {
     const known = kept("car.message") ?? FIRST;
     this.type.value = Object.hasOwn(MESSAGES, known) || known === "JSON" ? known : FIRST;
-    this.drive = el("div", { class: "pair" }, el("label", {}, "Speed", this.speed, el("span", { class: "unit" }, "m/s")), el("label", {}, this.turnLabel, this.turn, this.turnUnit));
+    this.drive = el(
+      "div",
+      { class: "pair" },
+      el("label", {}, "Speed", this.speed, el("span", { class: "unit" }, "m/s")),
+      el("label", {}, this.turnLabel, this.turn, this.turnUnit),
+    );
     const form = el(
       "form",
       { class: "control" },
-      el("div", { class: "pair" }, el("label", {}, "Command", this.command), el("label", {}, "Message", this.type)),
+      el(
+        "div",
+        { class: "pair" },
+        el("label", {}, "Command", this.command),
+        el("label", {}, "Message", this.type),
+      ),
       this.drive,
       this.json,
-      el("div", { class: "pair" }, el("label", { title: "How long the car may move, from now" }, "For", this.lease, el("span", { class: "unit" }, "ms"))),
-      el("div", { class: "pair" }, el("button", { type: "submit", class: "tool primary" }, "Send"), this.stop),
+      el(
+        "div",
+        { class: "pair" },
+        el(
+          "label",
+          { title: "How long the car may move, from now" },
+          "For",
+          this.lease,
+          el("span", { class: "unit" }, "ms"),
+        ),
+      ),
+      el(
+        "div",
+        { class: "pair" },
+        el("button", { type: "submit", class: "tool primary" }, "Send"),
+        this.stop,
+      ),
       this.said,
     );
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.submit();
     });
-    this.stop.addEventListener("click", () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS)));
+    this.stop.addEventListener(
+      "click",
+      () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS)),
+    );
     this.type.addEventListener("input", () => this.shape());
-    this.node = el("details", { class: "panel control-panel" }, el("summary", {}, el("h3", {}, "Commands")), form);
+    this.node = el(
+      "details",
+      { class: "panel control-panel" },
+      el("summary", {}, el("h3", {}, "Commands")),
+      form,
+    );
     this.shape();
   }
 
@@ -76,7 +155,9 @@ export class Commands {
   private submit(): void {
     const known = MESSAGES[this.type.value];
     try {
-      const message = known ? known.of(this.speed.valueAsNumber, this.turn.valueAsNumber) : (JSON.parse(this.json.value) as Message);
+      const message = known
+        ? known.of(this.speed.valueAsNumber, this.turn.valueAsNumber)
+        : (JSON.parse(this.json.value) as Message);
       void this.send(message, this.lease.value);
     } catch (error) {
       this.say("bad", `The message must be JSON: ${error instanceof Error ? error.message : String(error)}`);
@@ -91,11 +172,20 @@ export class Commands {
     this.say("", `Waiting for ${robot} …`);
     let told: readonly [string, string];
     try {
-      const { accepted, reason, after_ms } = await act<SendAnswer>("send", { robot, command, message: JSON.stringify(message), lease_ms });
+      const { accepted, reason, after_ms } = await act<SendAnswer>("send", {
+        robot,
+        command,
+        message: JSON.stringify(message),
+        lease_ms,
+      });
       if (accepted) told = ["good", `${command} accepted after ${age(after_ms / 1000)}`];
       else if (accepted === false) told = ["bad", `${command} rejected: ${reason.replaceAll("_", " ")}`];
       else if (reason) told = ["bad", reason];
-      else told = ["bad", `No answer within ${age(after_ms / 1000)}. Does its agent run, and has its car.yaml downlink.cmd.${command}?`];
+      else
+        told = [
+          "bad",
+          `No answer within ${age(after_ms / 1000)}. Does its agent run, and has its car.yaml downlink.cmd.${command}?`,
+        ];
     } catch (error) {
       if (!(error instanceof AnswerError)) throw error;
       told = ["bad", error.message];
@@ -105,7 +195,7 @@ export class Commands {
   }
 
   private say(kind: string, text: string): void {
-    this.said.dataset["kind"] = kind;
+    this.said.dataset.kind = kind;
     this.said.textContent = text;
   }
 }

@@ -1,8 +1,8 @@
 // The faults since this page was opened, the newest first.
 
 import { el, setAttribute, Text } from "../base/dom";
-import type { Fault, Robot } from "../live/robot";
 import { age, clockTime, zone } from "../base/format";
+import type { Fault, Robot } from "../live/robot";
 
 const SHOWN = 6;
 
@@ -22,7 +22,13 @@ export class FaultLog {
       const cells = ["fault-at", "fault-name", "fault-for"].map((name) => new Text(name, "td"));
       return { node: el("tr", {}, ...cells.map(({ node }) => node)), cells };
     });
-    const head = el("tr", {}, ...[`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"].map((name) => el("th", { scope: "col" }, name)));
+    const head = el(
+      "tr",
+      {},
+      ...[`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"].map((name) =>
+        el("th", { scope: "col" }, name),
+      ),
+    );
     this.node = el(
       "section",
       { class: "panel faults", "aria-label": "Fault log" },
@@ -34,7 +40,13 @@ export class FaultLog {
   refresh(robot: Robot): void {
     const newest = robot.faults.slice(-SHOWN).reverse();
     const count = robot.faults.length;
-    this.note.set(count === 0 ? "none since this page was opened" : count > SHOWN ? `the newest ${SHOWN} of ${count}` : "since this page was opened");
+    this.note.set(
+      count === 0
+        ? "none since this page was opened"
+        : count > SHOWN
+          ? `the newest ${SHOWN} of ${count}`
+          : "since this page was opened",
+    );
     this.rows.forEach(({ node, cells }, i) => {
       const fault: Fault | undefined = newest[i];
       setAttribute(node, "data-state", fault ? (fault.over ? "over" : "on") : "none");

@@ -1,14 +1,14 @@
 // A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds. A field
 // of bytes has its newest thumbnail.
 
-import { claimed, partsOf } from "../live/attachments";
+import { type FieldTable, STALE_S } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
-import { STALE_S, type FieldTable } from "../base/contract";
+import { age, type Spec, spec, write } from "../base/format";
+import { Sparkline } from "../charts/sparkline";
+import { claimed, partsOf } from "../live/attachments";
 import { numeric, type Stream } from "../live/stream";
-import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "../widgets/thumbnail";
 import { fieldKey } from "./board_panels";
-import { Sparkline } from "../charts/sparkline";
 
 class Tile {
   readonly node: HTMLElement;
@@ -31,7 +31,11 @@ class Tile {
     ];
     const title = meaning ? `${field}: ${meaning}` : field;
     this.node = choose
-      ? el("button", { type: "button", class: "tile", title: `${title}. Press to chart it.`, "aria-pressed": "false" }, ...parts)
+      ? el(
+          "button",
+          { type: "button", class: "tile", title: `${title}. Press to chart it.`, "aria-pressed": "false" },
+          ...parts,
+        )
       : el("div", { class: "tile", title }, ...parts);
     if (choose) this.node.addEventListener("click", choose);
   }
@@ -44,7 +48,11 @@ class Tile {
 
   set(value: Parameters<typeof write>[0]): void {
     this.value.set(write(value, this.spec));
-    setAttribute(this.node, "data-text", String(typeof value === "string" || (this.spec.texts !== undefined && value !== 0)));
+    setAttribute(
+      this.node,
+      "data-text",
+      String(typeof value === "string" || (this.spec.texts !== undefined && value !== 0)),
+    );
   }
 
   mark(charted: boolean): void {
@@ -100,12 +108,15 @@ export class StreamSection {
     const old = now - stream.takenAt;
     setAttribute(this.node, "data-stale", String(old > STALE_S + stream.silent_s));
     const rate = `${stream.rate(now).toFixed(1)} Hz`;
-    this.facts.set(`${old > STALE_S ? `${age(old)} old` : rate} · message ${stream.seq} of run ${stream.boot.slice(0, 8)}`);
+    this.facts.set(
+      `${old > STALE_S ? `${age(old)} old` : rate} · message ${stream.seq} of run ${stream.boot.slice(0, 8)}`,
+    );
     for (const [field, tile] of this.tiles) {
       tile.draw(stream, now);
       tile.mark(charted.has(fieldKey(stream.name, field)));
     }
-    for (const [field, picture] of this.pictures) picture.old(now - (stream.claims.get(field)?.takenAt ?? NaN));
+    for (const [field, picture] of this.pictures)
+      picture.old(now - (stream.claims.get(field)?.takenAt ?? NaN));
   }
 
   /** Make a tile for every field of this stream, those of the contract first, in its order. */
@@ -118,11 +129,20 @@ export class StreamSection {
       this.list.prepend(picture.node);
     }
     const claims = new Set(ofBytes.flatMap(partsOf));
-    const fresh = [...this.stream.sample.keys()].filter((field) => !this.tiles.has(field) && !this.except.has(field) && !claims.has(field));
+    const fresh = [...this.stream.sample.keys()].filter(
+      (field) => !this.tiles.has(field) && !this.except.has(field) && !claims.has(field),
+    );
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));
-      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2, this.stream.name), charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined));
+      this.tiles.set(
+        field,
+        new Tile(
+          field,
+          spec(field, this.table, this.ros2, this.stream.name),
+          charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined,
+        ),
+      );
     }
     const known = Object.keys(this.table.fields);
     const place = (field: string): number => (known.includes(field) ? known.indexOf(field) : known.length);

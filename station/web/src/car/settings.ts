@@ -3,7 +3,7 @@
 import type { SettingEntry, SettingsAnswer } from "../base/contract";
 import { el } from "../base/dom";
 import type { Robot } from "../live/robot";
-import { act, AnswerError } from "../server/answers";
+import { AnswerError, act } from "../server/answers";
 
 type Input = HTMLInputElement | HTMLSelectElement;
 
@@ -15,7 +15,13 @@ export class Settings {
   private robot: Robot | undefined;
 
   constructor() {
-    this.node = el("details", { class: "panel control-panel" }, el("summary", {}, el("h3", {}, "Settings")), this.rows, this.said);
+    this.node = el(
+      "details",
+      { class: "panel control-panel" },
+      el("summary", {}, el("h3", {}, "Settings")),
+      this.rows,
+      this.said,
+    );
     this.node.addEventListener("toggle", () => void this.load());
   }
 
@@ -51,11 +57,33 @@ export class Settings {
 
   private draw({ settings, online }: SettingsAnswer): void {
     const known = new Set(settings.map(({ name }) => name));
-    const free = [...(this.robot?.streams.keys() ?? [])].map((stream) => `fields.${stream}`).filter((name) => !known.has(name));
-    const fields = free.map((name): SettingEntry => ({ name, kind: "fields", low: 0, high: 0, unit: "", names: [], value: "", desired: false, pending: null, reason: "" }));
+    const free = [...(this.robot?.streams.keys() ?? [])]
+      .map((stream) => `fields.${stream}`)
+      .filter((name) => !known.has(name));
+    const fields = free.map(
+      (name): SettingEntry => ({
+        name,
+        kind: "fields",
+        low: 0,
+        high: 0,
+        unit: "",
+        names: [],
+        value: "",
+        desired: false,
+        pending: null,
+        reason: "",
+      }),
+    );
     this.rows.replaceChildren(...[...settings, ...fields].map((entry) => this.row(entry)));
     const waits = settings.some(({ pending }) => pending !== null);
-    this.say("", waits ? (online ? "The agent has not answered yet." : "The car is offline. It applies what is pending when it is back.") : "");
+    this.say(
+      "",
+      waits
+        ? online
+          ? "The agent has not answered yet."
+          : "The car is offline. It applies what is pending when it is back."
+        : "",
+    );
   }
 
   private row(entry: SettingEntry): HTMLElement {
@@ -63,11 +91,39 @@ export class Settings {
     const input = inputOf(entry);
     input.setAttribute("name", name);
     input.value = pending ?? value;
-    const set = el("button", { type: "submit", class: "tool", "aria-label": `Set ${name}`, hidden: "" }, "Set");
-    const undo = el("button", { type: "button", class: "tool", title: "Return to the value of car.yaml", "aria-label": `Reset ${name}` }, "Reset");
+    const set = el(
+      "button",
+      { type: "submit", class: "tool", "aria-label": `Set ${name}`, hidden: "" },
+      "Set",
+    );
+    const undo = el(
+      "button",
+      {
+        type: "button",
+        class: "tool",
+        title: "Return to the value of car.yaml",
+        "aria-label": `Reset ${name}`,
+      },
+      "Reset",
+    );
     undo.hidden = !desired;
-    const note = reason ? el("p", { class: "said", "data-kind": "bad" }, `rejected: ${reason}`) : pending === null ? "" : el("p", { class: "said" }, `${pending === "" ? "all fields are pending" : "pending"}; in force is ${value || "car.yaml's"}`);
-    const row = el("form", { class: "setting" }, el("label", {}, name, input, ...(unit ? [el("span", { class: "unit" }, unit)] : [])), set, undo, note);
+    const note = reason
+      ? el("p", { class: "said", "data-kind": "bad" }, `rejected: ${reason}`)
+      : pending === null
+        ? ""
+        : el(
+            "p",
+            { class: "said" },
+            `${pending === "" ? "all fields are pending" : "pending"}; in force is ${value || "car.yaml's"}`,
+          );
+    const row = el(
+      "form",
+      { class: "setting" },
+      el("label", {}, name, input, ...(unit ? [el("span", { class: "unit" }, unit)] : [])),
+      set,
+      undo,
+      note,
+    );
     input.addEventListener("input", () => (set.hidden = input.value === (pending ?? value)));
     row.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -78,15 +134,21 @@ export class Settings {
   }
 
   private say(kind: string, text: string): void {
-    this.said.dataset["kind"] = kind;
+    this.said.dataset.kind = kind;
     this.said.textContent = text;
   }
 }
 
 /** An input that takes only what the agent accepts. */
 function inputOf({ kind, low, high, names, value }: SettingEntry): Input {
-  if (kind === "number") return el("input", { type: "number", min: String(low), max: String(high), step: "any", required: "" });
-  if (kind === "fields") return el("input", { type: "text", placeholder: "all fields", spellcheck: "false", autocomplete: "off" });
+  if (kind === "number")
+    return el("input", { type: "number", min: String(low), max: String(high), step: "any", required: "" });
+  if (kind === "fields")
+    return el("input", { type: "text", placeholder: "all fields", spellcheck: "false", autocomplete: "off" });
   const choices = kind === "flag" ? ["true", "false"] : names;
-  return el("select", {}, ...[...(value === "" ? [""] : []), ...choices].map((each) => el("option", { value: each }, each)));
+  return el(
+    "select",
+    {},
+    ...[...(value === "" ? [""] : []), ...choices].map((each) => el("option", { value: each }, each)),
+  );
 }

@@ -20,7 +20,7 @@ export const TIME_STEPS_S = [
   ...[1, 2, 5, 10, 15, 28, 56, 84, 168, 365, 730, 1825, 3650].map((days) => days * DAY_S),
 ];
 
-export const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
+export const calm = (): boolean => window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 export function paint(): Paint {
   return { text: colour("--muted"), grid: colour("--grid") };
@@ -60,7 +60,8 @@ export function fit(host: HTMLElement, plot: uPlot, changed: (visible: boolean) 
 export function labels(splits: readonly number[]): string[] {
   const step = splits.length > 1 ? Math.abs(splits[1]! - splits[0]!) : 1;
   // As many as the step needs: 2.5 has one, 0.25 two.
-  const digits = [0, 1, 2].find((places) => Math.abs(step * 10 ** places - Math.round(step * 10 ** places)) < 1e-6) ?? 3;
+  const digits =
+    [0, 1, 2].find((places) => Math.abs(step * 10 ** places - Math.round(step * 10 ** places)) < 1e-6) ?? 3;
   return splits.map((value) => {
     if (Math.abs(value) >= 10_000) return `${signed(value / 1000, Math.abs(step) % 1000 ? 1 : 0)}k`;
     return signed(value, Math.abs(value / step - Math.round(value / step)) > 0.01 ? digits + 1 : digits);
@@ -86,7 +87,10 @@ export function roundRange(least: number, most: number, span: number, zero: bool
   else if (missing > 0) [least, most] = [least - missing / 2, most + missing / 2];
   // A line at the edge of a chart looks cut off. Zero is an edge that few values cross.
   const room = (most - least) * ROOM;
-  [least, most] = [least < 0 ? least - room : Math.max(0, least - room), most > 0 ? most + room : Math.min(0, most + room)];
+  [least, most] = [
+    least < 0 ? least - room : Math.max(0, least - room),
+    most > 0 ? most + room : Math.min(0, most + room),
+  ];
   const step = roundStep((most - least) / 8);
   return [Math.floor(least / step + 1e-9) * step, Math.ceil(most / step - 1e-9) * step];
 }
@@ -97,7 +101,13 @@ export function faint(rgb: string, share = 0.09): string {
 
 /** The gaps of a line: missing values, and times without samples. */
 export function holes(hole_s: () => number) {
-  return (plot: uPlot, series: number, first: number, last: number, gaps: uPlot.Series.Gaps): uPlot.Series.Gaps => {
+  return (
+    plot: uPlot,
+    series: number,
+    first: number,
+    last: number,
+    gaps: uPlot.Series.Gaps,
+  ): uPlot.Series.Gaps => {
     const times = plot.data[0];
     const values = plot.data[series]!;
     let shown = -1;

@@ -1,8 +1,8 @@
 // A heading with readings above a live chart. While the pointer is on the chart, the readings are of its time.
 
-import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
 import { el, setAttribute, Text } from "../base/dom";
-import { age, AS_SENT, linear, number, type Linear } from "../base/format";
+import { AS_SENT, age, type Linear, linear, number } from "../base/format";
+import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
 
 /** A value in a panel's heading, computed from the values of the panel's lines. */
 export interface Reading {
@@ -31,9 +31,7 @@ export class ChartPanel {
   private as: Linear = AS_SENT;
   private digits: number | undefined;
 
-  constructor(
-    private readonly options: ChartPanelOptions,
-  ) {
+  constructor(private readonly options: ChartPanelOptions) {
     const { title, readings, chart } = options;
     this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
     this.units = readings.map(({ unit }) => {
@@ -64,7 +62,8 @@ export class ChartPanel {
       about: {
         title,
         lines: chart.lines.map((_, i) => readings.find(({ line }) => line === i)?.label ?? ""),
-        write: (value) => `${number(value, this.digits ?? readings[0]?.digits)} ${this.units[0]?.node.textContent ?? ""}`,
+        write: (value) =>
+          `${number(value, this.digits ?? readings[0]?.digits)} ${this.units[0]?.node.textContent ?? ""}`,
       },
       onPoint: (point) => {
         this.hovered = point !== undefined;
@@ -108,6 +107,8 @@ export class ChartPanel {
   }
 
   private read(values: readonly number[]): void {
-    this.options.readings.forEach(({ digits, from }, i) => this.texts[i]!.set(number(from(values), this.digits ?? digits)));
+    this.options.readings.forEach(({ digits, from }, i) =>
+      this.texts[i]!.set(number(from(values), this.digits ?? digits)),
+    );
   }
 }

@@ -20,7 +20,12 @@ export class Gauge {
   private readonly unit = new Text("unit");
   private readonly low = new Text("num");
   private readonly high = new Text("num");
-  private readonly bar = el("div", { class: "bar", "aria-hidden": "true" }, el("span", { class: "band" }), el("span", { class: "needle" }));
+  private readonly bar = el(
+    "div",
+    { class: "bar", "aria-hidden": "true" },
+    el("span", { class: "band" }),
+    el("span", { class: "needle" }),
+  );
   private from = 0;
   private to = 1;
   private shown = "";
@@ -46,17 +51,25 @@ export class Gauge {
   }
 
   /** Show a value, and the minimum and maximum of the last 30 s. */
-  set(value: number, least: number, most: number, unit = this.options.unit, digits = this.options.digits): void {
+  set(
+    value: number,
+    least: number,
+    most: number,
+    unit = this.options.unit,
+    digits = this.options.digits,
+  ): void {
     // The extremes were in another unit before the car's parameters were known.
     if (unit !== this.shown) this.reset();
     this.shown = unit;
     this.value.set(number(value, digits));
     this.unit.set(unit);
     for (const each of [least, value]) if (each < this.from) this.from = roundedOut(each, Math.floor);
-    for (const each of [most, value]) if (each > this.to && each < Infinity) this.to = roundedOut(each, Math.ceil);
+    for (const each of [most, value])
+      if (each > this.to && each < Infinity) this.to = roundedOut(each, Math.ceil);
     this.low.set(number(this.from, 0));
     this.high.set(number(this.to, 0));
-    const place = (at: number): string => `${(Math.max(0, Math.min(1, (at - this.from) / (this.to - this.from))) * 100).toFixed(1)}%`;
+    const place = (at: number): string =>
+      `${(Math.max(0, Math.min(1, (at - this.from) / (this.to - this.from))) * 100).toFixed(1)}%`;
     const known = Number.isFinite(value);
     this.bar.style.setProperty("--at", known ? place(value) : "-10%");
     this.bar.style.setProperty("--low", known && least <= most ? place(least) : "0%");

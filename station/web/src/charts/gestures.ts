@@ -47,7 +47,10 @@ function fingers(over: HTMLElement, range: () => Range, move: (to: Range) => voi
     held = undefined;
     if (touching.size !== 2) return;
     const [from, to] = range();
-    const [left, right] = places().map((px) => from + ((to - from) * px) / Math.max(1, over.clientWidth)) as [number, number];
+    const [left, right] = places().map((px) => from + ((to - from) * px) / Math.max(1, over.clientWidth)) as [
+      number,
+      number,
+    ];
     held = [left, right];
   };
   over.addEventListener("pointerdown", (event) => {

@@ -1,12 +1,12 @@
 // A scrolling chart of the last seconds or minutes by uPlot, drawn only when it would change.
 
 import uPlot from "uplot";
-import { markLabels, marks, WINDOWS } from "./windows";
-import { age, AS_SENT, linear, type Linear } from "../base/format";
-import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
-import type { Ring } from "../live/ring";
+import { AS_SENT, age, type Linear, linear } from "../base/format";
 import { colour, onTheme } from "../base/theme";
-import { Spoken, type About } from "./spoken";
+import type { Ring } from "../live/ring";
+import { axis, calm, faint, fit, holes, labels, PLAIN, paint, rem, roundRange } from "./axes";
+import { type About, Spoken } from "./spoken";
+import { markLabels, marks, WINDOWS } from "./windows";
 
 export interface Line {
   /** The custom property of its colour. */
@@ -25,7 +25,9 @@ export interface LiveChartOptions {
   /** Its title, its lines' names, and a value with its unit. */
   readonly about: Pick<About, "title" | "lines" | "write">;
   /** Called with the values under the pointer and their age in seconds; undefined when it leaves. */
-  readonly onPoint?: (point: { readonly ago: number; readonly values: readonly number[] } | undefined) => void;
+  readonly onPoint?: (
+    point: { readonly ago: number; readonly values: readonly number[] } | undefined,
+  ) => void;
 }
 
 /** A history, and a column for each line; undefined if it does not exist yet. */
@@ -81,7 +83,10 @@ export class LiveChart {
           points: { size: 7, width: 0 },
           sync: { key: shared.key, setSeries: false },
         },
-        scales: { x: { time: false, auto: false }, y: { auto: true, range: (_, low, high) => this.range(low, high) } },
+        scales: {
+          x: { time: false, auto: false },
+          y: { auto: true, range: (_, low, high) => this.range(low, high) },
+        },
         axes: [
           axis(colours, 1.5, 0.3, {
             splits: (_, __, low) => marks(this.window_s).map((mark) => low + mark),
@@ -126,7 +131,10 @@ export class LiveChart {
 
   /** Set the data, undefined for none, and its scale. */
   show(shown: Shown | undefined, as: Linear): void {
-    const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns) && this.filled === shown?.history.inserted;
+    const same =
+      this.shown?.history === shown?.history &&
+      String(this.shown?.columns) === String(shown?.columns) &&
+      this.filled === shown?.history.inserted;
     if (same && this.as.scale === as.scale && this.as.shift === as.shift) return;
     [this.shown, this.as, this.filled] = [shown, as, shown?.history.inserted];
     this.dirty = true;
@@ -187,7 +195,12 @@ export class LiveChart {
     const [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
     const [toLow, toHigh] = roundRange(least, most, this.options.span, this.options.zero ?? false);
     const ease = (from: number, to: number): number =>
-      calm.matches || this.window_s > EASED_S || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.3;
+      calm() ||
+      this.window_s > EASED_S ||
+      Number.isNaN(from) ||
+      Math.abs(to - from) < (toHigh - toLow) * 0.004
+        ? to
+        : from + (to - from) * 0.3;
     this.low = ease(this.low, toLow);
     this.high = ease(this.high, toHigh);
     return [this.low, this.high];
@@ -228,5 +241,5 @@ export class LiveChart {
 
 /** The right edge: now, or the next full second for viewers who prefer less motion. */
 function edge(now: number): number {
-  return calm.matches ? Math.ceil(now) : now;
+  return calm() ? Math.ceil(now) : now;
 }

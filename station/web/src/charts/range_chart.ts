@@ -1,12 +1,12 @@
 // A chart of a range by uPlot: of a past time, with the time of day below it, or of any other quantity.
 
 import uPlot from "uplot";
-import { axis, DAY_S, faint, fit, holes, labels, paint, PLAIN, rem, roundRange, TIME_STEPS_S } from "./axes";
-import { gestures } from "./gestures";
-import type { Range } from "../base/range";
 import { dayTime, number, when } from "../base/format";
+import type { Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
-import { Spoken, type About } from "./spoken";
+import { axis, DAY_S, faint, fit, holes, labels, PLAIN, paint, rem, roundRange, TIME_STEPS_S } from "./axes";
+import { gestures } from "./gestures";
+import { type About, Spoken } from "./spoken";
 
 export interface Curve {
   readonly label: string;
@@ -81,7 +81,14 @@ export class RangeChart {
     read();
     const colours = () => this.paint;
     const rounded = (_: uPlot, low: number | null, high: number | null): [number, number] =>
-      low === null || high === null ? [0, 1] : roundRange(low, high, Math.max(Math.abs(high) * 0.02, high === 0 && low === 0 ? 1 : 1e-6), options.zero ?? false);
+      low === null || high === null
+        ? [0, 1]
+        : roundRange(
+            low,
+            high,
+            Math.max(Math.abs(high) * 0.02, high === 0 && low === 0 ? 1 : 1e-6),
+            options.zero ?? false,
+          );
     const right = options.curves.some((curve) => curve.right);
     const series: uPlot.Series[] = options.curves.map((curve, i) => ({
       scale: curve.right ? "right" : "y",
@@ -106,11 +113,32 @@ export class RangeChart {
           points: { size: 7, width: 0 },
           ...(options.sync ? { sync: { key: options.sync, setSeries: false } } : {}),
         },
-        scales: { x: { time: options.unit === undefined, auto: false, range: () => [...this.range] }, y: { range: rounded }, right: { range: rounded } },
+        scales: {
+          x: { time: options.unit === undefined, auto: false, range: () => [...this.range] },
+          y: { range: rounded },
+          right: { range: rounded },
+        },
         axes: [
-          axis(colours, 1.5, 0.3, { space: rem(4.6), ...(options.unit === undefined ? { incrs: TIME_STEPS_S } : {}), values: (_, splits) => (options.unit === undefined ? timeLabels(splits) : labels(splits).map((text) => `${text} ${options.unit}`)) }),
+          axis(colours, 1.5, 0.3, {
+            space: rem(4.6),
+            ...(options.unit === undefined ? { incrs: TIME_STEPS_S } : {}),
+            values: (_, splits) =>
+              options.unit === undefined
+                ? timeLabels(splits)
+                : labels(splits).map((text) => `${text} ${options.unit}`),
+          }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
-          ...(right ? [axis(colours, 3.1, 0.4, { side: 1, scale: "right", space: rem(2.2), grid: { show: false }, values: (_, splits) => labels(splits) })] : []),
+          ...(right
+            ? [
+                axis(colours, 3.1, 0.4, {
+                  side: 1,
+                  scale: "right",
+                  space: rem(2.2),
+                  grid: { show: false },
+                  values: (_, splits) => labels(splits),
+                }),
+              ]
+            : []),
         ],
         series: [{}, ...series, ...(options.band ? [edge, edge] : [])],
         ...(options.band ? { bands: [{ series: [3, 2], fill: () => faint(this.palette[0]!, 0.22) }] } : {}),
@@ -127,7 +155,10 @@ export class RangeChart {
     this.spoken = new Spoken(host, this.plot, {
       ...options.about,
       lines: options.curves.map(({ label }) => label),
-      range: () => (unit === undefined ? `${dayTime(this.range[0])} to ${when(this.range[1])}` : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`),
+      range: () =>
+        unit === undefined
+          ? `${dayTime(this.range[0])} to ${when(this.range[1])}`
+          : `${number(this.range[0], 2)} to ${number(this.range[1], 2)} ${unit}`,
       at: (x) => (unit === undefined ? dayTime(x, { fractionalSecondDigits: 1 }) : `${number(x, 2)} ${unit}`),
       timeless: unit !== undefined,
       band: options.band ?? false,
@@ -228,13 +259,23 @@ function timeLabels(splits: readonly number[]): string[] {
   const day = { day: "numeric", month: "short" } as const;
   const time = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" } as const;
   const options: Intl.DateTimeFormatOptions =
-    step >= 300 * DAY_S ? { year: "numeric" }
-    : step >= 27 * DAY_S ? { month: "short", year: "numeric" }
-    : step >= DAY_S * 0.9 ? day
-    : step >= DAY_S / 8 ? { ...day, ...time }
-    : step >= 60 ? time
-    : step >= 1 ? { ...time, second: "2-digit" }
-    : { minute: "2-digit", second: "2-digit", fractionalSecondDigits: step >= 0.1 ? 1 : step >= 0.01 ? 2 : 3 };
+    step >= 300 * DAY_S
+      ? { year: "numeric" }
+      : step >= 27 * DAY_S
+        ? { month: "short", year: "numeric" }
+        : step >= DAY_S * 0.9
+          ? day
+          : step >= DAY_S / 8
+            ? { ...day, ...time }
+            : step >= 60
+              ? time
+              : step >= 1
+                ? { ...time, second: "2-digit" }
+                : {
+                    minute: "2-digit",
+                    second: "2-digit",
+                    fractionalSecondDigits: step >= 0.1 ? 1 : step >= 0.01 ? 2 : 3,
+                  };
   const format = new Intl.DateTimeFormat("en-GB", options);
   return splits.map((at) => format.format(at * 1000));
 }

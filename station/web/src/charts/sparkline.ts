@@ -1,8 +1,8 @@
 // A small line of the last 30 seconds, without axes.
 
+import { colour, onTheme } from "../base/theme";
 import { WINDOW_S } from "../live/bounds";
 import type { Ring } from "../live/ring";
-import { colour, onTheme } from "../base/theme";
 
 const HOLE_S = 2.5;
 const seen = new WeakSet<Element>();

@@ -63,9 +63,15 @@ export class Spoken {
     const figures = this.lines().map((name, i) => {
       const { newest } = within(i + 1);
       const [least, most] = [within(band ? 2 : i + 1).least, within(band ? 3 : i + 1).most];
-      return Number.isNaN(newest) ? "" : `${name ? `${name}: ` : ""}${timeless ? "last" : "newest"} ${write(newest)}, minimum ${write(least)}, maximum ${write(most)}`;
+      return Number.isNaN(newest)
+        ? ""
+        : `${name ? `${name}: ` : ""}${timeless ? "last" : "newest"} ${write(newest)}, minimum ${write(least)}, maximum ${write(most)}`;
     });
-    setAttribute(this.host, "aria-label", `Chart ${title}, ${range()}. ${figures.filter(Boolean).join("; ") || "No values"}.`);
+    setAttribute(
+      this.host,
+      "aria-label",
+      `Chart ${title}, ${range()}. ${figures.filter(Boolean).join("; ") || "No values"}.`,
+    );
   }
 
   private lines(): readonly string[] {
@@ -75,7 +81,7 @@ export class Spoken {
   /** The first and the last index on the screen; none is -1 and before the first. */
   private visible(): readonly [number, number] {
     const { data, scales } = this.plot;
-    const { min, max } = scales["x"] ?? {};
+    const { min, max } = scales.x ?? {};
     const times = Array.from(data[0]);
     const last = times.findLastIndex((x) => x <= (max ?? Infinity));
     return [times.findIndex((x) => x >= (min ?? -Infinity)), last];
@@ -122,7 +128,11 @@ interface Extremes {
   readonly most: number;
 }
 
-export function extremes(column: ArrayLike<number | null | undefined>, from = 0, to = column.length): Extremes {
+export function extremes(
+  column: ArrayLike<number | null | undefined>,
+  from = 0,
+  to = column.length,
+): Extremes {
   let [newest, least, most] = [NaN, Infinity, -Infinity];
   for (let i = Math.max(0, from); i < to; i += 1) {
     const value = column[i];

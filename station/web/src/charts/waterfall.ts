@@ -2,9 +2,9 @@
 
 import type { Config } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
-import { MEDIAN_S } from "../live/bounds";
-import { LEGS, type Delay, type Leg, type Robot } from "../live/robot";
 import { milliseconds, NOTHING } from "../base/format";
+import { MEDIAN_S } from "../live/bounds";
+import { type Delay, LEGS, type Leg, type Robot } from "../live/robot";
 
 const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
   car: ["Car", "from the sample to its leaving the car"],
@@ -14,7 +14,10 @@ const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
   toPage: ["Page hears it", "from PubNub to this page"],
   screen: ["Page shows it", "from its arrival to the next picture"],
 };
-const SHOWN: Readonly<Record<Config["live"], readonly (Leg | "screen")[]>> = { pubnub: [...LEGS, "screen"], iot: ["car", "toPage", "screen"] };
+const SHOWN: Readonly<Record<Config["live"], readonly (Leg | "screen")[]>> = {
+  pubnub: [...LEGS, "screen"],
+  iot: ["car", "toPage", "screen"],
+};
 const STRAIGHT = ["Network and broker", "from the car over AWS IoT to this page"] as const;
 // A smaller clock offset is normal for clocks that are not measured.
 const CLOCKS_MS = 5;
@@ -47,7 +50,20 @@ export class Waterfall {
         "header",
         {},
         el("h3", {}, "Delay by hop"),
-        el("p", { class: "reading" }, el("span", { class: "label", title: "from leaving the car to arriving at the page, which then has to draw it" }, `median of ${MEDIAN_S} s, car to page`), this.median.node, el("span", { class: "unit" }, "ms")),
+        el(
+          "p",
+          { class: "reading" },
+          el(
+            "span",
+            {
+              class: "label",
+              title: "from leaving the car to arriving at the page, which then has to draw it",
+            },
+            `median of ${MEDIAN_S} s, car to page`,
+          ),
+          this.median.node,
+          el("span", { class: "unit" }, "ms"),
+        ),
       ),
       list,
       this.warning.node,
@@ -70,8 +86,12 @@ export class Waterfall {
       before += part;
     });
     const known = [...robot.streams.values()].some(({ hops }) => hops.offset_known);
-    const clocks = known ? "The car's clock is corrected by the offset that it measured." : "The car has not measured its clock's offset: its clock is taken as it is.";
-    const told = backwards(delay) ? "A hop takes less than no time: the clocks of car, cloud and this device disagree." : clocks;
+    const clocks = known
+      ? "The car's clock is corrected by the offset that it measured."
+      : "The car has not measured its clock's offset: its clock is taken as it is.";
+    const told = backwards(delay)
+      ? "A hop takes less than no time: the clocks of car, cloud and this device disagree."
+      : clocks;
     this.warning.set(`Medians of ${MEDIAN_S} s, so they are not the newest message's. ${told}`);
     setAttribute(this.warning.node, "data-bad", String(backwards(delay)));
   }

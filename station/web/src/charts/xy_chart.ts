@@ -1,10 +1,10 @@
 // One quantity over another: the newest point and its track, which fades.
 
 import uPlot from "uplot";
-import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { setAttribute } from "../base/dom";
 import { number } from "../base/format";
 import { colour, onTheme } from "../base/theme";
+import { axis, faint, fit, labels, PLAIN, paint, rem, roundRange } from "./axes";
 import { AGAIN_MS, extremes } from "./spoken";
 
 export interface XYChartOptions {
@@ -52,7 +52,10 @@ export class XYChart {
     this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
     this.ink = colour("--accent");
     const colours = () => this.paint;
-    const named = (label: string | (() => string), font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`): uPlot.Axis => ({
+    const named = (
+      label: string | (() => string),
+      font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`,
+    ): uPlot.Axis => ({
       label,
       labelFont: font,
       labelSize: rem(1.1),
@@ -70,8 +73,16 @@ export class XYChart {
           y: { auto: false, range: () => this.bounds.y },
         },
         axes: [
-          axis(colours, 1.4, 0.3, { ...named(options.x), values: (_, splits) => labels(splits), space: rem(3) }),
-          axis(colours, 2.9, 0.4, { ...named(options.y), values: (_, splits) => labels(splits), space: rem(2) }),
+          axis(colours, 1.4, 0.3, {
+            ...named(options.x),
+            values: (_, splits) => labels(splits),
+            space: rem(3),
+          }),
+          axis(colours, 2.9, 0.4, {
+            ...named(options.y),
+            values: (_, splits) => labels(splits),
+            space: rem(2),
+          }),
         ],
         series: [{}, { show: true, paths: () => null, points: { show: false } }],
         hooks: { draw: [(plot) => this.drawTrack(plot)] },
@@ -115,10 +126,15 @@ export class XYChart {
   private write(): void {
     this.writtenAt = performance.now();
     const { title, x, y } = this.options;
-    const axes = [[typeof x === "string" ? x : x(), this.track.x], [y, this.track.y]] as const;
+    const axes = [
+      [typeof x === "string" ? x : x(), this.track.x],
+      [y, this.track.y],
+    ] as const;
     const figures = axes.map(([name, values]) => {
       const { newest, least, most } = extremes(values);
-      return Number.isNaN(newest) ? `${name}: no values` : `${name}: newest ${number(newest, 2)}, minimum ${number(least, 2)}, maximum ${number(most, 2)}`;
+      return Number.isNaN(newest)
+        ? `${name}: no values`
+        : `${name}: newest ${number(newest, 2)}, minimum ${number(least, 2)}, maximum ${number(most, 2)}`;
     });
     setAttribute(this.host, "aria-label", `Chart ${title}. ${figures.join("; ")}.`);
   }
@@ -133,7 +149,8 @@ export class XYChart {
     }
     if (equal) {
       const { width, height } = this.plot.bbox;
-      const scale = Math.max((x[1] - x[0]) / width, (y[1] - y[0]) / height, span[0] / width, span[1] / height) * 1.08;
+      const scale =
+        Math.max((x[1] - x[0]) / width, (y[1] - y[0]) / height, span[0] / width, span[1] / height) * 1.08;
       const around = ([low, high]: [number, number], size: number): [number, number] => {
         const middle = (low + high) / 2;
         return [middle - (size * scale) / 2, middle + (size * scale) / 2];
@@ -204,7 +221,13 @@ export class XYChart {
     const last = x.length - 1;
     if (last >= 0 && !Number.isNaN(x[last]! + y[last]!)) {
       ctx.beginPath();
-      ctx.arc(plot.valToPos(x[last]!, "x", true), plot.valToPos(y[last]!, "y", true), 4.5 * uPlot.pxRatio, 0, 2 * Math.PI);
+      ctx.arc(
+        plot.valToPos(x[last]!, "x", true),
+        plot.valToPos(y[last]!, "y", true),
+        4.5 * uPlot.pxRatio,
+        0,
+        2 * Math.PI,
+      );
       ctx.fillStyle = this.ink;
       ctx.fill();
     }

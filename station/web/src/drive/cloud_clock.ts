@@ -20,7 +20,11 @@ export class CloudClock {
 
   /** The car had a command, which left here at `left_ms`, at the cloud's time `taken_ms`. */
   answered(left_ms: number, taken_ms: number): void {
-    this.highs = kept(this.highs, { at_ms: left_ms, offset_ms: taken_ms - left_ms }, (one, other) => one <= other);
+    this.highs = kept(
+      this.highs,
+      { at_ms: left_ms, offset_ms: taken_ms - left_ms },
+      (one, other) => one <= other,
+    );
   }
 
   /** The cloud's time less this computer's; undefined before the first message. Without an answer it is the least
@@ -35,7 +39,11 @@ export class CloudClock {
 }
 
 /** The bounds of the last minute, the tightest first: a newer one replaces those that it betters. */
-function kept(bounds: readonly Bound[], bound: Bound, betters: (one: number, other: number) => boolean): Bound[] {
+function kept(
+  bounds: readonly Bound[],
+  bound: Bound,
+  betters: (one: number, other: number) => boolean,
+): Bound[] {
   const young = bounds.filter(({ at_ms }) => bound.at_ms - at_ms < DRIVE_CLOCK_KEPT_MS);
   return [...young.filter(({ offset_ms }) => !betters(bound.offset_ms, offset_ms)), bound];
 }

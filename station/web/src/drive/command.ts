@@ -1,6 +1,6 @@
 // The commands of one hold of the stick, as `iort_contract.messages.control.commands` writes them.
 
-import { DRIVE_LEASE_MS, DRIVE_MARGIN_MS, SCHEMA_VERSION, type DriveLimitsEntry } from "../base/contract";
+import { DRIVE_LEASE_MS, DRIVE_MARGIN_MS, type DriveLimitsEntry, SCHEMA_VERSION } from "../base/contract";
 import type { Motion } from "./stick";
 
 export interface Command {
@@ -34,7 +34,23 @@ export function driverName(...names: readonly string[]): string {
 /** How long a command holds the car at most. */
 export const leaseOf = ({ lease_ms }: DriveLimitsEntry): number => Math.min(DRIVE_LEASE_MS, lease_ms);
 
-export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sent_us, motion, takeover, ends }: { readonly seq: number; readonly sent_us: number; readonly motion: Motion; readonly takeover: boolean; readonly ends: boolean }): Command {
+export function commandOf(
+  session: Session,
+  limits: DriveLimitsEntry,
+  {
+    seq,
+    sent_us,
+    motion,
+    takeover,
+    ends,
+  }: {
+    readonly seq: number;
+    readonly sent_us: number;
+    readonly motion: Motion;
+    readonly takeover: boolean;
+    readonly ends: boolean;
+  },
+): Command {
   const lease_ms = Math.max(1, leaseOf(limits) - DRIVE_MARGIN_MS);
   return {
     v: SCHEMA_VERSION,
@@ -53,9 +69,15 @@ export function commandOf(session: Session, limits: DriveLimitsEntry, { seq, sen
 }
 
 /** The ROS message with the two fields that the stick drives. */
-function messageOf({ speed, steering }: DriveLimitsEntry, { speed_mps, steering_rad }: Motion): Record<string, unknown> {
+function messageOf(
+  { speed, steering }: DriveLimitsEntry,
+  { speed_mps, steering_rad }: Motion,
+): Record<string, unknown> {
   const message: Record<string, unknown> = {};
-  for (const [path, value] of [[speed, speed_mps], [steering, steering_rad]] as const) {
+  for (const [path, value] of [
+    [speed, speed_mps],
+    [steering, steering_rad],
+  ] as const) {
     const names = path.split(".");
     const last = names.pop()!;
     let inner = message;

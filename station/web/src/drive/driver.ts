@@ -7,12 +7,21 @@
 //
 // iort_station.fleet.control.driving does the same and draws the phases; tests/unit/station/fleet/driving.json tests both.
 
-import { DRIVE_ANSWER_MS, DRIVE_CORRECTIONS, DRIVE_ENDS, DRIVE_LEASE_MS, DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, LIVE_MAX_RATE_HZ, type DriveLimitsEntry } from "../base/contract";
+import {
+  DRIVE_ANSWER_MS,
+  DRIVE_CORRECTIONS,
+  DRIVE_ENDS,
+  DRIVE_LEASE_MS,
+  DRIVE_MAX_AGE_MS,
+  DRIVE_MAX_RTT_MS,
+  type DriveLimitsEntry,
+  LIVE_MAX_RATE_HZ,
+} from "../base/contract";
 import { CloudClock } from "./cloud_clock";
-import { commandOf, leaseOf, type Command, type Session } from "./command";
+import { type Command, commandOf, leaseOf, type Session } from "./command";
 import type { Driven, LiveMessage } from "./live_message";
-import { CENTRE, meant, type Motion, type Stick } from "./stick";
 import { inWords, lost, untimely } from "./outcomes";
+import { CENTRE, type Motion, meant, type Stick } from "./stick";
 
 export type Phase = "free" | "starting" | "driving" | "holding" | "over";
 
@@ -60,7 +69,9 @@ export class Driver {
   /** The age of the car's newest sample; undefined before the first one. */
   age_ms(now_ms: number): number | undefined {
     const cloud = this.cloud_ms(now_ms);
-    return cloud === undefined || this.taken_ms === -Infinity ? undefined : Math.max(0, cloud - this.taken_ms);
+    return cloud === undefined || this.taken_ms === -Infinity
+      ? undefined
+      : Math.max(0, cloud - this.taken_ms);
   }
 
   /** Who drives now, by the car's own word: the name, and whether it is this hold. */
@@ -126,12 +137,15 @@ export class Driver {
     this.ticked_ms = now_ms;
     if (this.phase === "starting" || this.phase === "driving") {
       // A key may have been let go meanwhile.
-      const frozen = still_ms > leaseOf(this.limits) ? `This page stood still for ${Math.round(still_ms)} ms` : "";
+      const frozen =
+        still_ms > leaseOf(this.limits) ? `This page stood still for ${Math.round(still_ms)} ms` : "";
       const against = frozen || this.against(now_ms) || this.unanswered(now_ms);
       if (against !== "") this.end(against);
     }
-    if (this.phase !== "driving" && (this.phase === "starting" || this.standing)) return this.command(STANDING, now_ms);
-    if (this.phase === "driving") return this.command(meant(this.stick, { top_mps: this.top_mps, ...this.limits }), now_ms);
+    if (this.phase !== "driving" && (this.phase === "starting" || this.standing))
+      return this.command(STANDING, now_ms);
+    if (this.phase === "driving")
+      return this.command(meant(this.stick, { top_mps: this.top_mps, ...this.limits }), now_ms);
     if (this.stops === 0) return undefined;
     this.stops -= 1;
     return this.command(STANDING, now_ms, true);
@@ -147,7 +161,8 @@ export class Driver {
   private end(reason: string, lost = false): void {
     const holds = this.phase === "starting" || this.phase === "driving";
     if (lost || !this.standing) this.finish();
-    if (holds || (lost && this.phase !== "free")) [this.phase, this.reason] = [this.held ? "over" : "free", reason];
+    if (holds || (lost && this.phase !== "free"))
+      [this.phase, this.reason] = [this.held ? "over" : "free", reason];
     this.takeover = false;
   }
 
@@ -164,13 +179,18 @@ export class Driver {
     if (this.clockless) return inWords("clock_offset_unknown");
     const age = this.age_ms(now_ms);
     if (age === undefined) return "Nothing has been heard of the car yet";
-    return age > DRIVE_MAX_AGE_MS ? `The newest sample is ${Math.round(age)} ms old, at most ${DRIVE_MAX_AGE_MS} ms is allowed` : "";
+    return age > DRIVE_MAX_AGE_MS
+      ? `The newest sample is ${Math.round(age)} ms old, at most ${DRIVE_MAX_AGE_MS} ms is allowed`
+      : "";
   }
 
   private unanswered(now_ms: number): string {
-    if (this.phase === "starting") return now_ms - this.began_ms > DRIVE_ANSWER_MS ? "The car does not answer" : "";
+    if (this.phase === "starting")
+      return now_ms - this.began_ms > DRIVE_ANSWER_MS ? "The car does not answer" : "";
     const oldest = this.waiting[0]?.left_ms ?? now_ms;
-    return now_ms - oldest > DRIVE_MAX_RTT_MS + SAMPLE_MS ? `The car has not answered for ${Math.round(now_ms - oldest)} ms` : "";
+    return now_ms - oldest > DRIVE_MAX_RTT_MS + SAMPLE_MS
+      ? `The car has not answered for ${Math.round(now_ms - oldest)} ms`
+      : "";
   }
 
   private answer(driven: Driven, message: LiveMessage, now_ms: number): void {
@@ -200,7 +220,12 @@ export class Driver {
       this.end(inWords(driven.outcome), true);
     } else if (this.phase === "holding") {
       // The next command may pass.
-    } else if (this.phase === "starting" && !this.standing && untimely.has(driven.outcome) && this.corrections < DRIVE_CORRECTIONS) {
+    } else if (
+      this.phase === "starting" &&
+      !this.standing &&
+      untimely.has(driven.outcome) &&
+      this.corrections < DRIVE_CORRECTIONS
+    ) {
       this.corrections += 1;
       const { began_ms } = this;
       this.begin(now_ms);
@@ -221,7 +246,13 @@ export class Driver {
     this.seq += 1;
     this.waiting.push({ seq, left_ms: now_ms });
     this.waiting = this.waiting.filter(({ left_ms }) => now_ms - left_ms < DRIVE_ANSWER_MS + DRIVE_LEASE_MS);
-    return commandOf(this.session, this.limits, { seq, sent_us: this.cloud_us(now_ms), motion, takeover: this.takeover, ends });
+    return commandOf(this.session, this.limits, {
+      seq,
+      sent_us: this.cloud_us(now_ms),
+      motion,
+      takeover: this.takeover,
+      ends,
+    });
   }
 
   private cloud_ms(now_ms: number): number | undefined {
@@ -233,4 +264,5 @@ export class Driver {
   }
 }
 
-const slow = (rtt_ms: number): string => `The round trip takes ${Math.round(rtt_ms)} ms, at most ${DRIVE_MAX_RTT_MS} ms is allowed`;
+const slow = (rtt_ms: number): string =>
+  `The round trip takes ${Math.round(rtt_ms)} ms, at most ${DRIVE_MAX_RTT_MS} ms is allowed`;

@@ -34,24 +34,36 @@ export class Inputs {
     window.addEventListener("keydown", (event) => this.key(event, true, leave), early);
     window.addEventListener("keyup", (event) => this.key(event, false, leave), early);
     document.addEventListener("visibilitychange", () => this.release(), { signal });
-    for (const end of ["blur", "pagehide", "dragstart"] as const) window.addEventListener(end, () => this.release(), { signal });
+    for (const end of ["blur", "pagehide", "dragstart"] as const)
+      window.addEventListener(end, () => this.release(), { signal });
     // A finger that rests on the button asks for a menu, too, and gets none.
     window.addEventListener("contextmenu", (event) => event.defaultPrevented || this.release(), { signal });
     window.addEventListener("focusin", (event) => typed(event) && this.release(), { signal });
-    for (const node of [pad, button]) node.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
-    button.addEventListener("pointerdown", (event) => {
-      button.setPointerCapture(event.pointerId);
-      this.pointers.add(event.pointerId);
-      changed();
-    }, { signal });
-    pad.addEventListener("pointerdown", (event) => {
-      if (this.dragged) return;
-      pad.setPointerCapture(event.pointerId);
-      this.dragged = { id: event.pointerId, mouse: event.pointerType === "mouse" };
-      this.drag(event);
-      changed();
-    }, { signal });
-    pad.addEventListener("pointermove", (event) => event.pointerId === this.dragged?.id && this.drag(event), { signal });
+    for (const node of [pad, button])
+      node.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
+    button.addEventListener(
+      "pointerdown",
+      (event) => {
+        button.setPointerCapture(event.pointerId);
+        this.pointers.add(event.pointerId);
+        changed();
+      },
+      { signal },
+    );
+    pad.addEventListener(
+      "pointerdown",
+      (event) => {
+        if (this.dragged) return;
+        pad.setPointerCapture(event.pointerId);
+        this.dragged = { id: event.pointerId, mouse: event.pointerType === "mouse" };
+        this.drag(event);
+        changed();
+      },
+      { signal },
+    );
+    pad.addEventListener("pointermove", (event) => event.pointerId === this.dragged?.id && this.drag(event), {
+      signal,
+    });
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
       button.addEventListener(end, (event) => this.lift(event.pointerId), { signal });
       pad.addEventListener(end, (event) => this.lift(event.pointerId), { signal });
@@ -99,10 +111,11 @@ export class Inputs {
     else if (!pushes(event.code)) return;
     else if (down) this.keys.add(event.code);
     else this.keys.delete(event.code);
-    if (typed(event)) return this.changed();
-    // Neither another car, nor a press on the button that has the focus.
-    event.preventDefault();
-    event.stopPropagation();
+    if (!typed(event)) {
+      // Neither another car, nor a press on the button that has the focus.
+      event.preventDefault();
+      event.stopPropagation();
+    }
     this.changed();
   }
 

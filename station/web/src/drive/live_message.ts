@@ -32,7 +32,8 @@ export function readLive(topic: string, payload: string): LiveMessage | undefine
   if (!isObject(message)) return undefined;
   const { v, t, sent_us, offset_us, sample } = message;
   if (v !== SCHEMA_VERSION || !isInteger(t) || !isInteger(sent_us) || !isObject(sample)) return undefined;
-  const cloud = (us: number): number | undefined => (isInteger(offset_us) ? (us + offset_us) / 1e3 : undefined);
+  const cloud = (us: number): number | undefined =>
+    isInteger(offset_us) ? (us + offset_us) / 1e3 : undefined;
   return {
     taken_ms: cloud(t),
     sent_ms: cloud(sent_us),
@@ -41,10 +42,24 @@ export function readLive(topic: string, payload: string): LiveMessage | undefine
   };
 }
 
-function drivenOf({ session, seq, outcome, driver, driver_by, lease_left_ms }: Readonly<Record<string, unknown>>): Driven | undefined {
+function drivenOf({
+  session,
+  seq,
+  outcome,
+  driver,
+  driver_by,
+  lease_left_ms,
+}: Readonly<Record<string, unknown>>): Driven | undefined {
   if (typeof session !== "string" || !isInteger(seq) || typeof outcome !== "string") return undefined;
   const text = (value: unknown): string => (typeof value === "string" ? value : "");
-  return { session, seq, outcome, driver: text(driver), driverBy: text(driver_by), leaseLeft_ms: typeof lease_left_ms === "number" ? lease_left_ms : 0 };
+  return {
+    session,
+    seq,
+    outcome,
+    driver: text(driver),
+    driverBy: text(driver_by),
+    leaseLeft_ms: typeof lease_left_ms === "number" ? lease_left_ms : 0,
+  };
 }
 
 function isObject(value: unknown): value is Readonly<Record<string, unknown>> {

@@ -1,7 +1,13 @@
 // Driving a car by hand, in its view: the stick, the dead-man's button, and what stands against driving.
 
-import { DRIVE_MAX_AGE_MS, DRIVE_MAX_RTT_MS, DRIVE_RATE_HZ, type Config, type DriveLimitsEntry } from "../base/contract";
 import { now } from "../base/clock";
+import {
+  type Config,
+  DRIVE_MAX_AGE_MS,
+  DRIVE_MAX_RTT_MS,
+  DRIVE_RATE_HZ,
+  type DriveLimitsEntry,
+} from "../base/contract";
 import { el, onPress, setAttribute, Text } from "../base/dom";
 import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
@@ -20,7 +26,8 @@ const WORDS = {
   free: "You have the wheel, and do not drive: whoever drives the car goes on. Hold the dead-man's switch to drive.",
   starting: "Waiting for the car's answer …",
   driving: "Driving.",
-  holding: "You hold the car: it stands until you drive on, or leave the wheel. Then others may drive it, also a planner on board.",
+  holding:
+    "You hold the car: it stands until you drive on, or leave the wheel. Then others may drive it, also a planner on board.",
 } as const;
 const UNHEARD = "The car does not hear you: others may drive it, also a planner on board.";
 
@@ -41,12 +48,25 @@ export class DrivePanel {
   private readonly who = new Text("note");
   private readonly said = el("p", { class: "drive-said", role: "status" });
   private readonly knob = el("span", { class: "knob" });
-  private readonly pad = el("div", { class: "stick", role: "img", "aria-label": "Stick: up is ahead" }, this.knob);
+  private readonly pad = el(
+    "div",
+    { class: "stick", role: "img", "aria-label": "Stick: up is ahead" },
+    this.knob,
+  );
   private readonly hold = el("button", { type: "button", class: "deadman" }, "Hold to drive");
   private readonly top = el("input", { type: "range", name: "top", min: "0.1", step: "0.1" });
   private readonly topWords = new Text("num");
-  private readonly name = el("input", { type: "text", name: "driver", maxlength: "64", autocomplete: "name" });
-  private readonly figures = { rtt: figure("Round trip"), age: figure("Newest sample"), asked: figure("Asked for") };
+  private readonly name = el("input", {
+    type: "text",
+    name: "driver",
+    maxlength: "64",
+    autocomplete: "name",
+  });
+  private readonly figures = {
+    rtt: figure("Round trip"),
+    age: figure("Newest sample"),
+    asked: figure("Asked for"),
+  };
   private readonly body: HTMLElement;
   private robot: string | undefined;
   private wheel: Wheel | undefined;
@@ -64,10 +84,34 @@ export class DrivePanel {
     onPress(this.over, () => this.takeOver());
     this.over.addEventListener("blur", () => (this.sure = false));
     this.top.addEventListener("input", () => this.topped());
-    const limits = el("div", { class: "drive-limits" }, el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top), ...Object.values(this.figures).map(({ node }) => node));
-    const help = el("p", { class: "note drive-help" }, "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.");
+    const limits = el(
+      "div",
+      { class: "drive-limits" },
+      el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top),
+      ...Object.values(this.figures).map(({ node }) => node),
+    );
+    const help = el(
+      "p",
+      { class: "note drive-help" },
+      "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.",
+    );
     this.body = el("div", { class: "drive-body", hidden: "" }, this.pad, this.hold, limits, help);
-    this.node = el("section", { class: "panel drive", "aria-label": "Drive", hidden: "" }, el("header", {}, el("h3", {}, "Drive"), this.who.node, el("label", { class: "drive-name" }, "as ", this.name), this.take, this.leave), this.said, this.over, this.body);
+    this.node = el(
+      "section",
+      { class: "panel drive", "aria-label": "Drive", hidden: "" },
+      el(
+        "header",
+        {},
+        el("h3", {}, "Drive"),
+        this.who.node,
+        el("label", { class: "drive-name" }, "as ", this.name),
+        this.take,
+        this.leave,
+      ),
+      this.said,
+      this.over,
+      this.body,
+    );
     this.leave.hidden = true;
   }
 
@@ -101,7 +145,12 @@ export class DrivePanel {
     const driver = new Driver(limits, by, newName);
     this.top.max = String(limits.max_speed_mps);
     this.top.value = String(Math.min(limits.max_speed_mps, Number(kept("drive.top") ?? FIRST_TOP_MPS)));
-    const inputs = new Inputs(this.pad, this.hold, () => this.held(), () => this.exit());
+    const inputs = new Inputs(
+      this.pad,
+      this.hold,
+      () => this.held(),
+      () => this.exit(),
+    );
     const socket = new DriveSocket(this.config.namespace, robot, {
       message: (topic, payload) => {
         const message = readLive(topic, payload);
@@ -110,7 +159,13 @@ export class DrivePanel {
       state: (reason) => driver.block(reason),
     });
     driver.block("Connecting …");
-    this.wheel = { driver, inputs, socket, limits, timer: window.setInterval(() => this.tick(), TICK_S * 1000) };
+    this.wheel = {
+      driver,
+      inputs,
+      socket,
+      limits,
+      timer: window.setInterval(() => this.tick(), TICK_S * 1000),
+    };
     this.topped();
     this.arranged();
     this.hold.focus({ preventScroll: true });
@@ -123,7 +178,8 @@ export class DrivePanel {
     window.clearInterval(wheel.timer);
     wheel.driver.leave();
     // That others may drive.
-    for (let command = wheel.driver.tick(now() * 1000); command; command = wheel.driver.tick(now() * 1000)) wheel.socket.send(wheel.limits.command, command);
+    for (let command = wheel.driver.tick(now() * 1000); command; command = wheel.driver.tick(now() * 1000))
+      wheel.socket.send(wheel.limits.command, command);
     wheel.socket.close();
     this.wheel = undefined;
     this.who.set("");
@@ -175,12 +231,17 @@ export class DrivePanel {
     const age = driver.age_ms(at_ms);
     this.figures.rtt.set(driver.rtt_ms, DRIVE_MAX_RTT_MS, "ms");
     this.figures.age.set(age, DRIVE_MAX_AGE_MS, "ms");
-    const motion = meant(phase === "driving" ? stick : { x: 0, y: 0 }, { top_mps: driver.top_mps, ...limits });
+    const motion = meant(phase === "driving" ? stick : { x: 0, y: 0 }, {
+      top_mps: driver.top_mps,
+      ...limits,
+    });
     this.figures.asked.text(`${number(motion.speed_mps, 1)} m/s, ${number(motion.steering_rad, 2)} rad`);
     const who = driver.driving(at_ms);
     this.who.set(who ? (who.mine ? "you drive" : `${who.by} drives`) : "nobody drives");
     const against = phase === "free" ? driver.against(at_ms) : "";
-    const free = against || (phase === "free" && driver.reason ? `${driver.reason}.` : WORDS[phase === "over" ? "free" : phase]);
+    const free =
+      against ||
+      (phase === "free" && driver.reason ? `${driver.reason}.` : WORDS[phase === "over" ? "free" : phase]);
     const unheard = phase === "holding" && !who?.mine;
     this.say(phase === "over" ? `${driver.reason}. Let go to begin again.` : unheard ? UNHEARD : free);
     this.over.hidden = driver.other === "";
@@ -212,10 +273,20 @@ export class DrivePanel {
 }
 
 /** A figure with its limit, marked when it is beyond. */
-function figure(label: string): { readonly node: HTMLElement; readonly text: (text: string) => void; readonly set: (value: number | undefined, most: number, unit: string) => void } {
+function figure(label: string): {
+  readonly node: HTMLElement;
+  readonly text: (text: string) => void;
+  readonly set: (value: number | undefined, most: number, unit: string) => void;
+} {
   const value = new Text("num");
   const limit = new Text("note");
-  const node = el("p", { class: "drive-figure" }, el("span", { class: "label" }, label), value.node, limit.node);
+  const node = el(
+    "p",
+    { class: "drive-figure" },
+    el("span", { class: "label" }, label),
+    value.node,
+    limit.node,
+  );
   return {
     node,
     text: (text) => value.set(text),
@@ -227,4 +298,5 @@ function figure(label: string): { readonly node: HTMLElement; readonly text: (te
   };
 }
 
-const newName = (): string => Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
+const newName = (): string =>
+  Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");

@@ -2,8 +2,18 @@
 // page's main thread, where the keys are: a page that is frozen must not go on driving.
 
 import type { IClientOptions, MqttClient } from "mqtt";
-import { CMD, LEASE, LIVE, LIVE_MAX_RATE_HZ, SCHEMA_VERSION, VIEW, VIEW_LEASE_MS, VIEW_RENEW_S, type SocketAnswer } from "../base/contract";
-import { act, AnswerError } from "../server/answers";
+import {
+  CMD,
+  LEASE,
+  LIVE,
+  LIVE_MAX_RATE_HZ,
+  SCHEMA_VERSION,
+  type SocketAnswer,
+  VIEW,
+  VIEW_LEASE_MS,
+  VIEW_RENEW_S,
+} from "../base/contract";
+import { AnswerError, act } from "../server/answers";
 import type { Command } from "./command";
 
 declare const mqtt: { connect(url: string, options: IClientOptions): MqttClient };
@@ -22,7 +32,9 @@ export class DriveSocket {
   private timer: number | undefined;
   private renewing: number | undefined;
   private closed = false;
-  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
+  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) =>
+    b.toString(16).padStart(2, "0"),
+  ).join("");
 
   constructor(
     private readonly namespace: string,
@@ -34,7 +46,8 @@ export class DriveSocket {
 
   /** Send a command; it is lost if the connection is. */
   send(name: string, command: Command): void {
-    if (this.client?.connected) this.client.publish(this.topic(CMD, name), JSON.stringify(command), { qos: 0 });
+    if (this.client?.connected)
+      this.client.publish(this.topic(CMD, name), JSON.stringify(command), { qos: 0 });
   }
 
   close(): void {
@@ -62,7 +75,16 @@ export class DriveSocket {
   }
 
   private connect(url: string, clientId: string): void {
-    const client = (this.client = mqtt.connect(url, { protocolVersion: 5, clientId, clean: true, reconnectPeriod: 0, connectTimeout: CONNECT_MS, keepalive: 10, queueQoSZero: false, timerVariant: "native" }));
+    const client = (this.client = mqtt.connect(url, {
+      protocolVersion: 5,
+      clientId,
+      clean: true,
+      reconnectPeriod: 0,
+      connectTimeout: CONNECT_MS,
+      keepalive: 10,
+      queueQoSZero: false,
+      timerVariant: "native",
+    }));
     client.on("connect", () => {
       client.subscribe(this.topic(LIVE, "+"), { qos: 0 }, (error) => {
         if (client !== this.client) return;
@@ -76,15 +98,27 @@ export class DriveSocket {
         this.ends.state("");
       });
     });
-    client.on("message", (topic, payload) => client === this.client && this.ends.message(topic, payload.toString()));
-    client.on("error", (error) => client === this.client && this.lose(`The broker's connection failed: ${error.message}`));
+    client.on(
+      "message",
+      (topic, payload) => client === this.client && this.ends.message(topic, payload.toString()),
+    );
+    client.on(
+      "error",
+      (error) => client === this.client && this.lose(`The broker's connection failed: ${error.message}`),
+    );
     client.on("close", () => client === this.client && this.lose("The broker's connection ended"));
   }
 
   /** Have the car send its messages here as often as it may. */
   private lease(lease_ms: number): void {
     if (!this.client?.connected) return;
-    const lease = { v: SCHEMA_VERSION, viewer: this.viewer, rate_hz: LIVE_MAX_RATE_HZ, lease_ms, broker: true };
+    const lease = {
+      v: SCHEMA_VERSION,
+      viewer: this.viewer,
+      rate_hz: LIVE_MAX_RATE_HZ,
+      lease_ms,
+      broker: true,
+    };
     this.client.publish(this.topic(VIEW, LEASE), JSON.stringify(lease), { qos: 0 });
   }
 
@@ -106,12 +140,12 @@ export class DriveSocket {
 /** Load a script of the page, once. */
 function script(source: string): Promise<void> {
   const known = document.querySelector<HTMLScriptElement>(`script[src="${source}"]`);
-  if (known?.dataset["loaded"]) return Promise.resolve();
+  if (known?.dataset.loaded) return Promise.resolve();
   known?.remove();
   return new Promise((resolve, reject) => {
     const node = document.createElement("script");
     node.addEventListener("load", () => {
-      node.dataset["loaded"] = "true";
+      node.dataset.loaded = "true";
       resolve();
     });
     node.addEventListener("error", () => reject(new AnswerError(`${source} could not be loaded`)));

@@ -26,16 +26,21 @@ const DEAD = 0.12;
 // A key is all or nothing, so the stick follows it at this many lengths a second; back to the centre, it jumps.
 const KEY_RATE = 2.5;
 const PUSHES: Readonly<Record<string, Stick>> = {
-  ArrowUp: { x: 0, y: 1 }, KeyW: { x: 0, y: 1 },
-  ArrowDown: { x: 0, y: -1 }, KeyS: { x: 0, y: -1 },
-  ArrowLeft: { x: -1, y: 0 }, KeyA: { x: -1, y: 0 },
-  ArrowRight: { x: 1, y: 0 }, KeyD: { x: 1, y: 0 },
+  ArrowUp: { x: 0, y: 1 },
+  KeyW: { x: 0, y: 1 },
+  ArrowDown: { x: 0, y: -1 },
+  KeyS: { x: 0, y: -1 },
+  ArrowLeft: { x: -1, y: 0 },
+  KeyA: { x: -1, y: 0 },
+  ArrowRight: { x: 1, y: 0 },
+  KeyD: { x: 1, y: 0 },
 };
 
 /** Whether a key, by its place on the keyboard, pushes the stick. */
 export const pushes = (code: string): boolean => Object.hasOwn(PUSHES, code);
 
-const within = (value: number): number => (value > -1 ? (value < 1 ? value : 1) : value <= -1 ? -1 : 0);
+/** From -1 to 1; what is no number is at rest. */
+const within = (value: number): number => (Number.isNaN(value) ? 0 : Math.min(1, Math.max(-1, value)));
 
 /** Where a point is in a square, as a stick; `size` is its side, y goes down as on a screen. */
 export function pointed(x: number, y: number, size: number): Stick {

@@ -36,8 +36,15 @@ export class StopControl {
     // It is read before it is needed, and takes no room later.
     byId("over").after(this.unable.node);
     // What stays in sight while the page scrolls covers what is below it.
-    const measured = [[header, "--header"], [strip, "--strip"]] as const;
-    const observer = new ResizeObserver(() => measured.forEach(([node, name]) => document.documentElement.style.setProperty(name, `${node.offsetHeight}px`)));
+    const measured = [
+      [header, "--header"],
+      [strip, "--strip"],
+    ] as const;
+    const observer = new ResizeObserver(() =>
+      measured.forEach(([node, name]) =>
+        document.documentElement.style.setProperty(name, `${node.offsetHeight}px`),
+      ),
+    );
     for (const [node] of measured) observer.observe(node);
     this.press.hidden = !this.stops.able;
     if (this.stops.able) byId("stop-bar").append(this.press);
@@ -63,29 +70,48 @@ export class StopControl {
     this.sure = sure;
     this.seen_ms = this.stops.newest_ms(this.robot);
     const whom = this.robot === undefined ? this.stops.held.fleet : [this.robot];
-    this.release.textContent = sure ? `Really release ${listed(whom)}: ${whom.length === 1 ? "it" : "they"} may move` : `Release ${this.robot ?? "all"}`;
+    this.release.textContent = sure
+      ? `Really release ${listed(whom)}: ${whom.length === 1 ? "it" : "they"} may move`
+      : `Release ${this.robot ?? "all"}`;
     setAttribute(this.release, "data-sure", String(sure));
   }
 
   private show(): void {
     const { stops, robot } = this;
     const words = stops.names.map((name) => [name, stops.word(name)] as const);
-    const of = (kind: string): (readonly [string, string])[] => words.flatMap(([name, word]) => (word.kind === kind ? [[name, word.why] as const] : []));
+    const of = (kind: string): (readonly [string, string])[] =>
+      words.flatMap(([name, word]) => (word.kind === kind ? [[name, word.why] as const] : []));
     const stand = of("stands").map(([name]) => name);
     const released = stand.filter((name) => !stops.of(name)!.asked && stops.of(name)!.reason === "");
     const { fleet, alone } = stops.held;
     const one = robot === undefined ? undefined : stops.of(robot);
     write(this.sent, this.request());
     write(this.moves, reasons("NOT standing", of("moves")));
-    write(this.words, [
-      ...(stand.length > 0 ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`] : []),
-      ...(released.length > 0 ? [`Release not confirmed by ${listed(released)}.`] : []),
-      ...(one?.asked && one.by ? [`Stopped by ${one.by}, ${when(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`] : []),
-      ...(robot === undefined && alone.length > 0 ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`] : []),
-      ...(one?.stands && one.reason ? [`${robot} rejects the release: ${one.reason}.`] : []),
-    ].join(" "));
-    write(this.unable, reasons("The stop does not stop", of("unable").filter(([name]) => (robot ?? name) === name)));
-    const any = robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
+    write(
+      this.words,
+      [
+        ...(stand.length > 0
+          ? [`Emergency stop: ${listed(stand)} ${stand.length === 1 ? "stands" : "stand"}.`]
+          : []),
+        ...(released.length > 0 ? [`Release not confirmed by ${listed(released)}.`] : []),
+        ...(one?.asked && one.by
+          ? [`Stopped by ${one.by}, ${when(one.at_ms / 1000)}${one.alone ? "" : ", with the fleet"}.`]
+          : []),
+        ...(robot === undefined && alone.length > 0
+          ? [`Stopped alone: ${listed(alone)}, to be released on the car's page.`]
+          : []),
+        ...(one?.stands && one.reason ? [`${robot} rejects the release: ${one.reason}.`] : []),
+      ].join(" "),
+    );
+    write(
+      this.unable,
+      reasons(
+        "The stop does not stop",
+        of("unable").filter(([name]) => (robot ?? name) === name),
+      ),
+    );
+    const any =
+      robot === undefined ? fleet.length > 0 : one !== undefined && (one.asked || one.stopped === true);
     this.release.hidden = !stops.able || !any;
     this.stands.hidden = this.words.node.hidden && this.release.hidden;
   }
@@ -95,9 +121,15 @@ export class StopControl {
     const { sent, error, away } = this.stops;
     const whom = sent?.robot ?? "all cars";
     if (sent && !sent.late) return `${sent.stopped ? "Stop" : "Release"} sent to ${whom} …`;
-    if (sent) return sent.stopped ? `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may not have been stopped. ${this.advice()}` : `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may or may not have been released.`;
-    if (error) return `${error}${error.endsWith(".") ? "" : "."}${error.startsWith("Not") ? "" : ` ${this.advice()}`}`;
-    return away ? `The page's server does not answer: nobody can be stopped here, and cars may stand or move by now. ${this.advice()}` : "";
+    if (sent)
+      return sent.stopped
+        ? `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may not have been stopped. ${this.advice()}`
+        : `No answer after ${age(ANSWER_MS / 1000)}: ${whom} may or may not have been released.`;
+    if (error)
+      return `${error}${error.endsWith(".") ? "" : "."}${error.startsWith("Not") ? "" : ` ${this.advice()}`}`;
+    return away
+      ? `The page's server does not answer: nobody can be stopped here, and cars may stand or move by now. ${this.advice()}`
+      : "";
   }
 
   private advice(): string {
@@ -114,7 +146,9 @@ function write(text: Text, words: string): void {
 
 /** Names with their reasons: those with the same one together. */
 function reasons(title: string, of: readonly (readonly [string, string])[]): string {
-  const groups = [...new Set(of.map(([, why]) => why))].map((why) => `${listed(of.flatMap(([name, its]) => (its === why ? [name] : [])))} (${why})`);
+  const groups = [...new Set(of.map(([, why]) => why))].map(
+    (why) => `${listed(of.flatMap(([name, its]) => (its === why ? [name] : [])))} (${why})`,
+  );
   return groups.length > 0 ? `${title}: ${groups.join("; ")}.` : "";
 }
 

@@ -2,7 +2,7 @@
 
 import type { Config, MotionAnswer, MotionEntry } from "../base/contract";
 import { may } from "../server/admission";
-import { act, ask, AnswerError } from "../server/answers";
+import { AnswerError, act, ask } from "../server/answers";
 
 const POLL_MS = 10_000;
 // While a car has not confirmed what was asked for here: often for the first seconds, and then for a while.
@@ -60,7 +60,9 @@ export class Stops {
   /** What is known of a car; a stop that was sent counts as asked for, so that nobody here drives on. */
   of(robot: string): MotionEntry | undefined {
     const motion = Object.hasOwn(this.robots, robot) ? this.robots[robot] : undefined;
-    return motion && this.sent?.stopped && (this.sent.robot ?? robot) === robot ? { ...motion, asked: true } : motion;
+    return motion && this.sent?.stopped && (this.sent.robot ?? robot) === robot
+      ? { ...motion, asked: true }
+      : motion;
   }
 
   get names(): string[] {
@@ -73,25 +75,37 @@ export class Stops {
     const { asked, stands, reason, stoppable, why_not } = motion;
     if (stands) return { kind: "stands", why: "" };
     const failed = Object.hasOwn(this.failed, robot) ? this.failed[robot]! : "";
-    const why =
-      failed ? `not sent: ${failed}`
-      : reason ? (stoppable === false ? why_not : `it rejects the stop: ${reason}`)
-      : asked ? (this.online(robot) === false ? "offline: it has not confirmed it, and stops before it takes a command" : "not confirmed")
-      : "";
+    const why = failed
+      ? `not sent: ${failed}`
+      : reason
+        ? stoppable === false
+          ? why_not
+          : `it rejects the stop: ${reason}`
+        : asked
+          ? this.online(robot) === false
+            ? "offline: it has not confirmed it, and stops before it takes a command"
+            : "not confirmed"
+          : "";
     if (why) return { kind: "moves", why };
     if (stoppable === false) return { kind: "unable", why: why_not };
-    return this.held.fleet.length > 0 ? { kind: "moves", why: motion.by ? `released by ${motion.by}` : "it was not asked to stop" } : { kind: "", why: "" };
+    return this.held.fleet.length > 0
+      ? { kind: "moves", why: motion.by ? `released by ${motion.by}` : "it was not asked to stop" }
+      : { kind: "", why: "" };
   }
 
   /** The cars that a stop of the fleet holds, which the fleet's release ends; and those that were stopped alone. */
   get held(): { readonly fleet: string[]; readonly alone: string[] } {
     const asked = this.names.filter((name) => this.robots[name]!.asked);
-    return { fleet: asked.filter((name) => !this.robots[name]!.alone), alone: asked.filter((name) => this.robots[name]!.alone) };
+    return {
+      fleet: asked.filter((name) => !this.robots[name]!.alone),
+      alone: asked.filter((name) => this.robots[name]!.alone),
+    };
   }
 
   /** When the newest stop of a car, or of any, was asked for. */
   newest_ms(robot: string | undefined): number {
-    const robots = robot === undefined ? Object.values(this.robots).filter(({ asked }) => asked) : [this.of(robot)];
+    const robots =
+      robot === undefined ? Object.values(this.robots).filter(({ asked }) => asked) : [this.of(robot)];
     return Math.max(0, ...robots.map((one) => one?.at_ms ?? 0));
   }
 
@@ -105,7 +119,11 @@ export class Stops {
     this.turn += 1;
     window.clearTimeout(this.timer);
     const whom = robot === undefined ? {} : { robot };
-    const request = act<MotionAnswer>("stop", { stopped: String(stopped), ...whom, ...(stopped ? {} : { seen_ms: String(seen_ms) }) }, { signal: sent.end.signal });
+    const request = act<MotionAnswer>(
+      "stop",
+      { stopped: String(stopped), ...whom, ...(stopped ? {} : { seen_ms: String(seen_ms) }) },
+      { signal: sent.end.signal },
+    );
     // It holds a connection; the server works on it all the same.
     if (before?.late) before.end.abort();
     const late = window.setTimeout(() => {
@@ -125,7 +143,8 @@ export class Stops {
     } catch (error) {
       if (sent.end.signal.aborted) return;
       if (!(error instanceof AnswerError)) throw error;
-      if (sent === this.sent) this.error = `${stopped ? "NOTHING WAS STOPPED" : "Not released"}: ${error.message}`;
+      if (sent === this.sent)
+        this.error = `${stopped ? "NOTHING WAS STOPPED" : "Not released"}: ${error.message}`;
     } finally {
       window.clearTimeout(late);
       if (sent === this.sent) this.sent = undefined;
@@ -151,7 +170,9 @@ export class Stops {
     // Whatever was sent meanwhile asks again when it is answered.
     if (this.sent && !this.sent.late) return;
     const since_ms = performance.now() - this.sent_ms;
-    const waits = Object.values(this.robots).some(({ asked, stands, reason }) => reason === "" && asked !== stands);
+    const waits = Object.values(this.robots).some(
+      ({ asked, stands, reason }) => reason === "" && asked !== stands,
+    );
     this.later(!waits || since_ms > SOON_FOR_MS ? POLL_MS : since_ms > OFTEN_FOR_MS ? SOON_MS : OFTEN_MS);
   }
 

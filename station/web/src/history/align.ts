@@ -1,7 +1,7 @@
 // Puts several ranges on one axis: the time since each began, or the distance since then.
 
-import { TACHOMETER_COUNTS, type HistoryAnswer, type Value } from "../base/contract";
-import { linear, type Linear } from "../base/format";
+import { type HistoryAnswer, TACHOMETER_COUNTS, type Value } from "../base/contract";
+import { type Linear, linear } from "../base/format";
 
 export type Axis = "time" | "distance";
 
@@ -19,14 +19,26 @@ const MOST_MPS = 100;
 const LEAST_STEP_S = 0.1;
 // Shorter steps between positions count once they add up: they may be the noise of a car that stands.
 const LEAST_STEP_M = 0.1;
-const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
+const POSITIONS = [
+  "pose.pose.position.",
+  "pose.position.",
+  "position.",
+  "transform.translation.",
+  "translation.",
+  "pose.",
+  "",
+];
 
 /**
  * The metres driven since the first row: from the tachometer, the position, or the speed; undefined without any of
  * them. `speed` is the car's, of its motor's speed: the tachometer needs it too.
  */
-export function distance({ times_s, fields }: HistoryAnswer, speed: Linear | undefined): number[] | undefined {
-  const column = (name: string): readonly Value[] | undefined => (Object.hasOwn(fields, name) ? fields[name]!.mean : undefined);
+export function distance(
+  { times_s, fields }: HistoryAnswer,
+  speed: Linear | undefined,
+): number[] | undefined {
+  const column = (name: string): readonly Value[] | undefined =>
+    Object.hasOwn(fields, name) ? fields[name]!.mean : undefined;
   const rows = times_s.length;
   const counter = COUNTERS.map(column).find((values) => values !== undefined);
   if (counter && speed) {
@@ -51,11 +63,19 @@ export function distance({ times_s, fields }: HistoryAnswer, speed: Linear | und
   }
   const erpm = column("speed");
   if (!erpm || !speed) return undefined;
-  return summed(rows, [erpm], (i, before) => Math.abs(linear(Number(erpm[i]), speed)) * (times_s[i]! - times_s[before]!));
+  return summed(
+    rows,
+    [erpm],
+    (i, before) => Math.abs(linear(Number(erpm[i]), speed)) * (times_s[i]! - times_s[before]!),
+  );
 }
 
 /** The running sum of the steps from one row to the next in which all columns are numbers. */
-function summed(rows: number, columns: readonly (readonly Value[])[], step: (row: number, before: number) => number): number[] {
+function summed(
+  rows: number,
+  columns: readonly (readonly Value[])[],
+  step: (row: number, before: number) => number,
+): number[] {
   let [sum, before] = [0, -1];
   return Array.from({ length: rows }, (_, row) => {
     if (columns.every((values) => typeof values[row] === "number")) {
@@ -72,7 +92,12 @@ export function onGrid({ x, y }: Line, grid: readonly number[], hole: number): (
   return grid.map((at) => {
     if (x.length === 0 || at < x[0]! || at > x.at(-1)!) return null;
     while (i < x.length - 2 && x[i + 1]! < at) i += 1;
-    const [x0, x1, y0, y1] = [x[i]!, x[Math.min(i + 1, x.length - 1)]!, y[i] ?? null, y[Math.min(i + 1, x.length - 1)] ?? null];
+    const [x0, x1, y0, y1] = [
+      x[i]!,
+      x[Math.min(i + 1, x.length - 1)]!,
+      y[i] ?? null,
+      y[Math.min(i + 1, x.length - 1)] ?? null,
+    ];
     if (at === x0 || x1 === x0) return y0;
     if (at === x1) return y1;
     if (y0 === null || y1 === null || x1 - x0 > hole) return null;

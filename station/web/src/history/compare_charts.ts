@@ -1,9 +1,9 @@
 // A chart for each chosen field, with a line for each part. All charts share their range and their cursor.
 
 import { el, setAttribute, Text } from "../base/dom";
-import { number, write, type Spec } from "../base/format";
+import { number, type Spec, write } from "../base/format";
 import type { Range } from "../base/range";
-import { RangeChart, type Hands } from "../charts/range_chart";
+import { type Hands, RangeChart } from "../charts/range_chart";
 
 const FIRST_FIELDS = ["speed", "current_motor", "duty_cycle", "voltage_input"];
 const MOST_CHARTS = 8;
@@ -48,11 +48,17 @@ export class CompareCharts {
     this.range = range;
     for (const field of this.fields) this.remove(field);
     const all = [...data.fields.keys()];
-    const known = [wanted, FIRST_FIELDS].map((list) => list.filter((field) => all.includes(field))).find((list) => list.length > 0);
+    const known = [wanted, FIRST_FIELDS]
+      .map((list) => list.filter((field) => all.includes(field)))
+      .find((list) => list.length > 0);
     for (const field of (known ?? all.slice(0, 4)).slice(0, MOST_CHARTS)) this.add(field, names);
     this.chips.replaceChildren(
       ...all.map((field) => {
-        const chip = el("button", { type: "button", class: "chip", "aria-pressed": String(this.shown.has(field)), title: field }, this.spec(field).label);
+        const chip = el(
+          "button",
+          { type: "button", class: "chip", "aria-pressed": String(this.shown.has(field)), title: field },
+          this.spec(field).label,
+        );
         chip.addEventListener("click", () => {
           if (this.shown.has(field)) this.remove(field);
           else if (this.shown.size < MOST_CHARTS) this.add(field, names);
@@ -87,13 +93,34 @@ export class CompareCharts {
     const { label, unit, digits } = this.spec(field);
     const readings = names.map((name) => new Text("num", "span", { "aria-label": name }));
     const plot = el("div", { class: "plot" });
-    const values = readings.map(({ node }, i) => el("p", { class: "reading" }, el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }), el("span", { class: "label" }, names[i]!), node));
-    const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values), plot);
+    const values = readings.map(({ node }, i) =>
+      el(
+        "p",
+        { class: "reading" },
+        el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }),
+        el("span", { class: "label" }, names[i]!),
+        node,
+      ),
+    );
+    const node = el(
+      "section",
+      { class: "panel", "aria-label": label },
+      el("header", {}, el("h3", {}, label, " ", el("span", { class: "unit" }, unit)), ...values),
+      plot,
+    );
     this.node.append(node);
     const curves = names.map((name, i) => ({ label: name, colour: `--${hue(i)}`, dash: dash(i) }));
     const chart = new RangeChart(
       plot,
-      { about: { title: label, write: (value) => `${number(value, digits)} ${unit}` }, curves, sync: "compare", hole_s: Infinity, unit: this.data.unit, hands: this.hands, onCursor: this.onCursor },
+      {
+        about: { title: label, write: (value) => `${number(value, digits)} ${unit}` },
+        curves,
+        sync: "compare",
+        hole_s: Infinity,
+        unit: this.data.unit,
+        hands: this.hands,
+        onCursor: this.onCursor,
+      },
       [[...this.data.grid], ...columns.map((column) => [...column])] as [number[], ...(number | null)[][]],
       this.range,
     );

@@ -2,11 +2,18 @@
 
 import type { HistoryAnswer } from "../base/contract";
 import { el, setAttribute, Text } from "../base/dom";
-import { linear, number, write, type Spec } from "../base/format";
+import { linear, number, type Spec, write } from "../base/format";
 import type { Range } from "../base/range";
-import { RangeChart, type Hands, type Mark } from "../charts/range_chart";
+import { type Hands, type Mark, RangeChart } from "../charts/range_chart";
 
-const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
+const FIRST_FIELDS = [
+  "speed",
+  "voltage_input",
+  "current_motor",
+  "current_input",
+  "duty_cycle",
+  "temperature_pcb",
+];
 const FIRST_CHARTS = 6;
 const MOST_CHARTS = 12;
 
@@ -46,7 +53,9 @@ export class FieldCharts {
   set(drive: HistoryAnswer, fields: readonly string[], range: Range, wanted: readonly string[]): void {
     this.drive = drive;
     this.range = range;
-    const charted = fields.filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
+    const charted = fields.filter((field) =>
+      drive.fields[field]!.mean.some((value) => typeof value === "number"),
+    );
     const usual = FIRST_FIELDS.filter((field) => charted.includes(field));
     const known = wanted.filter((field) => charted.includes(field)).slice(0, MOST_CHARTS);
     const chosen = known.length > 0 ? known : usual.length > 0 ? usual : charted.slice(0, FIRST_CHARTS);
@@ -54,7 +63,11 @@ export class FieldCharts {
     for (const field of chosen) this.update(field);
     this.chips.replaceChildren(
       ...charted.map((field) => {
-        const chip = el("button", { type: "button", class: "chip", "aria-pressed": String(this.shown.has(field)), title: field }, this.options.spec(field).label);
+        const chip = el(
+          "button",
+          { type: "button", class: "chip", "aria-pressed": String(this.shown.has(field)), title: field },
+          this.options.spec(field).label,
+        );
         chip.addEventListener("click", () => {
           if (this.shown.has(field)) this.remove(field);
           else if (this.shown.size < MOST_CHARTS) this.update(field);
@@ -89,7 +102,8 @@ export class FieldCharts {
 
   /** Show the values of a row in the charts' headings. */
   read(index: number): void {
-    for (const [field, { reading }] of this.shown) reading.set(write(this.drive?.fields[field]?.mean[index], this.options.spec(field)));
+    for (const [field, { reading }] of this.shown)
+      reading.set(write(this.drive?.fields[field]?.mean[index], this.options.spec(field)));
   }
 
   private remove(field: string): void {
@@ -103,9 +117,13 @@ export class FieldCharts {
     const { times_s, fields, row_s } = this.drive!;
     const { mean, least, most } = fields[field]!;
     const as = this.options.spec(field);
-    const scaled = (values: typeof mean): (number | null)[] => values.map((value) => (typeof value === "number" ? linear(value, as) : null));
+    const scaled = (values: typeof mean): (number | null)[] =>
+      values.map((value) => (typeof value === "number" ? linear(value, as) : null));
     const band = least !== undefined && most !== undefined;
-    const data = [[...times_s], scaled(mean), ...(band ? [scaled(least), scaled(most)] : [])] as [number[], ...(number | null)[][]];
+    const data = [[...times_s], scaled(mean), ...(band ? [scaled(least), scaled(most)] : [])] as [
+      number[],
+      ...(number | null)[][],
+    ];
     const hole_s = Math.max(1, row_s * 2.5);
     const known = this.shown.get(field);
     const shown = known?.band === band ? known : this.make(field, as, data, band, hole_s);
@@ -113,18 +131,37 @@ export class FieldCharts {
     shown.extent.set(extent(band ? [scaled(least), scaled(most)] : [scaled(mean)], as));
   }
 
-  private make(field: string, { label, unit, digits }: Spec, data: [number[], ...(number | null)[][]], band: boolean, hole_s: number): Shown {
+  private make(
+    field: string,
+    { label, unit, digits }: Spec,
+    data: [number[], ...(number | null)[][]],
+    band: boolean,
+    hole_s: number,
+  ): Shown {
     const [reading, extent] = [new Text("num", "span", { "data-reading": field }), new Text("note")];
     const plot = el("div", { class: "plot" });
     const value = el("p", { class: "reading" }, reading.node, el("span", { class: "unit" }, unit));
-    const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), extent.node, value), plot);
+    const node = el(
+      "section",
+      { class: "panel", "aria-label": label },
+      el("header", {}, el("h3", {}, label), extent.node, value),
+      plot,
+    );
     const old = this.shown.get(field);
     old?.chart.destroy();
     if (old) old.node.replaceWith(node);
     else this.node.append(node);
     const { onCursor, hands } = this.options;
     const about = { title: label, write: (value: number) => `${number(value, digits)} ${unit}` };
-    const options = { about, curves: [{ label, colour: "--accent" }], sync: "history", hole_s, band, onCursor, hands };
+    const options = {
+      about,
+      curves: [{ label, colour: "--accent" }],
+      sync: "history",
+      hole_s,
+      band,
+      onCursor,
+      hands,
+    };
     const shown = { node, chart: new RangeChart(plot, options, data, this.range), band, reading, extent };
     shown.chart.mark(this.marks);
     this.shown.set(field, shown);

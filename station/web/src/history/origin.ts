@@ -7,7 +7,9 @@ import type { Range } from "../base/range";
 /** A sentence, with a space before it; nothing if all comes from the table. */
 /** What the answer lacks since it cannot be read. */
 export function unread(answer: HistoryAnswer): string {
-  return answer.refused > 0 ? ` ${number(answer.refused)} stored items cannot be read; the first: ${answer.reason}.` : "";
+  return answer.refused > 0
+    ? ` ${number(answer.refused)} stored items cannot be read; the first: ${answer.reason}.`
+    : "";
 }
 
 export function fromArchive(archive: Archived | null, [start, end]: Range): string {

@@ -1,12 +1,12 @@
 // Loads the parts of a comparison, and puts them on one grid.
 
 import type { FieldTable, HistoryAnswer } from "../base/contract";
-import { asSpeed, linear, spec, type Spec } from "../base/format";
+import { asSpeed, linear, type Spec, spec } from "../base/format";
 import type { Range } from "../base/range";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
 import { ask } from "../server/answers";
-import { distance, onGrid, type Axis } from "./align";
+import { type Axis, distance, onGrid } from "./align";
 import type { Compared } from "./compare_charts";
 
 // The rows of a request, and the steps of the grid: about the width of a chart in points.
@@ -37,16 +37,36 @@ export class Parts {
   ) {}
 
   /** The number of samples, whether some come from the archive, the whole range of x, and the values in the range `zoom` of it. Throws `NoDistance`. */
-  async load(parts: readonly Part[], stream: string, axis: Axis, zoom: Range | undefined, signal: AbortSignal): Promise<{ readonly samples: number; readonly archived: boolean; readonly extent: Range; readonly compared: Compared }> {
-    const wholes = await Promise.all(parts.map(async (part) => this.placed(part, await this.read(part, stream), axis)));
+  async load(
+    parts: readonly Part[],
+    stream: string,
+    axis: Axis,
+    zoom: Range | undefined,
+    signal: AbortSignal,
+  ): Promise<{
+    readonly samples: number;
+    readonly archived: boolean;
+    readonly extent: Range;
+    readonly compared: Compared;
+  }> {
+    const wholes = await Promise.all(
+      parts.map(async (part) => this.placed(part, await this.read(part, stream), axis)),
+    );
     const extent: Range = [0, Math.max(1e-3, ...wholes.map(({ x }) => x.at(-1) ?? 0))];
     const range = zoom ?? extent;
-    const shown = zoom ? await Promise.all(wholes.map((whole) => this.within(whole, stream, axis, zoom, signal))) : wholes;
+    const shown = zoom
+      ? await Promise.all(wholes.map((whole) => this.within(whole, stream, axis, zoom, signal)))
+      : wholes;
     const step = (range[1] - range[0]) / ROWS;
     const grid = Array.from({ length: ROWS + 1 }, (_, i) => range[0] + i * step);
     const samples = wholes.reduce((sum, { drive }) => sum + drive.samples, 0);
     const archived = wholes.some(({ drive }) => drive.archive !== null);
-    return { samples, archived, extent, compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) } };
+    return {
+      samples,
+      archived,
+      extent,
+      compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) },
+    };
   }
 
   /** The format of a field: the speed of the cars, if it is known of all of them. */
@@ -77,36 +97,69 @@ export class Parts {
   }
 
   /** Finer data of what a part has in a range of x. */
-  private async within({ part, t, x, drive }: Loaded, stream: string, axis: Axis, zoom: Range, signal: AbortSignal): Promise<Loaded> {
+  private async within(
+    { part, t, x, drive }: Loaded,
+    stream: string,
+    axis: Axis,
+    zoom: Range,
+    signal: AbortSignal,
+  ): Promise<Loaded> {
     const first = x.findIndex((at) => at >= zoom[0]);
     const last = x.findLastIndex((at) => at <= zoom[1]);
     // A row more at each end, so that the lines reach the edges.
     const [from, to] = [t[Math.max(0, first - 1)], t[Math.min(t.length - 1, last + 1)]];
-    if (first < 0 || last < 0 || from === undefined || to === undefined || drive.row_s === 0) return { part, drive, t, x };
-    const finer = await asked(part.robot, stream, [part.range[0] + from, part.range[0] + to + drive.row_s], signal);
+    if (first < 0 || last < 0 || from === undefined || to === undefined || drive.row_s === 0)
+      return { part, drive, t, x };
+    const finer = await asked(
+      part.robot,
+      stream,
+      [part.range[0] + from, part.range[0] + to + drive.row_s],
+      signal,
+    );
     const there = this.placed(part, finer, axis);
     if (axis === "time") return there;
     const offset = onGrid({ x: t, y: x }, [there.t[0] ?? 0], Infinity)[0] ?? 0;
     return { ...there, x: there.x.map((at) => at + offset) };
   }
 
-  private fields(shown: readonly Loaded[], stream: string, grid: readonly number[], axis: Axis): Compared["fields"] {
+  private fields(
+    shown: readonly Loaded[],
+    stream: string,
+    grid: readonly number[],
+    axis: Axis,
+  ): Compared["fields"] {
     const parts = shown.map(({ part }) => part);
-    const numeric = ({ drive }: Loaded): string[] => Object.keys(drive.fields).filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
+    const numeric = ({ drive }: Loaded): string[] =>
+      Object.keys(drive.fields).filter((field) =>
+        drive.fields[field]!.mean.some((value) => typeof value === "number"),
+      );
     const names = new Set(shown.flatMap(numeric));
     // The speed of the cars is shown as the field speed.
     const all = this.spec("speed", stream, parts).unit === "m/s";
     if (names.has("speed") && all) names.delete("speed_mps");
     const column = (field: string, { part, drive, x }: Loaded): (number | null)[] => {
-      const as = asSpeed(field, spec(field, this.table, drive.ros2, stream), all ? this.fleet.speed(part.robot) : undefined);
-      const y = drive.fields[field]?.mean.map((value) => (typeof value === "number" ? linear(value, as) : null)) ?? [];
-      return y.length === 0 ? grid.map(() => null) : onGrid({ x, y }, grid, axis === "time" ? Math.max(LEAST_HOLE_S, drive.row_s * HOLES) : Infinity);
+      const as = asSpeed(
+        field,
+        spec(field, this.table, drive.ros2, stream),
+        all ? this.fleet.speed(part.robot) : undefined,
+      );
+      const y =
+        drive.fields[field]?.mean.map((value) => (typeof value === "number" ? linear(value, as) : null)) ??
+        [];
+      return y.length === 0
+        ? grid.map(() => null)
+        : onGrid({ x, y }, grid, axis === "time" ? Math.max(LEAST_HOLE_S, drive.row_s * HOLES) : Infinity);
     };
     return new Map([...names].map((field) => [field, shown.map((each) => column(field, each))]));
   }
 }
 
-function asked(robot: string, stream: string, [from, to]: Range, signal?: AbortSignal): Promise<HistoryAnswer> {
+function asked(
+  robot: string,
+  stream: string,
+  [from, to]: Range,
+  signal?: AbortSignal,
+): Promise<HistoryAnswer> {
   const [from_us, to_us] = [from, to].map((at) => String(Math.round(at * 1e6))) as [string, string];
   return ask<HistoryAnswer>("history", { robot, stream, from_us, to_us, rows: String(ROWS) }, signal);
 }

@@ -9,7 +9,10 @@ import { Thumbnail } from "../widgets/thumbnail";
 export class Pictures {
   readonly node = el("div", { class: "tiles pictures" });
   /** For each field of bytes its thumbnail, and the rows that have one. */
-  private readonly kept = new Map<string, { readonly picture: Thumbnail; readonly rows: readonly number[] }>();
+  private readonly kept = new Map<
+    string,
+    { readonly picture: Thumbnail; readonly rows: readonly number[] }
+  >();
 
   constructor(private readonly table: FieldTable) {}
 

@@ -15,10 +15,20 @@ export interface PlaybackEvents {
 
 export class Playback {
   readonly node: HTMLElement;
-  private readonly slider = el("input", { type: "range", min: "0", value: "0", class: "scrub", "aria-label": "Time within the range" });
+  private readonly slider = el("input", {
+    type: "range",
+    min: "0",
+    value: "0",
+    class: "scrub",
+    "aria-label": "Time within the range",
+  });
   private readonly at = new Text("num scrub-at");
   private readonly button = el("button", { type: "button", class: "tool play" }, "Play");
-  private readonly speed = el("select", { class: "tool speed", "aria-label": "Speed of the playback" }, ...SPEEDS.map((each) => el("option", { value: String(each) }, `${each}×`)));
+  private readonly speed = el(
+    "select",
+    { class: "tool speed", "aria-label": "Speed of the playback" },
+    ...SPEEDS.map((each) => el("option", { value: String(each) }, `${each}×`)),
+  );
   private times: readonly number[] = [];
   private timer: number | undefined;
 

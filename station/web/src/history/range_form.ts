@@ -4,9 +4,20 @@ import { el, Text } from "../base/dom";
 import { zone } from "../base/format";
 import type { Range } from "../base/range";
 
-const LAST = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
+const LAST = [
+  ["1 min", 60],
+  ["5 min", 300],
+  ["15 min", 900],
+  ["1 h", 3600],
+] as const;
 const FORM = "2026-05-04 14:03:27";
-const TYPED = { size: String(FORM.length + 1), placeholder: FORM, title: `Date and time, like ${FORM}`, autocomplete: "off", spellcheck: "false" };
+const TYPED = {
+  size: String(FORM.length + 1),
+  placeholder: FORM,
+  title: `Date and time, like ${FORM}`,
+  autocomplete: "off",
+  spellcheck: "false",
+};
 // Shorter ranges show milliseconds.
 const FINE_S = 20;
 
@@ -27,7 +38,11 @@ export class RangeForm {
   private readonly zone = new Text("zone");
   private readonly select = el("select", { id: "stream", name: "stream" });
   /** Goes back to the range before the zoom. */
-  readonly out = el("button", { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" }, "Zoom out");
+  readonly out = el(
+    "button",
+    { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" },
+    "Zoom out",
+  );
 
   constructor(events: RangeFormEvents) {
     this.node = el(
@@ -77,17 +92,25 @@ export class RangeForm {
 
   /** Show the time zone of the form's times; it may change with the season. */
   private sayZone(): void {
-    const zones = [this.from, this.to].map(seconds).filter((at) => !Number.isNaN(at)).map(zone);
+    const zones = [this.from, this.to]
+      .map(seconds)
+      .filter((at) => !Number.isNaN(at))
+      .map(zone);
     this.zone.set([...new Set(zones)].join(" to "));
   }
 }
 
 /** A time in the input's format, in this device's time zone. */
 function local(at: number): string {
-  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 23).replace("T", " ");
+  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000)
+    .toISOString()
+    .slice(0, 23)
+    .replace("T", " ");
 }
 
 /** NaN for a text that is no date with a time. */
 function seconds({ value }: HTMLInputElement): number {
-  return /^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?$/.test(value.trim()) ? new Date(value.trim().replace(" ", "T")).getTime() / 1000 : NaN;
+  return /^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?$/.test(value.trim())
+    ? new Date(value.trim().replace(" ", "T")).getTime() / 1000
+    : NaN;
 }

@@ -2,7 +2,7 @@
 
 import type { FieldTable, HistoryAnswer } from "../base/contract";
 import { el } from "../base/dom";
-import { asSpeed, spec, type Spec } from "../base/format";
+import { asSpeed, type Spec, spec } from "../base/format";
 import type { Range } from "../base/range";
 import type { Hands, Mark } from "../charts/range_chart";
 import type { Fleet } from "../live/fleet";
@@ -55,7 +55,14 @@ export class Result {
       },
     });
     this.pictures = new Pictures(table);
-    this.node.append(this.playback.node, this.pictures.node, this.charts.chips, this.charts.node, new Download(asked).node, this.comparison.node);
+    this.node.append(
+      this.playback.node,
+      this.pictures.node,
+      this.charts.chips,
+      this.charts.node,
+      new Download(asked).node,
+      this.comparison.node,
+    );
   }
 
   set(robot: string, stream: string, drive: HistoryAnswer, range: Range): void {
@@ -98,7 +105,11 @@ export class Result {
   }
 
   private spec(field: string): Spec {
-    return asSpeed(field, spec(field, this.table, this.drive?.ros2, this.stream), this.fleet.speed(this.robot));
+    return asSpeed(
+      field,
+      spec(field, this.table, this.drive?.ros2, this.stream),
+      this.fleet.speed(this.robot),
+    );
   }
 
   /** Put the cursor where the viewer left it, or at the end. */
@@ -131,6 +142,8 @@ export class Result {
     this.playback.show(index);
     this.charts.read(index);
     this.pictures.point(drive, index);
-    this.comparison.then(new Map(Object.entries(drive.fields).map(([field, { mean }]) => [field, mean[index] ?? null])));
+    this.comparison.compare(
+      new Map(Object.entries(drive.fields).map(([field, { mean }]) => [field, mean[index] ?? null])),
+    );
   }
 }

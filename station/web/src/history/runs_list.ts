@@ -3,7 +3,7 @@
 import type { Extent, Run, RunsAnswer } from "../base/contract";
 import { el } from "../base/dom";
 import { age, number, when } from "../base/format";
-import { writeTime, type Range } from "../base/range";
+import { type Range, writeTime } from "../base/range";
 import { MOST_PARTS, route, writeParts } from "../base/route";
 
 export class RunsList {
@@ -20,9 +20,17 @@ export class RunsList {
 
   /** `older` is called for the runs before a time in microseconds. */
   constructor(older: (before_us: number) => void) {
-    const head = el("tr", {}, ...["Compare", "Start", "Length", "Samples", "State"].map((name) => el("th", { scope: "col" }, name)));
+    const head = el(
+      "tr",
+      {},
+      ...["Compare", "Start", "Length", "Samples", "State"].map((name) => el("th", { scope: "col" }, name)),
+    );
     this.more.addEventListener("click", () => older(this.runs.at(-1)!.from_us));
-    this.node.append(this.about, el("table", {}, el("thead", {}, head), this.body), el("p", { class: "tools" }, this.more, this.compare));
+    this.node.append(
+      this.about,
+      el("table", {}, el("thead", {}, head), this.body),
+      el("p", { class: "tools" }, this.more, this.compare),
+    );
   }
 
   /** The newest run that has the stream, or else the newest: the runs do not tell of the agent's own streams. */
@@ -81,19 +89,40 @@ export class RunsList {
       else this.chosen.delete(run.run);
       this.choose();
     });
-    const link = el("a", { href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, when(from));
+    const link = el(
+      "a",
+      {
+        href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }),
+      },
+      when(from),
+    );
     const samples = part.samples === null ? "" : number(part.samples);
     const state = run.lost > 0 ? `${run.state}, ${number(run.lost)} lost` : run.state;
-    return el("tr", { "data-run": run.run }, el("td", {}, el("label", {}, check)), el("th", { scope: "row" }, link), ...[age(to - from), samples, state].map((text) => el("td", {}, text)));
+    return el(
+      "tr",
+      { "data-run": run.run },
+      el("td", {}, el("label", {}, check)),
+      el("th", { scope: "row" }, link),
+      ...[age(to - from), samples, state].map((text) => el("td", {}, text)),
+    );
   }
 
   private choose(): void {
     const parts = [...this.chosen.values()].map((range) => ({ robot: this.robot, range }));
-    const few = parts.length < 2 ? "Check two runs to compare them" : parts.length > MOST_PARTS ? `At most ${MOST_PARTS} runs can be compared` : "";
+    const few =
+      parts.length < 2
+        ? "Check two runs to compare them"
+        : parts.length > MOST_PARTS
+          ? `At most ${MOST_PARTS} runs can be compared`
+          : "";
     this.compare.textContent = few || `Compare ${parts.length} runs`;
     if (few) this.compare.removeAttribute("href");
-    else this.compare.href = route({ view: "compare", query: { runs: writeParts(parts), stream: this.stream } });
+    else
+      this.compare.href = route({ view: "compare", query: { runs: writeParts(parts), stream: this.stream } });
   }
 }
 
-const range = ({ from_us, to_us }: Extent): Range => [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000];
+const range = ({ from_us, to_us }: Extent): Range => [
+  Math.floor(from_us / 1000) / 1000,
+  Math.ceil(to_us / 1000) / 1000,
+];

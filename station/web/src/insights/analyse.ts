@@ -2,14 +2,20 @@
 
 import type { AnalysisAnswer, AnalysisStarted } from "../base/contract";
 import { el } from "../base/dom";
-import { act, ask, AnswerError } from "../server/answers";
+import { AnswerError, act, ask } from "../server/answers";
 
 const RANGES = { "1 day": 86_400, "7 days": 7 * 86_400, "30 days": 30 * 86_400 } as const;
 const POLL_MS = 1500;
 
 export class Analyse {
   readonly node: HTMLElement;
-  private readonly last = el("select", { "aria-label": "Drives of the last" }, ...Object.entries(RANGES).map(([label, seconds]) => el("option", { value: String(seconds) }, `last ${label}`)));
+  private readonly last = el(
+    "select",
+    { "aria-label": "Drives of the last" },
+    ...Object.entries(RANGES).map(([label, seconds]) =>
+      el("option", { value: String(seconds) }, `last ${label}`),
+    ),
+  );
   private readonly button = el("button", { type: "submit", class: "tool" }, "Analyse");
   private robot: string | undefined;
   private run = "";
@@ -45,7 +51,10 @@ export class Analyse {
     this.button.disabled = true;
     this.say("Starting the analysis …");
     try {
-      const { run } = await act<AnalysisStarted>("analyse", { last_s: this.last.value, ...(robot === undefined ? {} : { robot }) });
+      const { run } = await act<AnalysisStarted>("analyse", {
+        last_s: this.last.value,
+        ...(robot === undefined ? {} : { robot }),
+      });
       if (robot !== this.robot) return;
       this.run = run;
       await this.look(run);

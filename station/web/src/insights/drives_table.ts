@@ -9,27 +9,66 @@ import { route } from "../base/route";
 const ROWS = 20;
 
 /** `robot` is undefined for the fleet's drives; `chosen` is the start of the one whose laps are shown. */
-export function drivesTable(drives: readonly DriveEntry[], robot: string | undefined, chosen: number | undefined): HTMLElement {
-  const head = [...(robot === undefined ? ["Robot"] : []), "Start", "Length", "Samples", "Repaired", robot === undefined ? "Result" : "Laps"];
-  const rows = drives.slice(0, ROWS).map((drive) => row(drive, robot === undefined, drive.from_us === chosen));
+export function drivesTable(
+  drives: readonly DriveEntry[],
+  robot: string | undefined,
+  chosen: number | undefined,
+): HTMLElement {
+  const head = [
+    ...(robot === undefined ? ["Robot"] : []),
+    "Start",
+    "Length",
+    "Samples",
+    "Repaired",
+    robot === undefined ? "Result" : "Laps",
+  ];
+  const rows = drives
+    .slice(0, ROWS)
+    .map((drive) => row(drive, robot === undefined, drive.from_us === chosen));
   const failed = drives.filter((drive) => drive.failed !== "").length;
   const title = `Drives: ${drives.length}${failed > 0 ? `, ${failed} could not be analysed` : ""}`;
-  const table = el("table", {}, el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)))), el("tbody", {}, ...rows));
-  return el("section", { class: "panel drives", "aria-label": "Drives" }, el("h3", {}, title), el("div", { class: "log" }, table));
+  const table = el(
+    "table",
+    {},
+    el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)))),
+    el("tbody", {}, ...rows),
+  );
+  return el(
+    "section",
+    { class: "panel drives", "aria-label": "Drives" },
+    el("h3", {}, title),
+    el("div", { class: "log" }, table),
+  );
 }
 
 function row(drive: DriveEntry, named: boolean, chosen: boolean): HTMLElement {
   const { robot, from_us, to_us, samples, failed, repairs, estimates } = drive;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
-  const at = el("a", { href: route({ view: "history", robot, query: { from: writeTime(from), to: writeTime(to) } }) }, when(from));
-  const repaired = Object.entries(repairs).map(([kind, count]) => `${kind.replaceAll("_", " ")} ${number(count)}`);
-  const best = estimates["lap_best_s"];
-  const laps = el("a", { class: "tool", href: route({ view: "insights", robot, query: { drive: writeTime(from) } }), ...(chosen ? { "aria-current": "true" } : {}) }, best ? `best ${number(best.value, 2)} s` : "look for laps");
+  const at = el(
+    "a",
+    { href: route({ view: "history", robot, query: { from: writeTime(from), to: writeTime(to) } }) },
+    when(from),
+  );
+  const repaired = Object.entries(repairs).map(
+    ([kind, count]) => `${kind.replaceAll("_", " ")} ${number(count)}`,
+  );
+  const best = estimates.lap_best_s;
+  const laps = el(
+    "a",
+    {
+      class: "tool",
+      href: route({ view: "insights", robot, query: { drive: writeTime(from) } }),
+      ...(chosen ? { "aria-current": "true" } : {}),
+    },
+    best ? `best ${number(best.value, 2)} s` : "look for laps",
+  );
   const result = failed === "" ? (named ? "analysed" : laps) : failed;
   return el(
     "tr",
     { "data-failed": String(failed !== "") },
-    ...(named ? [el("th", { scope: "row" }, el("a", { href: route({ view: "insights", robot }) }, robot))] : []),
+    ...(named
+      ? [el("th", { scope: "row" }, el("a", { href: route({ view: "insights", robot }) }, robot))]
+      : []),
     el("td", {}, at),
     el("td", {}, age(to - from)),
     el("td", { "data-head": "samples" }, number(samples)),

@@ -21,20 +21,31 @@ export function scale(unit: string, size: number): readonly [factor: number, uni
 /** As many digits as the interval allows. */
 export function digits(low: number, high: number): number | undefined {
   const width = Math.abs(high - low);
-  return Number.isFinite(width) && width > 0 ? Math.max(0, Math.min(6, 1 - Math.floor(Math.log10(width)))) : undefined;
+  return Number.isFinite(width) && width > 0
+    ? Math.max(0, Math.min(6, 1 - Math.floor(Math.log10(width))))
+    : undefined;
 }
 
 /** 41.2 mΩ (39.8 to 42.6) */
 export function words(estimate: EstimateEntry, signed = false): string {
   const [factor, unit] = scale(estimate.unit, estimate.value);
-  const [value, low, high] = [estimate.value, estimate.low, estimate.high].map((each) => each * factor) as [number, number, number];
+  const [value, low, high] = [estimate.value, estimate.low, estimate.high].map((each) => each * factor) as [
+    number,
+    number,
+    number,
+  ];
   const places = digits(low, high);
   const sign = (each: number): string => `${signed && each > 0 ? "+" : ""}${number(each, places)}`;
   return `${sign(value)} ${unit} (${sign(low)} to ${sign(high)})`;
 }
 
 /** The sum of a baseline and a change. */
-export const changed = (usual: EstimateEntry, { value, low, high }: EstimateEntry): EstimateEntry => ({ ...usual, value: usual.value + value, low: usual.value + low, high: usual.value + high });
+export const changed = (usual: EstimateEntry, { value, low, high }: EstimateEntry): EstimateEntry => ({
+  ...usual,
+  value: usual.value + value,
+  low: usual.value + low,
+  high: usual.value + high,
+});
 
 /** A bar from low to high with the value on it; behind it, where it usually is. Without that, it begins at zero. */
 export function intervalBar(now: EstimateEntry, usual: EstimateEntry | null): HTMLElement {
@@ -50,5 +61,11 @@ export function intervalBar(now: EstimateEntry, usual: EstimateEntry | null): HT
   };
   const behind = usual ? part("interval-usual", usual.low, usual.high) : part("interval-zero", 0, 0);
   const said = `${words(now)}${usual ? `, usually ${words(usual)}` : ""}`;
-  return el("span", { class: "interval", role: "img", "aria-label": said }, behind, part("interval-now", now.low, now.high), part("interval-value", now.value, now.value));
+  return el(
+    "span",
+    { class: "interval", role: "img", "aria-label": said },
+    behind,
+    part("interval-now", now.low, now.high),
+    part("interval-value", now.value, now.value),
+  );
 }

@@ -12,15 +12,34 @@ const SEVERITIES = { serious: 0, warning: 1, info: 2 } as const;
 /** The findings, the serious ones first and then the newest; `named` tells whose each is. */
 export function findingsList(findings: readonly FindingEntry[], named: boolean): HTMLElement {
   // The list of drives has those that failed.
-  const shown = findings.filter(({ kind }) => kind !== ANALYSIS_FAILED).sort((a, b) => SEVERITIES[a.severity] - SEVERITIES[b.severity] || b.from_us - a.from_us);
+  const shown = findings
+    .filter(({ kind }) => kind !== ANALYSIS_FAILED)
+    .sort((a, b) => SEVERITIES[a.severity] - SEVERITIES[b.severity] || b.from_us - a.from_us);
   return el("ul", { class: "findings" }, ...shown.map((finding) => item(finding, named)));
 }
 
 function item(finding: FindingEntry, named: boolean): HTMLElement {
   const { robot, kind, severity, meaning, action, text, stream, fields, q, effect, from_us, to_us } = finding;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
-  const query = { ...(stream ? { stream } : {}), from: writeTime(from), to: writeTime(Math.max(to, from + 1)), ...(fields.length > 0 ? { fields: fields.join(",") } : {}) };
-  const chance = q === null ? [] : [el("span", { class: "note", title: "The share of false findings among those that count as sure as this one" }, `false alarms: ${q < 1e-5 ? "less than 0.001" : `${number(q * 100, q < 0.001 ? 3 : 1)}`} % of such findings`)];
+  const query = {
+    ...(stream ? { stream } : {}),
+    from: writeTime(from),
+    to: writeTime(Math.max(to, from + 1)),
+    ...(fields.length > 0 ? { fields: fields.join(",") } : {}),
+  };
+  const chance =
+    q === null
+      ? []
+      : [
+          el(
+            "span",
+            {
+              class: "note",
+              title: "The share of false findings among those that count as sure as this one",
+            },
+            `false alarms: ${q < 1e-5 ? "less than 0.001" : `${number(q * 100, q < 0.001 ? 3 : 1)}`} % of such findings`,
+          ),
+        ];
   return el(
     "li",
     { class: "panel finding", "data-severity": severity, "data-kind": kind },
@@ -35,12 +54,24 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
     el("p", {}, ...marked(capital(text))),
     ...(effect ? [size(finding)] : []),
     el("p", {}, el("b", {}, "What to do: "), ...marked(action)),
-    el("p", { class: "seen" }, el("a", { class: "tool", href: route({ view: "history", robot, query }) }, "Show the evidence"), ...chance),
+    el(
+      "p",
+      { class: "seen" },
+      el("a", { class: "tool", href: route({ view: "history", robot, query }) }, "Show the evidence"),
+      ...chance,
+    ),
   );
 }
 
 function size({ effect, baseline }: FindingEntry): HTMLElement {
   const now = baseline ? changed(baseline, effect!) : effect!;
-  const told = baseline ? [`now ${words(now)}`, `usually ${words(baseline)}`, `change ${words(effect!, true)}`] : [words(now)];
-  return el("div", { class: "effect" }, intervalBar(now, baseline), el("ul", { class: "legend" }, ...told.map((each) => el("li", {}, each))));
+  const told = baseline
+    ? [`now ${words(now)}`, `usually ${words(baseline)}`, `change ${words(effect!, true)}`]
+    : [words(now)];
+  return el(
+    "div",
+    { class: "effect" },
+    intervalBar(now, baseline),
+    el("ul", { class: "legend" }, ...told.map((each) => el("li", {}, each))),
+  );
 }

@@ -40,7 +40,8 @@ export class IotLink extends Link {
   lease({ robots, ...lease }: Lease): void {
     if (this.state.kind !== "live") return;
     const payload = JSON.stringify({ v: SCHEMA_VERSION, ...lease, broker: true });
-    for (const robot of robots) this.client?.publish([VIEW, this.listening.namespace, robot, LEASE].join("/"), payload);
+    for (const robot of robots)
+      this.client?.publish([VIEW, this.listening.namespace, robot, LEASE].join("/"), payload);
   }
 
   protected open(): void {
@@ -74,7 +75,17 @@ export class IotLink extends Link {
     try {
       const { url, client_id } = await socketAddress(identity);
       if (opened !== this.opened) return;
-      client = mqtt.connect(url, { protocolVersion: 5, clientId: client_id, clean: true, reconnectPeriod: 0, resubscribe: false, subscribeBatchSize: MOST_FILTERS, keepalive: KEEPALIVE_S, connectTimeout: CONNECT_S * 1000, timerVariant: "native" });
+      client = mqtt.connect(url, {
+        protocolVersion: 5,
+        clientId: client_id,
+        clean: true,
+        reconnectPeriod: 0,
+        resubscribe: false,
+        subscribeBatchSize: MOST_FILTERS,
+        keepalive: KEEPALIVE_S,
+        connectTimeout: CONNECT_S * 1000,
+        timerVariant: "native",
+      });
     } catch (error) {
       if (opened !== this.opened) return;
       if (error instanceof AnswerError) this.lose(error.message);
@@ -84,18 +95,32 @@ export class IotLink extends Link {
     this.client = client;
     const robots = identity && identity.robots.length > 0 ? identity.robots : ["+"];
     client.on("connect", () =>
-      client.subscribe(robots.map((robot) => [LIVE, namespace, robot, "+"].join("/")), { qos: 0 }, (error, granted) => {
-        if (opened !== this.opened) return;
-        if (error || granted?.some(({ qos }) => qos >= FAILED)) this.lose("AWS IoT refuses the subscription", REFUSED_RETRY_S);
-        else this.connected();
-      }),
+      client.subscribe(
+        robots.map((robot) => [LIVE, namespace, robot, "+"].join("/")),
+        { qos: 0 },
+        (error, granted) => {
+          if (opened !== this.opened) return;
+          if (error || granted?.some(({ qos }) => qos >= FAILED))
+            this.lose("AWS IoT refuses the subscription", REFUSED_RETRY_S);
+          else this.connected();
+        },
+      ),
     );
     client.on("message", (topic, payload) => {
       if (opened !== this.opened) return;
       this.heard();
       this.onMessage(topic, payload);
     });
-    client.on("error", (error) => opened === this.opened && this.lose("code" in error && error.code ? `AWS IoT refuses the connection: ${error.message}` : "AWS IoT cannot be reached"));
+    client.on(
+      "error",
+      (error) =>
+        opened === this.opened &&
+        this.lose(
+          "code" in error && error.code
+            ? `AWS IoT refuses the connection: ${error.message}`
+            : "AWS IoT cannot be reached",
+        ),
+    );
     client.on("close", () => opened === this.opened && this.lose("the connection ended"));
   }
 }

@@ -37,7 +37,10 @@ export abstract class Link {
     self.clearTimeout(this.retry);
     this.close();
     this.heardAt = this.now();
-    this.retry = self.setTimeout(() => this.lose(`${this.other} does not answer`, FIRST_RETRY_S), this.answer_s * 1000);
+    this.retry = self.setTimeout(
+      () => this.lose(`${this.other} does not answer`, FIRST_RETRY_S),
+      this.answer_s * 1000,
+    );
     this.open();
   }
 
@@ -69,11 +72,17 @@ export abstract class Link {
     self.clearTimeout(this.retry);
     this.attempt = 0;
     this.heard();
-    this.change({ kind: "live", downFor: this.state.kind === "lost" ? this.now() - this.state.since : undefined });
+    this.change({
+      kind: "live",
+      downFor: this.state.kind === "lost" ? this.now() - this.state.since : undefined,
+    });
   }
 
   /** The connection is lost, and the next attempt is in `wait` seconds. */
-  protected lose(reason: string, wait = Math.min(LAST_RETRY_S, FIRST_RETRY_S * 2 ** this.attempt) * (0.75 + Math.random() / 2)): void {
+  protected lose(
+    reason: string,
+    wait = Math.min(LAST_RETRY_S, FIRST_RETRY_S * 2 ** this.attempt) * (0.75 + Math.random() / 2),
+  ): void {
     if (this.state.kind === "paused") return;
     this.close();
     this.attempt += 1;
@@ -90,7 +99,8 @@ export abstract class Link {
   }
 
   private async look(): Promise<void> {
-    if (this.state.kind !== "live" || this.probing || !this.visible || this.now() - this.heardAt < PROBE_S) return;
+    if (this.state.kind !== "live" || this.probing || !this.visible || this.now() - this.heardAt < PROBE_S)
+      return;
     this.probing = true;
     const asked = this.now();
     try {

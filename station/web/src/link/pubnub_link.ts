@@ -23,7 +23,12 @@ export class PubNubLink extends Link {
   /** Late statuses of an ended subscription are ignored. */
   private subscribed = false;
 
-  constructor(listening: Listening, now: () => number, onMessage: (channel: string, message: unknown, timetoken: string) => void, onState: (state: LinkState) => void) {
+  constructor(
+    listening: Listening,
+    now: () => number,
+    onMessage: (channel: string, message: unknown, timetoken: string) => void,
+    onState: (state: LinkState) => void,
+  ) {
     super("PubNub", now, onState);
     importScripts("pubnub.min.js");
     this.channel = `${listening.namespace}.*`;

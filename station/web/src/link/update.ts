@@ -1,7 +1,16 @@
 // A live message as Lambda 1 sends it to PubNub (iort_contract.live_update), or as the car sends it to the broker
 // (iort_contract.encode_live), checked field by field. Any other message is rejected with a reason.
 
-import { ABSENT_FROM, BOOT, FIELD_NAME, LIVE, MAX_FIELDS, MAX_NEXT_MS, NAME, type Value } from "../base/contract";
+import {
+  ABSENT_FROM,
+  BOOT,
+  FIELD_NAME,
+  LIVE,
+  MAX_FIELDS,
+  MAX_NEXT_MS,
+  NAME,
+  type Value,
+} from "../base/contract";
 
 export interface Hops {
   readonly sent_us: number;
@@ -26,12 +35,17 @@ export interface Update {
 }
 
 /** PubNub's message as an update, or the reason of its rejection. The channel names the robot, never the body. */
-export function parseUpdate(namespace: string, version: number, channel: string, message: unknown): Update | string {
+export function parseUpdate(
+  namespace: string,
+  version: number,
+  channel: string,
+  message: unknown,
+): Update | string {
   const robot = channel.startsWith(`${namespace}.`) ? channel.slice(namespace.length + 1) : "";
   if (!NAME.test(robot)) return "a channel that names no robot";
   if (!isObject(message)) return "not an object";
   const { stream, hops } = message;
-  if (message["robot"] !== robot) return "another robot's name";
+  if (message.robot !== robot) return "another robot's name";
   if (typeof stream !== "string" || !NAME.test(stream)) return "no stream name";
   if (!isObject(hops)) return "no hop times";
   const { received_ms, lambda_us } = hops;
@@ -40,9 +54,15 @@ export function parseUpdate(namespace: string, version: number, channel: string,
 }
 
 /** A car's own message as an update, or the reason of its rejection. The topic names robot and stream. */
-export function parseLive(namespace: string, version: number, topic: string, payload: Uint8Array): Update | string {
+export function parseLive(
+  namespace: string,
+  version: number,
+  topic: string,
+  payload: Uint8Array,
+): Update | string {
   const [lane, space, robot = "", stream = "", ...more] = topic.split("/");
-  if (lane !== LIVE || space !== namespace || more.length > 0 || !NAME.test(robot) || !NAME.test(stream)) return "a topic that names no robot";
+  if (lane !== LIVE || space !== namespace || more.length > 0 || !NAME.test(robot) || !NAME.test(stream))
+    return "a topic that names no robot";
   let message: unknown;
   try {
     message = JSON.parse(new TextDecoder().decode(payload));
@@ -61,7 +81,12 @@ interface Origin {
 }
 
 /** What both forms have in common; `times` has the car's time of sending. */
-function parse(version: number, message: Record<string, unknown>, times: Record<string, unknown>, { robot, stream, ...hops }: Origin): Update | string {
+function parse(
+  version: number,
+  message: Record<string, unknown>,
+  times: Record<string, unknown>,
+  { robot, stream, ...hops }: Origin,
+): Update | string {
   const { v, boot, seq, t, next_ms = 0, sample } = message;
   if (v !== version) return "another schema version";
   if (typeof boot !== "string" || !BOOT.test(boot)) return "no boot id";
@@ -79,7 +104,16 @@ function parse(version: number, message: Record<string, unknown>, times: Record<
     if (!isValue(value)) return "a value that is neither number, text, true, false nor null";
     values.set(name, absent(name, value) ? null : value);
   }
-  return { robot, stream, boot, seq, t_us: t, next_ms, hops: { ...hops, sent_us, offset_us, offset_known: Object.hasOwn(times, "offset_us") }, sample: values };
+  return {
+    robot,
+    stream,
+    boot,
+    seq,
+    t_us: t,
+    next_ms,
+    hops: { ...hops, sent_us, offset_us, offset_known: Object.hasOwn(times, "offset_us") },
+    sample: values,
+  };
 }
 
 /** Whether a value means that its sensor is not fitted: Lambda 1 has put null there already. */
@@ -97,5 +131,7 @@ function isInteger(value: unknown): value is number {
 }
 
 function isValue(value: unknown): value is Value {
-  return value === null || typeof value === "boolean" || typeof value === "number" || typeof value === "string";
+  return (
+    value === null || typeof value === "boolean" || typeof value === "number" || typeof value === "string"
+  );
 }

@@ -1,8 +1,8 @@
 // The leases that this page holds on cars' live lanes: a car sends at the highest rate that its viewers ask for, and
 // next to nothing without one. A lease ends by itself, so a page that dies costs no more than the rest of it.
 
-import { VIEW_LEASE_MS, VIEW_RENEW_S, type Config } from "../base/contract";
-import { act, AnswerError } from "../server/answers";
+import { type Config, VIEW_LEASE_MS, VIEW_RENEW_S } from "../base/contract";
+import { AnswerError, act } from "../server/answers";
 import type { Lease } from "./worker_messages";
 
 /** The rate of a card among others, and of a value beside the past. */
@@ -25,7 +25,9 @@ export class Viewing {
   private readonly connected: boolean;
   /** Why the newest lease was not sent. */
   error = "";
-  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
+  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) =>
+    b.toString(16).padStart(2, "0"),
+  ).join("");
   private looks = NONE;
   private held = NONE;
 
@@ -63,7 +65,11 @@ export class Viewing {
   private hold(looks = document.hidden ? NONE : this.looks, again = false): void {
     const asked = [...looks].filter(([robot, rate_hz]) => again || this.held.get(robot) !== rate_hz);
     for (const rate_hz of new Set(asked.map(([, each_hz]) => each_hz))) {
-      this.send(asked.flatMap(([robot, each_hz]) => (each_hz === rate_hz ? [robot] : [])), rate_hz, VIEW_LEASE_MS);
+      this.send(
+        asked.flatMap(([robot, each_hz]) => (each_hz === rate_hz ? [robot] : [])),
+        rate_hz,
+        VIEW_LEASE_MS,
+      );
     }
     const ended = [...this.held.keys()].filter((robot) => !looks.has(robot));
     if (ended.length > 0) this.send(ended, GLANCE_HZ, 0);
@@ -77,7 +83,13 @@ export class Viewing {
       this.lease({ robots, viewer, rate_hz, lease_ms });
       return;
     }
-    const asked = { robots: robots.join(","), viewer, rate_hz: String(rate_hz), lease_ms: String(lease_ms), ...(this.connected ? { broker: "yes" } : {}) };
+    const asked = {
+      robots: robots.join(","),
+      viewer,
+      rate_hz: String(rate_hz),
+      lease_ms: String(lease_ms),
+      ...(this.connected ? { broker: "yes" } : {}),
+    };
     act("view", asked, { keepalive: lease_ms === 0 })
       .then(() => {
         this.error = "";

@@ -10,7 +10,8 @@ export type LinkState =
   | { readonly kind: "lost"; readonly since: number; readonly retryAt: number; readonly reason: string };
 
 /** The settings of the subscription. */
-export interface Listening extends Pick<Config, "namespace" | "live" | "identity" | "subscribe_key" | "origin" | "tls" | "token"> {
+export interface Listening
+  extends Pick<Config, "namespace" | "live" | "identity" | "subscribe_key" | "origin" | "tls" | "token"> {
   readonly version: number;
   readonly user: string;
 }
@@ -48,4 +49,8 @@ export interface Refused {
 
 export type FromWorker =
   | { readonly kind: "state"; readonly state: LinkState }
-  | { readonly kind: "arrivals"; readonly arrivals: readonly Arrival[]; readonly refused: readonly Refused[] };
+  | {
+      readonly kind: "arrivals";
+      readonly arrivals: readonly Arrival[];
+      readonly refused: readonly Refused[];
+    };

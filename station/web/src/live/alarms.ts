@@ -1,8 +1,14 @@
 // The alarms: the cloud's by the server's answer, and the cars' own by their live values.
 
-import { CAR_ALARMS, type AlarmEntry, type AlarmsAnswer, type Config, type FieldTable } from "../base/contract";
+import {
+  type AlarmEntry,
+  type AlarmsAnswer,
+  CAR_ALARMS,
+  type Config,
+  type FieldTable,
+} from "../base/contract";
 import { number } from "../base/format";
-import { act, ask, AnswerError } from "../server/answers";
+import { AnswerError, act, ask } from "../server/answers";
 import type { Fleet } from "./fleet";
 import { hottest, type Robot } from "./robot";
 import { numeric } from "./stream";
@@ -73,13 +79,23 @@ export class Alarms {
   raised(now: number): Raised[] {
     const states = this.states(now);
     const known = new Map((this.entries ?? []).map((entry) => [entry.key, entry]));
-    const keys = new Set([...(this.entries ?? []).filter(({ state }) => state === "ALARM").map(({ key }) => key), ...states.keys()]);
+    const keys = new Set([
+      ...(this.entries ?? []).filter(({ state }) => state === "ALARM").map(({ key }) => key),
+      ...states.keys(),
+    ]);
     const found = [...keys].map((key) => {
       const entry = known.get(key);
       const cars = states.get(key as CarAlarm) ?? [];
       const seen = entry?.state === "ALARM" ? entry.acknowledged : null;
       const { meaning, advice } = entry ?? CAR_ALARMS[key as CarAlarm];
-      return { key, meaning, advice, entry, cars, fresh: !seen || cars.some(({ since }) => since > seen.at_s) };
+      return {
+        key,
+        meaning,
+        advice,
+        entry,
+        cars,
+        fresh: !seen || cars.some(({ since }) => since > seen.at_s),
+      };
     });
     return found.sort((a, b) => Number(b.fresh) - Number(a.fresh));
   }

@@ -9,7 +9,17 @@ export const DEEP_S = 1800;
 // 30 s at 16 Hz, as the live lane carries at most 10. A full fleet keeps at most 64 MB of columns, a watched car as
 // many columns again as its streams may have, of at most 12 MB a stream.
 export const BOUNDS = {
-  rows: 512, delays: 2048, columns: 8192, watched: 2048, cells: 1_500_000, robots: 1024, streams: 32, boots: 8, faults: 100, lines: 100, claims: 4,
+  rows: 512,
+  delays: 2048,
+  columns: 8192,
+  watched: 2048,
+  cells: 1_500_000,
+  robots: 1024,
+  streams: 32,
+  boots: 8,
+  faults: 100,
+  lines: 100,
+  claims: 4,
 } as const;
 
 /** The most rows of a watched ring of `width` columns. */

@@ -1,10 +1,10 @@
 // Starts the page's worker, and hands its messages to the fleet.
 
-import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
+import type { Config, FieldTable } from "../base/contract";
 import { keep, kept } from "../base/kept";
-import type { Fleet } from "./fleet";
 import type { FromWorker, Lease, LinkState, ToWorker } from "../link/worker_messages";
+import type { Fleet } from "./fleet";
 
 export class Feed {
   state: LinkState = { kind: "connecting" };
@@ -21,13 +21,23 @@ export class Feed {
       }
     });
     this.worker.addEventListener("error", (event) => {
-      this.state = { kind: "lost", since: now(), retryAt: now(), reason: `the page's worker failed: ${event.message}` };
+      this.state = {
+        kind: "lost",
+        since: now(),
+        retryAt: now(),
+        reason: `the page's worker failed: ${event.message}`,
+      };
       onState(this.state);
     });
     const { namespace, live, identity, subscribe_key, origin, tls, token } = config;
     const { version } = table;
-    this.tell({ kind: "start", listening: { namespace, live, identity, version, subscribe_key, origin, tls, token, user: userId() } });
-    document.addEventListener("visibilitychange", () => this.tell({ kind: "visible", visible: !document.hidden }));
+    this.tell({
+      kind: "start",
+      listening: { namespace, live, identity, version, subscribe_key, origin, tls, token, user: userId() },
+    });
+    document.addEventListener("visibilitychange", () =>
+      this.tell({ kind: "visible", visible: !document.hidden }),
+    );
   }
 
   /** Ask cars for their live messages over the page's own connection. */

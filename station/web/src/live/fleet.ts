@@ -1,12 +1,12 @@
 // Every car that this page has heard. Names come from the network, so the number of cars is bounded.
 
-import type { Linear } from "../base/format";
-import { ask, AnswerError } from "../server/answers";
 import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
+import type { Linear } from "../base/format";
+import type { Arrival, Refused } from "../link/worker_messages";
+import { AnswerError, ask } from "../server/answers";
 import { BOUNDS } from "./bounds";
 import { Robot } from "./robot";
 import { Stream, type Used } from "./stream";
-import type { Arrival, Refused } from "../link/worker_messages";
 
 export class Fleet {
   readonly robots = new Map<string, Robot>();
@@ -64,7 +64,13 @@ export class Fleet {
     const sent_us = update.hops.sent_us + offset_us;
     // A message that came straight from the broker has one leg from the car to here.
     const last_us = wall_us - (pubnub_us ?? sent_us);
-    const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, (pubnub_us ?? NaN) - lambda_us, last_us];
+    const legs = [
+      update.hops.sent_us - update.t_us,
+      received_ms * 1e3 - sent_us,
+      lambda_us - received_ms * 1e3,
+      (pubnub_us ?? NaN) - lambda_us,
+      last_us,
+    ];
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 
@@ -72,13 +78,18 @@ export class Fleet {
     this.malformed += messages;
     this.lastRefusal = robot ? `${robot}: ${reason}` : reason;
     if (robot && (this.refused.has(robot) || this.refused.size < BOUNDS.robots)) {
-      this.refused.set(robot, { robot, messages: (this.refused.get(robot)?.messages ?? 0) + messages, reason });
+      this.refused.set(robot, {
+        robot,
+        messages: (this.refused.get(robot)?.messages ?? 0) + messages,
+        reason,
+      });
     }
   }
 
   /** The conversion from erpm to m/s; undefined if the car's parameters are unknown. */
   speed(robot: string): Linear | undefined {
-    const { speed_to_erpm_gain: gain, speed_to_erpm_offset: offset = 0 } = (Object.hasOwn(this.vehicles, robot) && this.vehicles[robot]) || {};
+    const { speed_to_erpm_gain: gain, speed_to_erpm_offset: offset = 0 } =
+      (Object.hasOwn(this.vehicles, robot) && this.vehicles[robot]) || {};
     return gain ? { scale: 1 / gain, shift: offset === 0 ? 0 : -offset / gain } : undefined;
   }
 

@@ -15,5 +15,11 @@ export interface Line {
 export function lineOf(t_us: number, field: (name: string) => Value | undefined): Line | undefined {
   const [text, left] = [field("text"), field("left_out")];
   if (typeof text !== "string") return undefined;
-  return { t_us, level: String(field("level") ?? ""), logger: String(field("logger") ?? ""), text, leftOut: typeof left === "number" ? left : 0 };
+  return {
+    t_us,
+    level: String(field("level") ?? ""),
+    logger: String(field("logger") ?? ""),
+    text,
+    leftOut: typeof left === "number" ? left : 0,
+  };
 }

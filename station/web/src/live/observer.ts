@@ -1,10 +1,10 @@
 // The page's state for tests and for the browser's console; every access makes a copy, so it is read-only.
 
 import { now } from "../base/clock";
-import type { Feed } from "./feed";
-import type { Fleet } from "./fleet";
 import { GONE_S, STALE_S } from "../base/contract";
 import { BOUNDS } from "./bounds";
+import type { Feed } from "./feed";
+import type { Fleet } from "./fleet";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>
@@ -14,11 +14,32 @@ export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
         const streams = [...robot.streams.values()].map((stream) => {
           const { name, boot, seq, t_us, hops, sample, received, takenAt, history } = stream;
           const kept = { rows: history.length, columns: history.width };
-          return [name, { boot, seq, t: t_us, hops: { ...hops }, sample: Object.fromEntries(sample), received, age_s: at - takenAt, kept }];
+          return [
+            name,
+            {
+              boot,
+              seq,
+              t: t_us,
+              hops: { ...hops },
+              sample: Object.fromEntries(sample),
+              received,
+              age_s: at - takenAt,
+              kept,
+            },
+          ];
         });
         const delay_ms = { newest: robot.newestDelay(), median: robot.medianDelay(at) };
         const silent_s = at - robot.heardAt;
-        return [robot.name, { state: robot.freshness(at), silent_s, streams: Object.fromEntries(streams), delay_ms, faults: robot.faults.length }];
+        return [
+          robot.name,
+          {
+            state: robot.freshness(at),
+            silent_s,
+            streams: Object.fromEntries(streams),
+            delay_ms,
+            faults: robot.faults.length,
+          },
+        ];
       }),
     );
   return Object.freeze({

@@ -1,8 +1,8 @@
 // Fills the charts of a watched car with what was recorded before this page heard it, from the page's server.
 
-import { LOG_STREAM, type Config, type HistoryAnswer } from "../base/contract";
 import { now } from "../base/clock";
-import { ask, AnswerError } from "../server/answers";
+import { type Config, type HistoryAnswer, LOG_STREAM } from "../base/contract";
+import { AnswerError, ask } from "../server/answers";
 import type { Robot } from "./robot";
 import type { Stream } from "./stream";
 
@@ -40,7 +40,8 @@ export class Past {
       const first = !this.asked.has(stream);
       this.asked.set(stream, from);
       this.ask(robot, stream, from, to);
-      if (first) window.setTimeout(() => this.robot === robot && this.join(robot, stream, heard), RECORDED_S * 1000);
+      if (first)
+        window.setTimeout(() => this.robot === robot && this.join(robot, stream, heard), RECORDED_S * 1000);
     }
   }
 
@@ -56,7 +57,13 @@ export class Past {
     // From the car's clock to the page's.
     const shift = stream.takenAt - stream.t_us / 1e6;
     const us = (at: number): string => String(Math.round((at - shift) * 1e6));
-    const asked = { robot: robot.name, stream: stream.name, from_us: us(from), to_us: us(to), rows: String(ROWS) };
+    const asked = {
+      robot: robot.name,
+      stream: stream.name,
+      from_us: us(from),
+      to_us: us(to),
+      rows: String(ROWS),
+    };
     this.queue = this.queue.then(async () => {
       if (signal.aborted) return;
       try {
@@ -84,7 +91,13 @@ function add(stream: Stream, answer: HistoryAnswer, shift: number, before: numbe
   for (const [field, { mean }] of Object.entries(answer.fields)) {
     const values = rows.map((row) => mean[row]);
     if (!values.some((value) => typeof value === "number")) continue;
-    fields.set(field, Float64Array.from(values, (value) => (typeof value === "number" ? value : NaN)));
+    fields.set(
+      field,
+      Float64Array.from(values, (value) => (typeof value === "number" ? value : NaN)),
+    );
   }
-  stream.prefill(rows.map((row) => answer.times_s[row]! + shift), fields);
+  stream.prefill(
+    rows.map((row) => answer.times_s[row]! + shift),
+    fields,
+  );
 }

@@ -1,7 +1,7 @@
 // The registered cars, asked from the page's server while somebody looks; a static site knows only the cars that it hears.
 
 import type { Config, RobotPresence, RobotsAnswer, TagsAnswer } from "../base/contract";
-import { ask, AnswerError } from "../server/answers";
+import { AnswerError, ask } from "../server/answers";
 
 const REFRESH_S = 30;
 

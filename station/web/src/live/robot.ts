@@ -1,8 +1,16 @@
 // One car: its streams, the delays and the faults. Nothing here touches the page; times are those of base/clock.ts.
 
-import { DRIVE_STREAM, GONE_S, LOG_STREAM, STALE_S, TEMPERATURES, type FieldTable, type Value } from "../base/contract";
+import {
+  DRIVE_STREAM,
+  type FieldTable,
+  GONE_S,
+  LOG_STREAM,
+  STALE_S,
+  TEMPERATURES,
+  type Value,
+} from "../base/contract";
 import { BOUNDS, DEEP_S, deepRows, MEDIAN_S, WINDOW_S } from "./bounds";
-import { lineOf, type Line } from "./lines";
+import { type Line, lineOf } from "./lines";
 import { Ring } from "./ring";
 import type { Stream } from "./stream";
 
@@ -92,7 +100,8 @@ export class Robot {
   driver(now: number): string | undefined {
     const stream = this.streams.get(DRIVE_STREAM);
     const left_ms = stream?.sample.get("lease_left_ms");
-    if (!stream?.sample.get("driver") || typeof left_ms !== "number" || now > stream.heardAt + left_ms / 1000) return undefined;
+    if (!stream?.sample.get("driver") || typeof left_ms !== "number" || now > stream.heardAt + left_ms / 1000)
+      return undefined;
     const by = stream.sample.get("driver_by");
     return typeof by === "string" ? by : "somebody";
   }
@@ -111,7 +120,8 @@ export class Robot {
 
   /** Keep the newest line of the agent's log. */
   logLine(stream: Stream): void {
-    const line = stream.name === LOG_STREAM ? lineOf(stream.t_us, (name) => stream.sample.get(name)) : undefined;
+    const line =
+      stream.name === LOG_STREAM ? lineOf(stream.t_us, (name) => stream.sample.get(name)) : undefined;
     if (!line) return;
     this.lines.push(line);
     if (this.lines.length > BOUNDS.lines) this.lines.shift();

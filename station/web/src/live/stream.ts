@@ -1,10 +1,10 @@
 // One stream of a car: the newest sample, and the values of the last seconds. A watched car's go back further.
 
 import type { FieldTable, Value } from "../base/contract";
-import { claim, claimed, type Claim } from "./attachments";
+import type { Hops, Update } from "../link/update";
+import { type Claim, claim, claimed } from "./attachments";
 import { BOUNDS, DEEP_S, deepRows, WINDOW_S } from "./bounds";
 import { Ring } from "./ring";
-import type { Hops, Update } from "../link/update";
 
 /** The field that the fleet's cards draw; it is kept when the columns of all cars are used up. */
 export const CARD_FIELD = "speed";
@@ -43,7 +43,13 @@ export class Stream {
   boot = "";
   seq = -1;
   t_us = 0;
-  hops: Hops = { sent_us: 0, received_ms: undefined, lambda_us: undefined, offset_us: 0, offset_known: false };
+  hops: Hops = {
+    sent_us: 0,
+    received_ms: undefined,
+    lambda_us: undefined,
+    offset_us: 0,
+    offset_known: false,
+  };
   sample: ReadonlyMap<string, Value> = new Map();
   /** The newest sample's time on the page's clock, as if it were as fast as the fastest message. */
   takenAt = -Infinity;
@@ -139,12 +145,18 @@ export class Stream {
     this.version += 1;
     this.arrivals.push([now]);
     for (const [field, value] of update.sample) {
-      if (typeof value === "number" && !Number.isInteger(value) && this.table.fields[field]?.ros2_unit !== undefined) this.ros2 = true;
+      if (
+        typeof value === "number" &&
+        !Number.isInteger(value) &&
+        this.table.fields[field]?.ros2_unit !== undefined
+      )
+        this.ros2 = true;
     }
     if (!(this.takenAt <= this.history.last(0))) this.keep(update.sample);
     for (const field of claimed(update.sample).slice(0, BOUNDS.claims)) {
       const kept = claim(field, (name) => update.sample.get(name));
-      if (kept && (this.claims.has(field) || this.claims.size < BOUNDS.claims)) this.claims.set(field, { claim: kept, takenAt: this.takenAt });
+      if (kept && (this.claims.has(field) || this.claims.size < BOUNDS.claims))
+        this.claims.set(field, { claim: kept, takenAt: this.takenAt });
     }
     return true;
   }

@@ -1,9 +1,9 @@
 // The server's key, without which a browser may only look. It comes once, for the token in the address that the
 // server's terminal shows, and is kept in this browser.
 
-import { INVITATION, type Admitted, type Config } from "../base/contract";
+import { type Admitted, type Config, INVITATION } from "../base/contract";
 import { keep, kept } from "../base/kept";
-import { act, AnswerError, KEPT_KEY } from "./answers";
+import { AnswerError, act, KEPT_KEY } from "./answers";
 
 const IN_ADDRESS = new RegExp(`[?&]${INVITATION}=([\\w-]+)`);
 let admitted = false;
@@ -33,7 +33,8 @@ export async function enter(config: Config): Promise<void> {
 }
 
 /** Whether the server takes an action, and takes it from this browser. */
-export const may = (config: Config, action: string): boolean => config.actions.includes(action) && (admitted || !config.keyed.includes(action));
+export const may = (config: Config, action: string): boolean =>
+  config.actions.includes(action) && (admitted || !config.keyed.includes(action));
 
 /** Why this browser may only look; empty if it may act, or if nobody may. */
 export const readOnly = (config: Config): string => (admitted || config.keyed.length === 0 ? "" : refusal);

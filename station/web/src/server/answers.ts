@@ -13,23 +13,45 @@ type Parameters = Readonly<Record<string, string>>;
 
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
 export function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
-  return laneOf(name).run(async (end) => (await (await get(`${name}.json`, parameters, end)).json()) as T, signal);
+  return laneOf(name).run(
+    async (end) => (await (await get(`${name}.json`, parameters, end)).json()) as T,
+    signal,
+  );
 }
 
 /**
  * Have the server change something, with `keepalive` even if the page is closed meanwhile. Throws `AnswerError` if it
  * does not, or if the change is refused.
  */
-export function act<T>(name: string, parameters: Parameters, { keepalive = false, signal }: { readonly keepalive?: boolean; readonly signal?: AbortSignal } = {}): Promise<T> {
+export function act<T>(
+  name: string,
+  parameters: Parameters,
+  { keepalive = false, signal }: { readonly keepalive?: boolean; readonly signal?: AbortSignal } = {},
+): Promise<T> {
   const headers = { "Content-Type": "application/json", [KEY_HEADER]: kept(KEPT_KEY) ?? "" };
-  const request: RequestInit = { method: "POST", priority: "high", keepalive, headers, body: JSON.stringify(parameters) };
+  const request: RequestInit = {
+    method: "POST",
+    priority: "high",
+    keepalive,
+    headers,
+    body: JSON.stringify(parameters),
+  };
   // The last word of a page that is closed cannot wait.
   const lane = keepalive ? AT_ONCE : laneOf(name);
-  return lane.run(async (end) => (await (await answered(`${name}.json`, { ...request, ...(end ? { signal: end } : {}) })).json()) as T, signal);
+  return lane.run(
+    async (end) =>
+      (await (await answered(`${name}.json`, { ...request, ...(end ? { signal: end } : {}) })).json()) as T,
+    signal,
+  );
 }
 
 /** Ask for a file, and report the bytes received; throws `AnswerError` also if the file is cut off. */
-export function download(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<Downloaded> {
+export function download(
+  name: string,
+  parameters: Parameters,
+  received: (size: number) => void,
+  signal: AbortSignal,
+): Promise<Downloaded> {
   return laneOf(name).run(() => downloaded(name, parameters, received, signal), signal);
 }
 
@@ -38,7 +60,12 @@ interface Downloaded {
   readonly name: string;
 }
 
-async function downloaded(name: string, parameters: Parameters, received: (size: number) => void, signal: AbortSignal): Promise<Downloaded> {
+async function downloaded(
+  name: string,
+  parameters: Parameters,
+  received: (size: number) => void,
+  signal: AbortSignal,
+): Promise<Downloaded> {
   const answer = await get(name, parameters, signal);
   const parts: Uint8Array<ArrayBuffer>[] = [];
   let size = 0;
@@ -51,14 +78,19 @@ async function downloaded(name: string, parameters: Parameters, received: (size:
     }
   } catch (error) {
     if (signal.aborted) throw error;
-    throw new AnswerError("The download was cut off, and nothing was saved. The server's terminal has the reason.");
+    throw new AnswerError(
+      "The download was cut off, and nothing was saved. The server's terminal has the reason.",
+    );
   }
   const named = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1];
   return { content: new Blob(parts), name: named ?? name };
 }
 
 function get(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
-  return answered(`${name}?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+  return answered(`${name}?${new URLSearchParams(parameters).toString()}`, {
+    cache: "no-store",
+    ...(signal ? { signal } : {}),
+  });
 }
 
 async function answered(address: string, request: RequestInit): Promise<Response> {
@@ -71,7 +103,10 @@ async function answered(address: string, request: RequestInit): Promise<Response
   }
   if (answer.ok) return answer;
   const body = (await answer.json().catch(() => ({}))) as { error?: unknown };
-  throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
+  throw new AnswerError(
+    typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`,
+  );
 }
 
-const isTimeout = (reason: unknown): boolean => reason instanceof DOMException && reason.name === "TimeoutError";
+const isTimeout = (reason: unknown): boolean =>
+  reason instanceof DOMException && reason.name === "TimeoutError";

@@ -26,7 +26,11 @@ class Lane {
   async run<T>(work: Work<T>, signal?: AbortSignal): Promise<T> {
     const free = await ("locks" in navigator ? this.shared(signal) : this.own(signal));
     try {
-      return await work(this.most_ms === undefined ? signal : AbortSignal.any([...(signal ? [signal] : []), AbortSignal.timeout(this.most_ms)]));
+      return await work(
+        this.most_ms === undefined
+          ? signal
+          : AbortSignal.any([...(signal ? [signal] : []), AbortSignal.timeout(this.most_ms)]),
+      );
     } finally {
       free();
     }
@@ -45,7 +49,9 @@ class Lane {
         return new Promise((free) => taken(free));
       };
       for (let place = 0; place < this.places; place += 1) {
-        navigator.locks.request(`iort.${this.name}.${place}`, { signal: end }, take).catch((error: unknown) => !has && failed(error));
+        navigator.locks
+          .request(`iort.${this.name}.${place}`, { signal: end }, take)
+          .catch((error: unknown) => !has && failed(error));
       }
     });
   }
@@ -68,6 +74,13 @@ const SOON = new Lane("soon", 1, 5_000);
 export const AT_ONCE = { run: <T>(work: Work<T>, signal?: AbortSignal): Promise<T> => work(signal) };
 
 // The rest is reading, or takes its time as reading does.
-const LANES: Readonly<Record<string, Pick<Lane, "run">>> = { stop: AT_ONCE, drive: AT_ONCE, key: AT_ONCE, motion: SOON, view: SOON };
+const LANES: Readonly<Record<string, Pick<Lane, "run">>> = {
+  stop: AT_ONCE,
+  drive: AT_ONCE,
+  key: AT_ONCE,
+  motion: SOON,
+  view: SOON,
+};
 
-export const laneOf = (name: string): Pick<Lane, "run"> => (Object.hasOwn(LANES, name) ? LANES[name]! : READING);
+export const laneOf = (name: string): Pick<Lane, "run"> =>
+  Object.hasOwn(LANES, name) ? LANES[name]! : READING;

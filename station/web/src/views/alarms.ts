@@ -1,12 +1,13 @@
 // The alarms: what is wrong, since when, what to do, where to look; and who has seen it.
 
 import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
-import { ask, AnswerError } from "../server/answers";
 import { el, marked, Text } from "../base/dom";
 import { capital, when } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { route } from "../base/route";
 import type { Alarms, CarState, Raised } from "../live/alarms";
+import { AnswerError, ask } from "../server/answers";
+import type { Services, View } from "./view";
 
 // The part of a car's past that a link shows. A cloud's alarm goes off minutes after its cause.
 const BEFORE_S = 60;
@@ -14,10 +15,17 @@ const CLOUD_BEFORE_S = 300;
 const AFTER_S = 60;
 const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;
 
-export class AlarmsView {
+export class AlarmsView implements View {
   readonly node: HTMLElement;
+  private readonly config: Config;
+  private readonly alarms: Alarms;
   private readonly note = new Text("history-note", "p", { role: "status" });
-  private readonly name = el("input", { id: "acknowledge-as", name: "acknowledge-as", autocomplete: "name", maxlength: "64" });
+  private readonly name = el("input", {
+    id: "acknowledge-as",
+    name: "acknowledge-as",
+    autocomplete: "name",
+    maxlength: "64",
+  });
   private readonly list = el("ul", { class: "raised" });
   private readonly none = el("p", { class: "unserved" }, "No alarm is raised.");
   private readonly quiet = el("tbody");
@@ -28,24 +36,48 @@ export class AlarmsView {
   private quietDrawn: unknown;
   private failure = "";
 
-  constructor(
-    private readonly config: Config,
-    private readonly alarms: Alarms,
-  ) {
+  constructor({ config, alarms }: Services) {
+    this.config = config;
+    this.alarms = alarms;
     this.name.value = kept("name") ?? "";
     this.name.addEventListener("change", () => keep("name", this.name.value));
-    const told = el("p", { class: "unserved" }, "This page was put on the web as it is: it sees only what the cars send. Run ", el("code", {}, "iort dashboard"), " for the cloud's alarms.");
+    const told = el(
+      "p",
+      { class: "unserved" },
+      "This page was put on the web as it is: it sees only what the cars send. Run ",
+      el("code", {}, "iort dashboard"),
+      " for the cloud's alarms.",
+    );
     const others = el(
       "details",
       { class: "panel quiet" },
       el("summary", {}, this.count.node),
-      el("div", { class: "log" }, el("table", {}, el("thead", {}, el("tr", {}, ...["Alarm", "Meaning", "State", "What to do"].map((text) => el("th", { scope: "col" }, text)))), this.quiet)),
+      el(
+        "div",
+        { class: "log" },
+        el(
+          "table",
+          {},
+          el(
+            "thead",
+            {},
+            el(
+              "tr",
+              {},
+              ...["Alarm", "Meaning", "State", "What to do"].map((text) => el("th", { scope: "col" }, text)),
+            ),
+          ),
+          this.quiet,
+        ),
+      ),
     );
     this.node = el(
       "article",
       { class: "alarms-view" },
       el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Alarms"), this.note.node),
-      ...(config.answers ? [el("p", { class: "range" }, el("label", {}, "acknowledge as ", this.name))] : [told]),
+      ...(config.answers
+        ? [el("p", { class: "range" }, el("label", {}, "acknowledge as ", this.name))]
+        : [told]),
       this.none,
       this.list,
       ...(config.answers ? [others] : []),
@@ -53,16 +85,28 @@ export class AlarmsView {
   }
 
   /** Update what changes; an alarm that has not changed keeps its node, and with it the focus. */
+  title(): string {
+    return "Alarms · iort";
+  }
+
+  /** The alarms are the same, whatever the address says. */
+  show(): void {}
+
   clock(now: number): void {
     const { entries, error, askedAt, user } = this.alarms;
     this.name.placeholder = user;
-    this.note.set(this.failure || error || (entries ? `as of ${when(askedAt)}` : this.config.answers ? "Loading …" : ""));
+    this.note.set(
+      this.failure || error || (entries ? `as of ${when(askedAt)}` : this.config.answers ? "Loading …" : ""),
+    );
     const raised = this.alarms.raised(now);
-    if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt) void this.find(askedAt);
+    if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt)
+      void this.find(askedAt);
     this.none.hidden = raised.length > 0 || (this.config.answers && entries === undefined);
     const shown = raised.map((alarm) => this.card(alarm));
-    if (shown.some((node, i) => this.list.children[i] !== node) || this.list.children.length !== shown.length) this.list.replaceChildren(...shown);
-    for (const key of this.cards.keys()) if (!raised.some((alarm) => alarm.key === key)) this.cards.delete(key);
+    if (shown.some((node, i) => this.list.children[i] !== node) || this.list.children.length !== shown.length)
+      this.list.replaceChildren(...shown);
+    for (const key of this.cards.keys())
+      if (!raised.some((alarm) => alarm.key === key)) this.cards.delete(key);
     if (this.quietDrawn !== entries) {
       this.quietDrawn = entries;
       const others = (entries ?? []).filter(({ state }) => state !== "ALARM");
@@ -94,14 +138,22 @@ export class AlarmsView {
     const node = el(
       "li",
       { class: "panel alarm", "data-alarm": key, "data-fresh": String(fresh) },
-      el("header", {}, el("h3", {}, capital(meaning)), el("code", { class: "note" }, key), el("span", { class: "note" }, since)),
+      el(
+        "header",
+        {},
+        el("h3", {}, capital(meaning)),
+        el("code", { class: "note" }, key),
+        el("span", { class: "note" }, since),
+      ),
       el("p", {}, el("b", {}, "What to do: "), ...marked(advice)),
       ...(cars.length > 0 ? [el("ul", { class: "cases" }, ...cars.map(live))] : []),
       ...(entry?.state === "ALARM" ? evidence(entry, messages) : []),
       el(
         "p",
         { class: "seen" },
-        ...(seen ? [`Acknowledged by ${seen.by}, ${when(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])] : []),
+        ...(seen
+          ? [`Acknowledged by ${seen.by}, ${when(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])]
+          : []),
         ...(entry?.state === "ALARM" && fresh ? [button] : []),
       ),
     );
@@ -122,17 +174,43 @@ export class AlarmsView {
 }
 
 /** Where more is known about an alarm of the cloud. */
-function evidence({ evidence, robots, named, since_s }: AlarmEntry, messages: RejectedAnswer | undefined): HTMLElement[] {
-  if (evidence === "logs") return [el("p", {}, el("a", { class: "tool", href: route({ view: "cloudwatch" }) }, "Newest warnings and errors"))];
+function evidence(
+  { evidence, robots, named, since_s }: AlarmEntry,
+  messages: RejectedAnswer | undefined,
+): HTMLElement[] {
+  if (evidence === "logs")
+    return [
+      el(
+        "p",
+        {},
+        el("a", { class: "tool", href: route({ view: "cloudwatch" }) }, "Newest warnings and errors"),
+      ),
+    ];
   if (evidence === "quarantine") {
     if (!messages) return [];
     const { rejected, found } = messages;
-    const told = found === 0 ? "Nothing is in quarantine now." : found > rejected.length ? `The newest ${rejected.length} of ${found} messages in quarantine:` : "In quarantine:";
+    const told =
+      found === 0
+        ? "Nothing is in quarantine now."
+        : found > rejected.length
+          ? `The newest ${rejected.length} of ${found} messages in quarantine:`
+          : "In quarantine:";
     return [el("p", {}, told), el("ul", { class: "cases" }, ...rejected.map(message))];
   }
   if (robots.length === 0) return [];
-  const links = robots.map((robot) => el("li", {}, past(robot, since_s - CLOUD_BEFORE_S, since_s + AFTER_S, robot)));
-  return [el("p", {}, named ? "The cars that an alert has named, at that time:" : "The cars that were connected, at that time:"), el("ul", { class: "cases across" }, ...links)];
+  const links = robots.map((robot) =>
+    el("li", {}, past(robot, since_s - CLOUD_BEFORE_S, since_s + AFTER_S, robot)),
+  );
+  return [
+    el(
+      "p",
+      {},
+      named
+        ? "The cars that an alert has named, at that time:"
+        : "The cars that were connected, at that time:",
+    ),
+    el("ul", { class: "cases across" }, ...links),
+  ];
 }
 
 function live({ robot, text, since }: CarState): HTMLElement {
@@ -151,7 +229,9 @@ function message({ id, robot, topic, source, reason, last_s, seen }: Rejected): 
   return el(
     "li",
     {},
-    robot === "-" ? el("span", { class: "note" }, at) : past(robot, last_s - BEFORE_S, last_s + AFTER_S, `${robot}, ${at}`),
+    robot === "-"
+      ? el("span", { class: "note" }, at)
+      : past(robot, last_s - BEFORE_S, last_s + AFTER_S, `${robot}, ${at}`),
     el("span", {}, reason),
     el("span", { class: "note" }, `${source} ${topic}`),
     el("code", {}, `iort errors ${id}`),
@@ -161,9 +241,20 @@ function message({ id, robot, topic, source, reason, last_s, seen }: Rejected): 
 /** A link to a car's past. */
 function past(robot: string, from_s: number, to_s: number, text: string): HTMLElement {
   const at = (seconds: number): string => new Date(seconds * 1000).toISOString();
-  return el("a", { class: "tool", href: route({ view: "history", robot, query: { from: at(from_s), to: at(to_s) } }) }, text);
+  return el(
+    "a",
+    { class: "tool", href: route({ view: "history", robot, query: { from: at(from_s), to: at(to_s) } }) },
+    text,
+  );
 }
 
 function row({ key, meaning, state, since_s, advice }: AlarmEntry): HTMLElement {
-  return el("tr", {}, el("td", {}, el("code", {}, key)), el("td", { class: "words" }, meaning), el("td", {}, `${STATES[state]} since ${when(since_s)}`), el("td", { class: "words" }, ...marked(advice)));
+  return el(
+    "tr",
+    {},
+    el("td", {}, el("code", {}, key)),
+    el("td", { class: "words" }, meaning),
+    el("td", {}, `${STATES[state]} since ${when(since_s)}`),
+    el("td", { class: "words" }, ...marked(advice)),
+  );
 }

@@ -1,35 +1,42 @@
 // One car in full: gauges, the viewer's charts, the delay by hop, faults, and every field of every stream.
 
-import { LOG_STREAM, type Config, type FieldTable } from "../base/contract";
+import { type FieldTable, LIVE_MAX_RATE_HZ, LOG_STREAM } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
-import { age, AS_SENT, linear, number, type Linear } from "../base/format";
-import { setAddress, type Query } from "../base/route";
+import { AS_SENT, age, type Linear, linear, number } from "../base/format";
+import { type Query, type Route, type RouteTo, route, setAddress } from "../base/route";
 import { AgentLog } from "../car/agent_log";
 import { Board } from "../car/board";
+import { BoardTools } from "../car/board_tools";
 import { GAUGES } from "../car/car_charts";
+import { Commands } from "../car/commands";
+import { FaultLog } from "../car/fault_log";
+import { StreamSection } from "../car/field_tiles";
+import { Settings } from "../car/settings";
 import { Gauge } from "../charts/gauge";
 import { Waterfall } from "../charts/waterfall";
+import type { DrivePanel } from "../drive/panel";
+import type { Looks } from "../link/viewing";
+import { asks } from "../link/viewing";
 import { MEDIAN_S, WINDOW_S } from "../live/bounds";
 import type { Fleet } from "../live/fleet";
 import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
-import { NotesPanel } from "../widgets/notes_panel";
-import { Commands } from "../car/commands";
-import { Settings } from "../car/settings";
-import { BoardTools } from "../car/board_tools";
-import { FaultLog } from "../car/fault_log";
-import { asks } from "../link/viewing";
 import { may } from "../server/admission";
-import { StreamSection } from "../car/field_tiles";
+import { NotesPanel } from "../widgets/notes_panel";
+import type { Services, Speed, View } from "./view";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
 
-export class CarView {
+export class CarView implements View<RouteTo<"car">> {
   readonly node: HTMLElement;
-  private readonly title = new Text("car-name", "h2");
+  private readonly fleet: Fleet;
+  private readonly table: FieldTable;
+  private readonly drive: DrivePanel;
+  private readonly links = el("p", { class: "tools" });
+  private readonly heading = new Text("car-name", "h2");
   private readonly state = new Text("car-state");
   private readonly asks: boolean;
   private readonly fault = el("p", { class: "fault", role: "alert", hidden: "" });
@@ -53,15 +60,10 @@ export class CarView {
   /** The time at which a message was drawn, and its delay since arrival in milliseconds. */
   private screens = new Ring(2, SCREENS, MEDIAN_S);
 
-  constructor(
-    config: Config,
-    private readonly fleet: Fleet,
-    private readonly table: FieldTable,
-    links: HTMLElement,
-    drive: HTMLElement,
-    /** Called when the address is another one. */
-    changed: () => void,
-  ) {
+  constructor({ config, fleet, table, drive, changed }: Services) {
+    this.fleet = fleet;
+    this.table = table;
+    this.drive = drive;
     this.asks = asks(config);
     this.past = new Past(config);
     this.waterfall = new Waterfall(config);
@@ -78,29 +80,54 @@ export class CarView {
     this.node = el(
       "article",
       { class: "car", id: "car" },
-      el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, links),
+      el("header", { class: "car-head" }, this.heading.node, this.state.node, this.fault, this.links),
       this.malformed.node,
       this.gaugeRow,
-      drive,
+      drive.node,
       this.tools.node,
-      el("div", { class: "board" }, this.board.node, el("aside", { class: "aside" }, this.waterfall.node, this.faults.node, this.log.node, this.notes.node, ...(may(config, "send") ? [this.commands.node, this.settings.node] : []))),
+      el(
+        "div",
+        { class: "board" },
+        this.board.node,
+        el(
+          "aside",
+          { class: "aside" },
+          this.waterfall.node,
+          this.faults.node,
+          this.log.node,
+          this.notes.node,
+          ...(may(config, "send") ? [this.commands.node, this.settings.node] : []),
+        ),
+      ),
       this.streams,
     );
   }
 
   /** The charts and their window, as the address has them. */
-  get query(): Query<"car"> {
+  private get query(): Query<"car"> {
     return this.tools.query;
   }
 
   /** Show what the address says; undefined when the viewer leaves. */
-  open(name: string | undefined, query: Query<"car"> = {}): void {
-    if (name === undefined) {
-      this.fleet.watch(undefined);
-      this.past.fill(undefined, 0);
-      this.show(undefined);
-      return;
-    }
+  title({ robot }: RouteTo<"car">): string {
+    return `${robot} · iort`;
+  }
+
+  waits(): boolean {
+    return !this.fleet.robots.has(this.name);
+  }
+
+  looks(): Looks {
+    return new Map([[this.name, LIVE_MAX_RATE_HZ]]);
+  }
+
+  leave(): void {
+    this.fleet.watch(undefined);
+    this.past.fill(undefined, 0);
+    this.hear(undefined);
+  }
+
+  show({ robot: name, query = {} }: RouteTo<"car">): void {
     this.name = name;
     this.commands.of(name);
     this.settings.of(name);
@@ -111,7 +138,7 @@ export class CarView {
   }
 
   /** Show a car, undefined while it is not heard. */
-  show(robot: Robot | undefined): void {
+  private hear(robot: Robot | undefined): void {
     if (this.robot !== robot) {
       this.robot = robot;
       this.sections.clear();
@@ -119,22 +146,53 @@ export class CarView {
       for (const gauge of this.gauges) gauge.reset();
       this.drawn = -1;
       this.screens = new Ring(2, SCREENS, MEDIAN_S);
-      this.title.set(robot?.name ?? "");
+      this.heading.set(robot?.name ?? "");
       this.tools.of(robot);
       this.settings.heard(robot);
       this.fleet.watch(robot);
     }
-    this.arrange();
+    this.arrangeStreams();
+  }
+
+  /** Show the car if it is heard, with its streams and its neighbours. */
+  arrange(): void {
+    this.hear(this.fleet.robots.get(this.name));
+    const [before, after] = this.neighbours();
+    const tool = (text: string, to: Route, label = text): HTMLElement =>
+      el("a", { class: "tool", href: route(to), "aria-label": label }, text);
+    const car = (text: string, label: string, robot: string): HTMLElement =>
+      tool(text, { view: "car", robot, query: this.query }, `${label}, ${robot}`);
+    this.links.replaceChildren(
+      tool("History", { view: "history", robot: this.name }),
+      tool("Insights", { view: "insights", robot: this.name }),
+      ...(before && after ? [car("‹", "Previous car", before), car("›", "Next car", after)] : []),
+    );
+  }
+
+  /** Left and right change the car. */
+  key(event: KeyboardEvent): void {
+    const [before, after] = this.neighbours();
+    const to = { ArrowLeft: before, ArrowRight: after }[event.key];
+    if (to !== undefined) location.hash = route({ view: "car", robot: to, query: this.query });
+  }
+
+  private neighbours(): [string | undefined, string | undefined] {
+    const names = [...this.fleet.robots.keys()].sort(byName);
+    const at = names.indexOf(this.name);
+    if (names.length < 2 || at < 0) return [undefined, undefined];
+    return [names.at(at - 1), names[(at + 1) % names.length]];
   }
 
   /** Make a section for each stream; called when a stream is new. */
-  private arrange(): void {
+  private arrangeStreams(): void {
     const { robot, table } = this;
     if (!robot) return;
     const vesc = robot.vesc(table);
     const gauged = new Set(vesc ? GAUGES.flatMap(({ fields }) => fields) : []);
     this.gaugeRow.hidden = vesc === undefined;
-    const ordered = [...robot.streams.values()].sort((a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name));
+    const ordered = [...robot.streams.values()].sort(
+      (a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name),
+    );
     for (const stream of ordered) {
       if (stream.name === LOG_STREAM) continue;
       let section = this.sections.get(stream);
@@ -149,8 +207,14 @@ export class CarView {
 
   /** Update what changes with a message. */
   values(now: number): void {
-    const { robot, table } = this;
-    if (!robot || robot.version === this.drawn) return;
+    const { robot } = this;
+    if (!robot) return;
+    if (robot.version !== this.drawn) this.write(robot, now);
+    this.board.draw(now);
+  }
+
+  private write(robot: Robot, now: number): void {
+    const { table } = this;
     // What is drawn first was heard before the viewer came.
     if (this.drawn >= 0) this.screens.push([now, (now - robot.heardAt) * 1000]);
     this.drawn = robot.version;
@@ -159,7 +223,8 @@ export class CarView {
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
     GAUGES.forEach((each, i) => {
       const show = each.show(newest, robot, speed);
-      const [least, most] = vesc && each.extent ? extent(vesc, each.extent, now, show.as ?? AS_SENT) : [NaN, NaN];
+      const [least, most] =
+        vesc && each.extent ? extent(vesc, each.extent, now, show.as ?? AS_SENT) : [NaN, NaN];
       this.gauges[i]!.set(show.value, least, most, show.unit, show.digits);
     });
     this.board.values(robot, speed);
@@ -173,6 +238,7 @@ export class CarView {
   /** Update what changes with time. */
   clock(now: number, linked: boolean): void {
     const { robot } = this;
+    this.drive.driven(robot?.driver(now));
     if (!robot) return;
     this.past.fill(robot, this.tools.window_s);
     const charted = new Set(this.board.charts);
@@ -181,7 +247,11 @@ export class CarView {
     this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);
     this.faults.refresh(robot);
     const { messages, reason } = this.fleet.refused.get(robot.name) ?? { messages: 0, reason: "" };
-    this.malformed.set(messages > 0 ? `${messages} live ${messages === 1 ? "message" : "messages"} of this car could not be read; the last: ${reason}.` : "");
+    this.malformed.set(
+      messages > 0
+        ? `${messages} live ${messages === 1 ? "message" : "messages"} of this car could not be read; the last: ${reason}.`
+        : "",
+    );
     this.malformed.node.hidden = messages === 0;
     this.log.refresh(robot);
     const fresh = robot.freshness(now);
@@ -192,25 +262,26 @@ export class CarView {
       stale: `stale: newest values are ${age(now - robot.takenAt)} old`,
       gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
     };
-    this.state.set(linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`);
+    this.state.set(
+      linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`,
+    );
   }
 
   /** The newest speed with its unit, and whether it is old; undefined for a car without one. */
-  speed(now: number): { readonly text: string; readonly old: boolean } | undefined {
+  speed(now: number): Speed | undefined {
     const { robot } = this;
     const vesc = robot?.vesc(this.table);
     if (!robot || !vesc?.sample.has("speed")) return undefined;
-    const { value, unit = "m/s", digits = 2 } = GAUGES.find(({ name }) => name === "speed_mps")!.show((field) => numeric(vesc.sample.get(field)), robot, this.fleet.speed(robot.name));
+    const {
+      value,
+      unit = "m/s",
+      digits = 2,
+    } = GAUGES.find(({ name }) => name === "speed_mps")!.show(
+      (field) => numeric(vesc.sample.get(field)),
+      robot,
+      this.fleet.speed(robot.name),
+    );
     return { text: `${number(value, digits)} ${unit}`, old: robot.freshness(now) !== "live" };
-  }
-
-  /** Who drives the car. */
-  driver(now: number): string | undefined {
-    return this.robot?.driver(now);
-  }
-
-  draw(now: number): void {
-    if (this.robot) this.board.draw(now);
   }
 }
 

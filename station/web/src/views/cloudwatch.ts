@@ -1,20 +1,27 @@
 // CloudWatch's deployed dashboards, drawn from the cloud's metrics.
 
 import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
-import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { NOTHING, number, when } from "../base/format";
 import { route } from "../base/route";
+import { type Curve, RangeChart } from "../charts/range_chart";
+import { AnswerError, ask } from "../server/answers";
 import { LogTable } from "../widgets/log_table";
-import { RangeChart, type Curve } from "../charts/range_chart";
+import type { Services, View } from "./view";
 
 const REFRESH_S = 30;
-const RANGES = [["15 min", 15], ["1 h", 60], ["3 h", 180], ["24 h", 1440]] as const;
+const RANGES = [
+  ["15 min", 15],
+  ["1 h", 60],
+  ["3 h", 180],
+  ["24 h", 1440],
+] as const;
 const COLOURS = ["--hue-1", "--hue-2", "--hue-3", "--hue-4", "--hue-5", "--hue-6"];
 const DASHES = [undefined, [6, 3], [2, 3]] as const;
 
-export class CloudWatchView {
+export class CloudWatchView implements View {
   readonly node: HTMLElement;
+  private readonly config: Config;
   private readonly choice = el("select", { id: "dashboard", name: "dashboard" });
   private readonly range = el("select", { id: "minutes", name: "minutes" });
   private readonly note = new Text("history-note", "p", { role: "status" });
@@ -24,12 +31,24 @@ export class CloudWatchView {
   private timer: number | undefined;
   private loading: AbortController | undefined;
 
-  constructor(private readonly config: Config) {
+  constructor({ config }: Services) {
+    this.config = config;
     this.range.append(...RANGES.map(([label, minutes]) => el("option", { value: String(minutes) }, label)));
     this.range.value = "60";
     for (const each of [this.choice, this.range]) each.addEventListener("change", () => void this.load());
-    const form = el("p", { class: "range" }, el("label", {}, "dashboard ", this.choice), el("label", {}, "last ", this.range));
-    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read CloudWatch. Run ", el("code", {}, "iort dashboard"), ", or look at them in the AWS console.");
+    const form = el(
+      "p",
+      { class: "range" },
+      el("label", {}, "dashboard ", this.choice),
+      el("label", {}, "last ", this.range),
+    );
+    const told = el(
+      "p",
+      { class: "unserved" },
+      "This page was put on the web as it is, and cannot read CloudWatch. Run ",
+      el("code", {}, "iort dashboard"),
+      ", or look at them in the AWS console.",
+    );
     this.node = el(
       "article",
       { class: "cloudwatch" },
@@ -38,13 +57,25 @@ export class CloudWatchView {
     );
   }
 
-  show(shown: boolean): void {
-    window.clearInterval(this.timer);
-    this.loading?.abort();
-    if (!shown) for (const log of this.logs.values()) log.stop();
-    if (!shown || !this.config.answers) return;
+  title(): string {
+    return "CloudWatch · iort";
+  }
+
+  show(): void {
+    this.rest();
+    if (!this.config.answers) return;
     void this.find();
     this.timer = window.setInterval(() => !document.hidden && void this.load(), REFRESH_S * 1000);
+  }
+
+  leave(): void {
+    this.rest();
+    for (const log of this.logs.values()) log.stop();
+  }
+
+  private rest(): void {
+    window.clearInterval(this.timer);
+    this.loading?.abort();
   }
 
   private async find(): Promise<void> {
@@ -67,14 +98,19 @@ export class CloudWatchView {
     const loading = new AbortController();
     this.loading = loading;
     try {
-      const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
+      const dashboard = await ask<Dashboard>(
+        "dashboard",
+        { name: this.choice.value, minutes: this.range.value },
+        loading.signal,
+      );
       if (loading.signal.aborted) return;
       this.draw(dashboard);
       // The dashboard ends with the current minute.
       const at = Date.now() / 1000;
       this.note.set(`as of ${when(at)}, again every ${REFRESH_S} s`);
     } catch (error) {
-      if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (!loading.signal.aborted)
+        this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
   }
 
@@ -84,23 +120,25 @@ export class CloudWatchView {
     const logs = new Map<string, LogTable>();
     const ordered = [...widgets].sort((a, b) => a.y - b.y || a.x - b.x);
     this.grid.replaceChildren(
-      ...ordered.map((widget) => {
-        const [node, plot] = frame(widget);
-        node.style.setProperty("--across", String(widget.width));
-        node.style.setProperty("--down", String(widget.height));
-        return [node, plot, widget] as const;
-      }).map(([node, plot, widget]) => {
-        if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
-        if (widget.kind === "log") {
-          const asked = { name, widget: String(widget.number), minutes: this.range.value };
-          const key = JSON.stringify(asked);
-          const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
-          logs.set(key, log);
-          node.append(log.node);
-          void log.refresh();
-        }
-        return node;
-      }),
+      ...ordered
+        .map((widget) => {
+          const [node, plot] = frame(widget);
+          node.style.setProperty("--across", String(widget.width));
+          node.style.setProperty("--down", String(widget.height));
+          return [node, plot, widget] as const;
+        })
+        .map(([node, plot, widget]) => {
+          if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
+          if (widget.kind === "log") {
+            const asked = { name, widget: String(widget.number), minutes: this.range.value };
+            const key = JSON.stringify(asked);
+            const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
+            logs.set(key, log);
+            node.append(log.node);
+            void log.refresh();
+          }
+          return node;
+        }),
     );
     for (const [key, log] of this.logs) if (!logs.has(key)) log.stop();
     this.logs = logs;
@@ -108,9 +146,14 @@ export class CloudWatchView {
 }
 
 function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
-  if (widget.kind === "text") return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
+  if (widget.kind === "text")
+    return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
   const heading = el("header", {}, el("h3", { title: widget.title }, widget.title));
-  const node = el("section", { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title }, heading);
+  const node = el(
+    "section",
+    { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title },
+    heading,
+  );
   if (widget.kind === "log") return [node, undefined];
   if (widget.kind === "other") {
     node.append(el("p", { class: "note" }, widget.text));
@@ -118,7 +161,15 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
   }
   if (widget.kind === "alarms") {
     const raised = widget.alarms.filter(({ state }) => state === "ALARM").length;
-    heading.append(el("span", { class: "note" }, raised === 0 ? `none of ${widget.alarms.length} raised` : `${raised} of ${widget.alarms.length} raised`));
+    heading.append(
+      el(
+        "span",
+        { class: "note" },
+        raised === 0
+          ? `none of ${widget.alarms.length} raised`
+          : `${raised} of ${widget.alarms.length} raised`,
+      ),
+    );
     node.append(el("ul", { class: "alarms" }, ...[...widget.alarms].sort(byUrgency).map(alarm)));
     return [node, undefined];
   }
@@ -133,7 +184,11 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
         el("span", { class: `key ${COLOURS[i % COLOURS.length]!.slice(2)}` }),
         series.label,
         " ",
-        el("b", { class: "num" }, series.values.length > 0 ? number(series.values.at(-1)!, digits(series.values.at(-1)!)) : NOTHING),
+        el(
+          "b",
+          { class: "num" },
+          series.values.length > 0 ? number(series.values.at(-1)!, digits(series.values.at(-1)!)) : NOTHING,
+        ),
       ),
     ),
   );
@@ -158,18 +213,31 @@ function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
   return el(
     "li",
     { "data-alarm": name, "data-state": state, title: [about, since, reason].filter(Boolean).join("\n") },
-    ...(state === "ALARM" ? [el("a", { href: route({ view: "alarms" }) }, name, " ", el("b", {}, STATES[state]))] : state === "OK" ? [name] : [name, " ", el("b", {}, STATES[state])]),
+    ...(state === "ALARM"
+      ? [el("a", { href: route({ view: "alarms" }) }, name, " ", el("b", {}, STATES[state]))]
+      : state === "OK"
+        ? [name]
+        : [name, " ", el("b", {}, STATES[state])]),
   );
 }
 
-function chart(host: HTMLElement, { title, series, period_s }: Widget, range: readonly [number, number]): RangeChart {
+function chart(
+  host: HTMLElement,
+  { title, series, period_s }: Widget,
+  range: readonly [number, number],
+): RangeChart {
   const times = [...new Set(series.flatMap(({ times_s }) => times_s))].sort((a, b) => a - b);
   const curves: Curve[] = series.map(({ label, right }, i) => {
     const dash = DASHES[Math.floor(i / COLOURS.length) % DASHES.length];
     return { label, right, colour: COLOURS[i % COLOURS.length]!, points: true, ...(dash ? { dash } : {}) };
   });
   const about = { title, write: (value: number) => number(value, digits(value)) };
-  return new RangeChart(host, { about, curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
+  return new RangeChart(
+    host,
+    { about, curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 },
+    [times, ...series.map((each) => aligned(each, times))],
+    range,
+  );
 }
 
 function aligned({ times_s, values }: Series, times: readonly number[]): (number | null)[] {
@@ -179,10 +247,13 @@ function aligned({ times_s, values }: Series, times: readonly number[]): (number
 
 /** Headings and paragraphs; a dashboard's text is never read as HTML. */
 function markdown(text: string): HTMLElement[] {
-  return text.split("\n").filter((line) => line.trim() !== "").map((line) => {
-    const heading = /^#+\s+(.*)$/.exec(line);
-    return heading ? el("h3", {}, heading[1]!) : el("p", {}, line);
-  });
+  return text
+    .split("\n")
+    .filter((line) => line.trim() !== "")
+    .map((line) => {
+      const heading = /^#+\s+(.*)$/.exec(line);
+      return heading ? el("h3", {}, heading[1]!) : el("p", {}, line);
+    });
 }
 
 function digits(value: number): number {

@@ -3,23 +3,33 @@
 import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { age, clockTime, number, when, zone } from "../base/format";
-import { same, writeTime, type Range } from "../base/range";
-import { MOST_PARTS, readParts, route, setAddress, writeParts, type Part, type Query } from "../base/route";
+import { type Range, same, writeTime } from "../base/range";
+import { MOST_PARTS, type Part, type RouteTo, readParts, route, setAddress, writeParts } from "../base/route";
 import { AddPart } from "../history/add_part";
 import type { Axis } from "../history/align";
 import { CompareCharts, hue } from "../history/compare_charts";
 import { NoDistance, Parts } from "../history/parts";
-import type { Fleet } from "../live/fleet";
-import { ask, AnswerError } from "../server/answers";
+import { AnswerError, ask } from "../server/answers";
+import type { Services, View } from "./view";
 
 const SETTLED_MS = 200;
 const AXES: Readonly<Record<Axis, string>> = { time: "Time since the start", distance: "Distance" };
 
-export class CompareView {
+export class CompareView implements View<RouteTo<"compare">> {
   readonly node: HTMLElement;
+  private readonly config: Config;
+  private readonly table: FieldTable;
   private readonly stream = el("select", { id: "compare-stream" });
-  private readonly axis = el("select", { id: "compare-axis" }, ...Object.entries(AXES).map(([value, label]) => el("option", { value }, label)));
-  private readonly out = el("button", { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" }, "Zoom out");
+  private readonly axis = el(
+    "select",
+    { id: "compare-axis" },
+    ...Object.entries(AXES).map(([value, label]) => el("option", { value }, label)),
+  );
+  private readonly out = el(
+    "button",
+    { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" },
+    "Zoom out",
+  );
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly at = new Text("num");
   private readonly list = el("ul", { class: "parts" });
@@ -36,14 +46,17 @@ export class CompareView {
   private loading: AbortController | undefined;
   private settling: number | undefined;
 
-  constructor(
-    private readonly config: Config,
-    private readonly table: FieldTable,
-    fleet: Fleet,
-  ) {
+  constructor({ config, table, fleet }: Services) {
+    this.config = config;
+    this.table = table;
     this.loader = new Parts(table, fleet);
     this.add = new AddPart(fleet, (part) => this.include(part));
-    const hands = { zoom: (to: Range) => this.go(to), move: (to: Range, upright: boolean) => this.move(to, upright), back: () => this.back(), pick: () => undefined };
+    const hands = {
+      zoom: (to: Range) => this.go(to),
+      move: (to: Range, upright: boolean) => this.move(to, upright),
+      back: () => this.back(),
+      pick: () => undefined,
+    };
     this.charts = new CompareCharts(
       (field) => this.loader.spec(field, this.stream.value, this.parts),
       hands,
@@ -56,16 +69,46 @@ export class CompareView {
     this.stream.addEventListener("change", () => this.restart());
     this.axis.addEventListener("change", () => this.restart());
     this.out.addEventListener("click", () => this.back());
-    const form = el("div", { class: "range" }, el("label", {}, "stream ", this.stream), el("label", {}, "over ", this.axis));
-    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To compare runs, run ", el("code", {}, "iort dashboard"), ".");
-    const served = [form, this.list, this.add.node, el("div", { class: "history-status" }, this.note.node, this.at.node, this.out), this.charts.chips, this.charts.node];
-    this.node = el("article", { class: "history compare-view" }, el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Compare")), ...(config.answers ? served : [told]));
+    const form = el(
+      "div",
+      { class: "range" },
+      el("label", {}, "stream ", this.stream),
+      el("label", {}, "over ", this.axis),
+    );
+    const told = el(
+      "p",
+      { class: "unserved" },
+      "This page was put on the web as it is, and cannot read the tables. To compare runs, run ",
+      el("code", {}, "iort dashboard"),
+      ".",
+    );
+    const served = [
+      form,
+      this.list,
+      this.add.node,
+      el("div", { class: "history-status" }, this.note.node, this.at.node, this.out),
+      this.charts.chips,
+      this.charts.node,
+    ];
+    this.node = el(
+      "article",
+      { class: "history compare-view" },
+      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Compare")),
+      ...(config.answers ? served : [told]),
+    );
   }
 
   /** Show what an address says; undefined when the viewer leaves. */
-  show(query: Query<"compare"> | undefined): void {
-    if (!query) this.loading?.abort();
-    if (!query || !this.config.answers) return;
+  title(): string {
+    return "Compare · iort";
+  }
+
+  leave(): void {
+    this.loading?.abort();
+  }
+
+  show({ query = {} }: RouteTo<"compare">): void {
+    if (!this.config.answers) return;
     this.parts = readParts(query.runs).slice(0, MOST_PARTS);
     this.wanted = query.fields?.split(",") ?? [];
     this.axis.value = query.x === "distance" ? "distance" : "time";
@@ -84,7 +127,9 @@ export class CompareView {
     try {
       const { streams } = await ask<StreamsAnswer>("streams", { robot });
       const chosen = this.stream.value;
-      this.stream.replaceChildren(...[...new Set([...streams, chosen])].map((name) => el("option", { value: name }, name)));
+      this.stream.replaceChildren(
+        ...[...new Set([...streams, chosen])].map((name) => el("option", { value: name }, name)),
+      );
       this.stream.value = chosen;
     } catch {
       // The request for the samples says why.
@@ -93,8 +138,10 @@ export class CompareView {
   }
 
   private include(part: Part): void {
-    if (this.parts.some(({ robot, range }) => robot === part.robot && same(range, part.range))) this.note.set(`${named(part)} is compared already.`);
-    else if (this.parts.length >= MOST_PARTS) this.note.set(`At most ${MOST_PARTS} runs can be compared: remove one first.`);
+    if (this.parts.some(({ robot, range }) => robot === part.robot && same(range, part.range)))
+      this.note.set(`${named(part)} is compared already.`);
+    else if (this.parts.length >= MOST_PARTS)
+      this.note.set(`At most ${MOST_PARTS} runs can be compared: remove one first.`);
     else this.choose([...this.parts, part]);
   }
 
@@ -121,12 +168,14 @@ export class CompareView {
 
   private back(): void {
     const before = this.zooms.pop();
-    if (before || this.zoom) this.go(before && before[1] - before[0] < this.extent[1] - this.extent[0] ? before : undefined, false);
+    if (before || this.zoom)
+      this.go(before && before[1] - before[0] < this.extent[1] - this.extent[0] ? before : undefined, false);
   }
 
   private move(to: Range, upright: boolean): boolean {
     const zoomed = this.zoom !== undefined;
-    if ((upright && !zoomed) || to[1] <= this.extent[0] || to[0] >= this.extent[1] || to[1] - to[0] < 1e-3) return false;
+    if ((upright && !zoomed) || to[1] <= this.extent[0] || to[0] >= this.extent[1] || to[1] - to[0] < 1e-3)
+      return false;
     if (this.zooms.length === 0) this.zooms.push(this.zoom ?? this.extent);
     this.zoom = to;
     this.charts.move(to);
@@ -154,24 +203,41 @@ export class CompareView {
     this.showParts();
     this.add.show(stream, [...new Set(parts.map(({ robot }) => robot))]);
     this.out.hidden = zoom === undefined;
-    this.note.set(parts.length < 2 ? `Add ${parts.length === 0 ? "two runs" : "another run"} to compare.` : "Loading …");
+    this.note.set(
+      parts.length < 2 ? `Add ${parts.length === 0 ? "two runs" : "another run"} to compare.` : "Loading …",
+    );
     try {
-      const { samples, archived, extent, compared } = await this.loader.load(parts, stream, this.axis.value as Axis, zoom, loading.signal);
+      const { samples, archived, extent, compared } = await this.loader.load(
+        parts,
+        stream,
+        this.axis.value as Axis,
+        zoom,
+        loading.signal,
+      );
       if (loading.signal.aborted) return;
       this.extent = extent;
       [this.grid, this.unit] = [compared.grid, compared.unit];
       this.charts.set(compared, shortly(parts), zoom ?? extent, this.wanted);
-      if (parts.length >= 2) this.note.set(samples === 0 ? "Nothing was stored in these ranges." : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`);
+      if (parts.length >= 2)
+        this.note.set(
+          samples === 0
+            ? "Nothing was stored in these ranges."
+            : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`,
+        );
       this.read(0);
     } catch (error) {
       if (loading.signal.aborted) return;
       if (error instanceof NoDistance) {
         this.axis.value = "time";
         await this.load();
-        this.note.set(`${error.message} has no distance in ${stream}: it needs a position, or the tachometer and the car's speed_to_erpm_gain. Shown over time.`);
+        this.note.set(
+          `${error.message} has no distance in ${stream}: it needs a position, or the tachometer and the car's speed_to_erpm_gain. Shown over time.`,
+        );
         return;
       }
-      this.note.set(error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`);
+      this.note.set(
+        error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`,
+      );
     }
   }
 
@@ -180,10 +246,31 @@ export class CompareView {
     this.list.replaceChildren(
       ...this.parts.map((part, i) => {
         const [from, to] = part.range;
-        const remove = el("button", { type: "button", class: "close", "aria-label": `Remove ${named(part)}` }, "×");
+        const remove = el(
+          "button",
+          { type: "button", class: "close", "aria-label": `Remove ${named(part)}` },
+          "×",
+        );
         remove.addEventListener("click", () => this.choose(this.parts.filter((_, other) => other !== i)));
-        const link = el("a", { href: route({ view: "history", robot: part.robot, query: { stream, from: writeTime(from), to: writeTime(to) } }) }, named(part));
-        return el("li", { class: "panel" }, el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }), link, el("span", { class: "note" }, age(to - from)), remove);
+        const link = el(
+          "a",
+          {
+            href: route({
+              view: "history",
+              robot: part.robot,
+              query: { stream, from: writeTime(from), to: writeTime(to) },
+            }),
+          },
+          named(part),
+        );
+        return el(
+          "li",
+          { class: "panel" },
+          el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }),
+          link,
+          el("span", { class: "note" }, age(to - from)),
+          remove,
+        );
       }),
     );
   }
@@ -204,6 +291,11 @@ function named({ robot, range: [from] }: Part): string {
 function shortly(parts: readonly Part[]): string[] {
   const robots = parts.map(({ robot }) => robot);
   const times = parts.map(({ range: [from] }) => `${clockTime(from)} ${zone(from)}`);
-  const names = new Set(robots).size === parts.length ? robots : new Set(robots).size === 1 ? times : robots.map((robot, i) => `${robot} ${times[i]!}`);
+  const names =
+    new Set(robots).size === parts.length
+      ? robots
+      : new Set(robots).size === 1
+        ? times
+        : robots.map((robot, i) => `${robot} ${times[i]!}`);
   return new Set(names).size === parts.length ? names : parts.map(named);
 }

@@ -1,15 +1,17 @@
 // Every car: one card each. Only the cards on the screen are updated, so that hundreds cost little more than a few.
 
-import type { Config, FieldTable } from "../base/contract";
+import type { FieldTable } from "../base/contract";
 import { byName, el, Text } from "../base/dom";
-import type { Query } from "../base/route";
+import type { RouteTo } from "../base/route";
 import type { Stops } from "../drive/stops";
+import { GLANCE_HZ, type Looks } from "../link/viewing";
 import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
 import type { Robot } from "../live/robot";
 import { Card } from "../widgets/card";
 import { FleetTools } from "../widgets/fleet_tools";
 import { OfflineCars } from "../widgets/offline_cars";
+import type { Services, View } from "./view";
 
 // A car that is gone for longer is folded: until then, its card says so in its place.
 const FOLD_S = 60;
@@ -18,8 +20,12 @@ const PLACE_S = 2;
 // A car that is asked sends its newest sample at once, and then has a card.
 const MOST_COMING = 50;
 
-export class FleetView {
+export class FleetView implements View<RouteTo<"fleet">> {
   readonly node: HTMLElement;
+  private readonly fleet: Fleet;
+  private readonly table: FieldTable;
+  private readonly registry: Registry;
+  private readonly stops: Stops;
   private readonly nav = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
   private readonly tools: FleetTools;
   private readonly offline: OfflineCars;
@@ -28,14 +34,18 @@ export class FleetView {
   private readonly seen = new Set<string>();
   /** The cars of whose cards it is known whether they are on the screen. */
   private readonly judged = new Set<string>();
-  private readonly nothing = el("p", { class: "note", role: "status", hidden: "" }, "No car has this name or tag.");
+  private readonly nothing = el(
+    "p",
+    { class: "note", role: "status", hidden: "" },
+    "No car has this name or tag.",
+  );
   private placedAt = -Infinity;
   private known = -1;
 
   private readonly watcher = new IntersectionObserver(
     (entries) => {
       for (const { target, isIntersecting } of entries) {
-        const name = (target as HTMLElement).dataset["robot"]!;
+        const name = (target as HTMLElement).dataset.robot!;
         this.judged.add(name);
         if (isIntersecting) this.seen.add(name);
         else this.seen.delete(name);
@@ -47,22 +57,28 @@ export class FleetView {
   /** Updates the cards on the screen, as the last clock did. */
   private refresh: () => void = () => {};
 
-  constructor(
-    config: Config,
-    private readonly fleet: Fleet,
-    private readonly table: FieldTable,
-    private readonly registry: Registry,
-    private readonly stops: Stops,
-  ) {
+  constructor({ config, fleet, table, registry, stops }: Services) {
+    this.fleet = fleet;
+    this.table = table;
+    this.registry = registry;
+    this.stops = stops.stops;
     this.tools = new FleetTools(registry, table, () => (this.placedAt = -Infinity));
     this.offline = new OfflineCars(config);
     this.node = el("div", { class: "fleet" }, this.tools.node, this.nothing, this.nav, this.offline.node);
   }
 
   /** Show the address's choice of cars. */
-  show(query: Query<"fleet">): void {
+  show({ query = {} }: RouteTo<"fleet">): void {
     this.tools.read(query);
     this.arrange();
+  }
+
+  title(): string {
+    return "iort live";
+  }
+
+  waits(): boolean {
+    return this.fleet.robots.size === 0;
   }
 
   /** There are other cars, or they have moved. */
@@ -81,17 +97,29 @@ export class FleetView {
     this.refresh = () => {
       for (const name of this.seen) {
         const robot = this.fleet.robots.get(name);
-        if (robot) this.cards.get(name)?.update(robot, { fleet: this.fleet, table: this.table, stop: this.stops.word(name) }, now, linked);
+        if (robot)
+          this.cards
+            .get(name)
+            ?.update(
+              robot,
+              { fleet: this.fleet, table: this.table, stop: this.stops.word(name) },
+              now,
+              linked,
+            );
       }
     };
     this.refresh();
   }
 
   /** The cars whose cards are on the screen, and those whose cards are still to come. */
-  get looked(): string[] {
-    const online = Object.entries(this.registry.robots ?? {}).flatMap(([name, presence]) => (presence.online ? [name] : []));
-    const coming = [...new Set([...this.fleet.robots.keys(), ...online])].filter((name) => !this.judged.has(name) && this.tools.finds(name));
-    return [...this.seen, ...coming.slice(0, MOST_COMING)];
+  looks(): Looks {
+    const online = Object.entries(this.registry.robots ?? {}).flatMap(([name, presence]) =>
+      presence.online ? [name] : [],
+    );
+    const coming = [...new Set([...this.fleet.robots.keys(), ...online])].filter(
+      (name) => !this.judged.has(name) && this.tools.finds(name),
+    );
+    return new Map([...this.seen, ...coming.slice(0, MOST_COMING)].map((name) => [name, GLANCE_HZ]));
   }
 
   /** Arrow keys move between the cards, which are links: Enter opens one. A slash searches. */
@@ -119,7 +147,10 @@ export class FleetView {
     const found = [...this.fleet.robots.values()].filter(({ name }) => this.tools.finds(name));
     const folded = (robot: Robot): boolean => robot.overdue_s(now) > FOLD_S;
     const nodes: HTMLElement[] = [];
-    for (const [heading, robots] of this.tools.arrange(found.filter((robot) => !folded(robot)), now)) {
+    for (const [heading, robots] of this.tools.arrange(
+      found.filter((robot) => !folded(robot)),
+      now,
+    )) {
       if (heading !== "") nodes.push(this.heading(heading, robots.length));
       nodes.push(...robots.map(({ name }) => this.card(name).node));
     }
@@ -133,8 +164,12 @@ export class FleetView {
       next.remove();
       next = after;
     }
-    const registered = Object.entries(this.registry.robots ?? {}).filter(([name]) => !this.fleet.robots.has(name) && this.tools.finds(name));
-    const away = [...registered, ...found.filter(folded).map((robot) => [robot.name, robot] as const)].sort(([a], [b]) => byName(a, b));
+    const registered = Object.entries(this.registry.robots ?? {}).filter(
+      ([name]) => !this.fleet.robots.has(name) && this.tools.finds(name),
+    );
+    const away = [...registered, ...found.filter(folded).map((robot) => [robot.name, robot] as const)].sort(
+      ([a], [b]) => byName(a, b),
+    );
     this.offline.show(away, this.fleet.robots.size === 0);
     this.nothing.hidden = nodes.length > 0 || away.length > 0 || this.fleet.robots.size === 0;
     // A page without cars has nothing to search.
@@ -183,7 +218,8 @@ function neighbour(cards: readonly HTMLElement[], at: number, key: string): numb
     const card = cards[i]!;
     if (card.offsetTop === top) continue;
     if (best !== undefined && card.offsetTop !== cards[best]!.offsetTop) break;
-    if (best === undefined || Math.abs(card.offsetLeft - left) < Math.abs(cards[best]!.offsetLeft - left)) best = i;
+    if (best === undefined || Math.abs(card.offsetLeft - left) < Math.abs(cards[best]!.offsetLeft - left))
+      best = i;
   }
   return best;
 }

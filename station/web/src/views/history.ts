@@ -3,15 +3,16 @@
 import type { Config, FieldTable, HistoryAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { age, number, when } from "../base/format";
-import { LEAST_S, readRange, readTime, rounded, same, writeTime, type Range } from "../base/range";
-import { route, setAddress, type Query } from "../base/route";
-import { RangeForm } from "../history/range_form";
+import { LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
+import { type Query, type RouteTo, route, setAddress } from "../base/route";
 import { fromArchive, unread } from "../history/origin";
+import { RangeForm } from "../history/range_form";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
-import type { Fleet } from "../live/fleet";
+import { GLANCE_HZ, type Looks } from "../link/viewing";
+import { AnswerError, ask } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
-import { ask, AnswerError } from "../server/answers";
+import type { Services, View } from "./view";
 
 // What is shown first, unless nothing was stored in it.
 const RECENT_S = 300;
@@ -21,9 +22,11 @@ const RUNS = 20;
 // Panning loads once it has stopped for this long.
 const SETTLED_MS = 200;
 
-export class HistoryView {
+export class HistoryView implements View<RouteTo<"history">> {
   readonly node: HTMLElement;
-  private readonly title = new Text("car-name", "h2");
+  private readonly config: Config;
+  private readonly table: FieldTable;
+  private readonly name = new Text("car-name", "h2");
   private readonly live = el("a", { class: "tool" }, "Live");
   private readonly insights = el("a", { class: "tool" }, "Insights");
   private readonly note = new Text("history-note", "p", { role: "status" });
@@ -38,11 +41,9 @@ export class HistoryView {
   private loading: AbortController | undefined;
   private settling: number | undefined;
 
-  constructor(
-    private readonly config: Config,
-    private readonly table: FieldTable,
-    fleet: Fleet,
-  ) {
+  constructor({ config, table, fleet }: Services) {
+    this.config = config;
+    this.table = table;
     this.form = new RangeForm({
       range: (range) => this.open(range),
       wrong: (text) => this.note.set(text),
@@ -51,38 +52,71 @@ export class HistoryView {
       out: () => this.zoomOut(),
     });
     this.result = new Result(table, fleet, {
-      hands: { zoom: (to) => this.zoom(to), move: (to, upright) => this.move(to, upright), back: () => this.zoomOut() },
+      hands: {
+        zoom: (to) => this.zoom(to),
+        move: (to, upright) => this.move(to, upright),
+        back: () => this.zoomOut(),
+      },
       asked: () => this.asked(),
       changed: () => this.write(),
     });
     this.notes = new NotesPanel(config, {
       at: () => (Number.isNaN(this.result.at) ? Math.min(this.range![1], Date.now() / 1000) : this.result.at),
-      shown: (notes) => this.result.mark(notes.map(({ t_us }, i) => ({ at: t_us / 1e6, label: String(i + 1) }))),
+      shown: (notes) =>
+        this.result.mark(notes.map(({ t_us }, i) => ({ at: t_us / 1e6, label: String(i + 1) }))),
     });
-    const served = [this.form.node, this.runs.node, el("div", { class: "history-status" }, this.note.node, this.form.out), this.result.node, this.notes.node];
-    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
+    const served = [
+      this.form.node,
+      this.runs.node,
+      el("div", { class: "history-status" }, this.note.node, this.form.out),
+      this.result.node,
+      this.notes.node,
+    ];
+    const told = el(
+      "p",
+      { class: "unserved" },
+      "This page was put on the web as it is, and cannot read the tables. To look into the past, run ",
+      el("code", {}, "iort dashboard"),
+      " on a machine with access to the cloud, or ",
+      el("code", {}, "iort query"),
+      ".",
+    );
     this.node = el(
       "article",
       { class: "history" },
-      el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "history"), el("p", { class: "tools" }, this.live, this.insights)),
+      el(
+        "header",
+        { class: "car-head" },
+        this.name.node,
+        el("p", { class: "car-state" }, "history"),
+        el("p", { class: "tools" }, this.live, this.insights),
+      ),
       ...(config.answers ? served : [told]),
     );
   }
 
-  /** Show what an address says of a robot's past; undefined when the viewer leaves. */
-  show(robot: string | undefined, query: Query<"history"> = {}): void {
+  title({ robot }: RouteTo<"history">): string {
+    return `${robot} · iort`;
+  }
+
+  looks(): Looks {
+    return new Map([[this.robot, GLANCE_HZ]]);
+  }
+
+  leave(): void {
     this.result.stop();
-    if (robot === undefined) {
-      this.loading?.abort();
-      return;
-    }
+    this.loading?.abort();
+  }
+
+  show({ robot, query = {} }: RouteTo<"history">): void {
+    this.result.stop();
     if (robot === this.robot && this.range) {
       this.follow(query);
       return;
     }
     this.loading?.abort();
     this.robot = robot;
-    this.title.set(robot);
+    this.name.set(robot);
     this.live.href = route({ view: "car", robot });
     this.insights.href = route({ view: "insights", robot });
     [this.range, this.zooms] = [undefined, []];
@@ -93,7 +127,7 @@ export class HistoryView {
     if (this.config.answers) void this.enter(robot, query);
   }
 
-  clock(_now: number): void {
+  clock(): void {
     this.result.clock();
   }
 
@@ -104,7 +138,9 @@ export class HistoryView {
     this.note.set("Looking for what is stored …");
     try {
       const { streams } = await ask<{ streams: string[] }>("streams", { robot }, loading.signal);
-      const stream = [query.stream, this.table.stream, streams[0]].find((name) => name !== undefined && streams.includes(name));
+      const stream = [query.stream, this.table.stream, streams[0]].find(
+        (name) => name !== undefined && streams.includes(name),
+      );
       this.form.node.hidden = stream === undefined;
       if (stream === undefined) {
         this.note.set("Nothing of this car is stored.");
@@ -128,7 +164,11 @@ export class HistoryView {
   private async findRuns(before_us?: number): Promise<void> {
     const { robot } = this;
     try {
-      const answer = await ask<RunsAnswer>("runs", { robot, count: String(RUNS), ...(before_us === undefined ? {} : { before_us: String(before_us) }) });
+      const answer = await ask<RunsAnswer>("runs", {
+        robot,
+        count: String(RUNS),
+        ...(before_us === undefined ? {} : { before_us: String(before_us) }),
+      });
       if (robot !== this.robot) return;
       if (before_us === undefined) this.runs.set(robot, answer);
       else this.runs.add(answer);
@@ -216,8 +256,14 @@ export class HistoryView {
   /** Put what is shown into the address. */
   private write(step = false): void {
     const [from, to] = this.range!.map(writeTime) as [string, string];
-    const more = { ...(this.result.wanted.length > 0 ? { fields: this.result.wanted.join(",") } : {}), ...(Number.isNaN(this.result.at) ? {} : { at: writeTime(this.result.at) }) };
-    setAddress({ view: "history", robot: this.robot, query: { stream: this.form.stream, from, to, ...more } }, step);
+    const more = {
+      ...(this.result.wanted.length > 0 ? { fields: this.result.wanted.join(",") } : {}),
+      ...(Number.isNaN(this.result.at) ? {} : { at: writeTime(this.result.at) }),
+    };
+    setAddress(
+      { view: "history", robot: this.robot, query: { stream: this.form.stream, from, to, ...more } },
+      step,
+    );
   }
 
   private asked(): Readonly<Record<string, string>> {
@@ -232,12 +278,23 @@ export class HistoryView {
     this.note.set("Loading …");
     const began = performance.now();
     try {
-      const drive = await ask<HistoryAnswer>("history", { ...this.asked(), rows: String(ROWS) }, loading.signal);
+      const drive = await ask<HistoryAnswer>(
+        "history",
+        { ...this.asked(), rows: String(ROWS) },
+        loading.signal,
+      );
       if (loading.signal.aborted) return;
       if (drive.samples === 0) this.result.clear();
       else this.result.set(this.robot, this.form.stream, drive, range);
-      const each = drive.row_s > 0 ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max` : "";
-      this.note.set(drive.samples === 0 ? this.nothing() : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.${fromArchive(drive.archive, range)}${unread(drive)}`);
+      const each =
+        drive.row_s > 0
+          ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max`
+          : "";
+      this.note.set(
+        drive.samples === 0
+          ? this.nothing()
+          : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.${fromArchive(drive.archive, range)}${unread(drive)}`,
+      );
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
     }

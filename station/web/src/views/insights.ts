@@ -1,10 +1,16 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import { STYLE_GROUP, type Config, type Extent, type InsightsAnswer, type RunsAnswer } from "../base/contract";
+import {
+  type Config,
+  type Extent,
+  type InsightsAnswer,
+  type RunsAnswer,
+  STYLE_GROUP,
+} from "../base/contract";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
-import { readTime, writeTime, type Range } from "../base/range";
-import { route, setAddress, type Query } from "../base/route";
+import { type Range, readTime, writeTime } from "../base/range";
+import { type Query, type RouteTo, route, setAddress } from "../base/route";
 import { Analyse } from "../insights/analyse";
 import { drivesTable } from "../insights/drives_table";
 import { findingsList } from "../insights/findings_list";
@@ -12,12 +18,14 @@ import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { styles } from "../insights/styles";
 import { may } from "../server/admission";
+import { AnswerError, ask } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
-import { ask, AnswerError } from "../server/answers";
+import type { Services, View } from "./view";
 
-export class InsightsView {
+export class InsightsView implements View<RouteTo<"insights">> {
   readonly node: HTMLElement;
-  private readonly title = new Text("car-name", "h2");
+  private readonly config: Config;
+  private readonly name = new Text("car-name", "h2");
   private readonly tools = el("p", { class: "tools" });
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly found = el("div", { class: "insights-part" });
@@ -25,24 +33,64 @@ export class InsightsView {
   private readonly parameters = new Parameters();
   private readonly notes: NotesPanel;
   private readonly laps = new LapsPanel((laps) => this.write(laps));
-  private readonly analyse = new Analyse((text) => this.note.set(text), (drives) => void this.analysed(drives));
+  private readonly analyse = new Analyse(
+    (text) => this.note.set(text),
+    (drives) => void this.analysed(drives),
+  );
   private loading: AbortController | undefined;
   private robot: string | undefined;
   private answer: InsightsAnswer | undefined;
   private drive: Range | undefined;
 
-  constructor(private readonly config: Config) {
+  constructor({ config }: Services) {
+    this.config = config;
     this.notes = new NotesPanel(config);
-    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the findings. Run ", el("code", {}, "iort dashboard"), ", or ", el("code", {}, "iort findings"), ".");
-    const status = el("div", { class: "history-status" }, this.note.node, ...(may(config, "analyse") ? [this.analyse.node] : []));
+    const told = el(
+      "p",
+      { class: "unserved" },
+      "This page was put on the web as it is, and cannot read the findings. Run ",
+      el("code", {}, "iort dashboard"),
+      ", or ",
+      el("code", {}, "iort findings"),
+      ".",
+    );
+    const status = el(
+      "div",
+      { class: "history-status" },
+      this.note.node,
+      ...(may(config, "analyse") ? [this.analyse.node] : []),
+    );
     const served = [status, this.found, this.notes.node, this.laps.node, this.parameters.node, this.driven];
-    this.node = el("article", { class: "insights-view" }, el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "insights"), this.tools), ...(config.answers ? served : [told]));
+    this.node = el(
+      "article",
+      { class: "insights-view" },
+      el(
+        "header",
+        { class: "car-head" },
+        this.name.node,
+        el("p", { class: "car-state" }, "insights"),
+        this.tools,
+      ),
+      ...(config.answers ? served : [told]),
+    );
   }
 
   /** Show a robot's insights, or the fleet's if undefined. */
-  show(robot: string | undefined, query: Query<"insights"> = {}): void {
-    this.title.set(robot ?? "Fleet");
-    this.tools.replaceChildren(...(robot === undefined ? [] : [el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"), el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"), el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet")]));
+  title({ robot }: RouteTo<"insights">): string {
+    return `${robot ?? "Insights"} · iort`;
+  }
+
+  show({ robot, query = {} }: RouteTo<"insights">): void {
+    this.name.set(robot ?? "Fleet");
+    this.tools.replaceChildren(
+      ...(robot === undefined
+        ? []
+        : [
+            el("a", { class: "tool", href: route({ view: "car", robot }) }, "Live"),
+            el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
+            el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet"),
+          ]),
+    );
     if (!this.config.answers) return;
     this.analyse.of(robot);
     void this.notes.show(robot);
@@ -69,20 +117,26 @@ export class InsightsView {
     this.laps.node.hidden = true;
     this.note.set("Loading …");
     try {
-      this.answer = await ask<InsightsAnswer>("insights", robot === undefined ? {} : { robot }, loading.signal);
+      this.answer = await ask<InsightsAnswer>(
+        "insights",
+        robot === undefined ? {} : { robot },
+        loading.signal,
+      );
       if (!loading.signal.aborted) await this.present(query);
     } catch (error) {
       if (loading.signal.aborted) return;
       this.note.set(error instanceof AnswerError ? error.message : String(error));
       // Laps need no findings.
-      if (robot !== undefined && !this.answer) await this.showLaps(robot, undefined, query).catch(() => undefined);
+      if (robot !== undefined && !this.answer)
+        await this.showLaps(robot, undefined, query).catch(() => undefined);
     }
   }
 
   /** Show the new findings; without drives, say why there are none. */
   private async analysed(drives: number): Promise<void> {
     await this.load(this.robot, {});
-    if (drives === 0) this.note.set("No drives were found in that time: nothing was recorded, or the car stood.");
+    if (drives === 0)
+      this.note.set("No drives were found in that time: nothing was recorded, or the car stood.");
   }
 
   private async present(query: Query<"insights">): Promise<void> {
@@ -91,19 +145,32 @@ export class InsightsView {
     const { findings, drives, groups } = answer;
     const newest = drives[0];
     const of = robot ?? "the fleet";
-    const state = newest ? `The newest analysed drive began ${when(newest.from_us / 1e6)}.` : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
+    const state = newest
+      ? `The newest analysed drive began ${when(newest.from_us / 1e6)}.`
+      : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
     this.note.set(state);
     const list = findingsList(findings, robot === undefined);
-    const nothing = el("p", { class: "unserved" }, newest ? `Nothing about ${of} differs from its earlier drives by more than chance.` : "There are no findings without analysed drives.");
+    const nothing = el(
+      "p",
+      { class: "unserved" },
+      newest
+        ? `Nothing about ${of} differs from its earlier drives by more than chance.`
+        : "There are no findings without analysed drives.",
+    );
     this.found.replaceChildren(list.childElementCount > 0 ? list : nothing);
     const wanted = readTime(query.drive);
-    const chosen = drives.find(({ from_us }) => Math.abs(from_us / 1e6 - wanted) < 0.01) ?? drives.find(({ failed }) => failed === "");
+    const chosen =
+      drives.find(({ from_us }) => Math.abs(from_us / 1e6 - wanted) < 0.01) ??
+      drives.find(({ failed }) => failed === "");
     if (robot === undefined) {
       this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, undefined)] : []));
       return;
     }
     const bars = styles(drives, groups[STYLE_GROUP] ?? {});
-    this.driven.replaceChildren(...(bars ? [bars] : []), ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
+    this.driven.replaceChildren(
+      ...(bars ? [bars] : []),
+      ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []),
+    );
     this.parameters.show(answer, [STYLE_GROUP]);
     await this.showLaps(robot, chosen, query);
   }
@@ -116,11 +183,19 @@ export class InsightsView {
     this.laps.node.hidden = extent === undefined;
     if (!extent) return;
     this.drive = [extent.from_us / 1e6, extent.to_us / 1e6];
-    await this.laps.show(robot, this.drive, (query.laps ?? "").split(",").map(Number).filter((lap) => lap > 0));
+    await this.laps.show(
+      robot,
+      this.drive,
+      (query.laps ?? "")
+        .split(",")
+        .map(Number)
+        .filter((lap) => lap > 0),
+    );
   }
 
   private write(laps: readonly number[]): void {
     const { robot, drive } = this;
-    if (robot !== undefined && drive) setAddress({ view: "insights", robot, query: { drive: writeTime(drive[0]), laps: laps.join(",") } });
+    if (robot !== undefined && drive)
+      setAddress({ view: "insights", robot, query: { drive: writeTime(drive[0]), laps: laps.join(",") } });
   }
 }

@@ -25,11 +25,22 @@ export class Card {
     this.node = el(
       "a",
       { class: "card", href: route({ view: "car", robot: name }), "data-robot": name, title: name },
-      el("span", { class: "card-head" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "card-name" }, name), this.state.node),
+      el(
+        "span",
+        { class: "card-head" },
+        el("span", { class: "dot", "aria-hidden": "true" }),
+        el("span", { class: "card-name" }, name),
+        this.state.node,
+      ),
     );
   }
 
-  update(robot: Robot, { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: StopWord }, now: number, linked: boolean): void {
+  update(
+    robot: Robot,
+    { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: StopWord },
+    now: number,
+    linked: boolean,
+  ): void {
     if (!this.inside) {
       this.inside = new Inside();
       this.node.append(this.stop.node, ...this.inside.nodes);
@@ -38,10 +49,21 @@ export class Card {
     const shown = linked || fresh === "live" ? fresh : "unlinked";
     setAttribute(this.node, "data-state", shown);
     const driver = robot.driver(now);
-    this.state.set(driver !== undefined ? `${driver} drives` : { live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
+    this.state.set(
+      driver !== undefined
+        ? `${driver} drives`
+        : { live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown],
+    );
     setAttribute(this.node, "data-fault", String(robot.fault(table) !== undefined));
     setAttribute(this.node, "data-stop", stop.kind);
-    this.stop.set({ stands: "stands: emergency stop", moves: `does NOT stand: ${stop.why}`, unable: "no emergency stop", "": "" }[stop.kind]);
+    this.stop.set(
+      {
+        stands: "stands: emergency stop",
+        moves: `does NOT stand: ${stop.why}`,
+        unable: "no emergency stop",
+        "": "",
+      }[stop.kind],
+    );
     this.stop.node.title = stop.why;
     this.inside.update(robot, fleet, table, now);
   }
@@ -61,10 +83,20 @@ class Inside {
 
   constructor() {
     const figure = (label: string, value: Text, unit: Node | string): HTMLElement =>
-      el("span", { class: "figure" }, el("span", { class: "figure-label" }, label), el("span", {}, value.node, unit));
+      el(
+        "span",
+        { class: "figure" },
+        el("span", { class: "figure-label" }, label),
+        el("span", {}, value.node, unit),
+      );
     const unit = (text: string): HTMLElement => el("span", { class: "unit" }, text);
     this.nodes = [
-      el("span", { class: "card-main" }, el("span", { class: "card-speed" }, this.speed.node, this.speedUnit.node), this.spark.node),
+      el(
+        "span",
+        { class: "card-main" },
+        el("span", { class: "card-speed" }, this.speed.node, this.speedUnit.node),
+        this.spark.node,
+      ),
       el(
         "span",
         { class: "card-figures" },

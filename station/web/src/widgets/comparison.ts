@@ -2,12 +2,12 @@
 
 import { power_w, type Value } from "../base/contract";
 import { el, Text } from "../base/dom";
+import { NOTHING, number, type Spec, write } from "../base/format";
 import { numeric, type Stream } from "../live/stream";
-import { NOTHING, number, write, type Spec } from "../base/format";
 
 interface Row {
   readonly spec: Spec;
-  readonly then: Text;
+  readonly past: Text;
   readonly now: Text;
   readonly change: Text;
   value: Value;
@@ -20,32 +20,40 @@ export class Comparison {
   private live: Stream | undefined;
 
   constructor() {
-    const head = el("tr", {}, ...["Field", "Then", "Now", "Change", "Unit"].map((name) => el("th", { scope: "col" }, name)));
-    this.node = el("section", { class: "panel compare", "aria-label": "Then and now" }, el("table", {}, el("thead", {}, head), this.body));
+    const head = el(
+      "tr",
+      {},
+      ...["Field", "Then", "Now", "Change", "Unit"].map((name) => el("th", { scope: "col" }, name)),
+    );
+    this.node = el(
+      "section",
+      { class: "panel compare", "aria-label": "Then and now" },
+      el("table", {}, el("thead", {}, head), this.body),
+    );
   }
 
   of(fields: readonly (readonly [string, Spec])[]): void {
     this.rows.clear();
     this.body.replaceChildren();
     for (const [field, spec] of fields) {
-      const row = { spec, then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
+      const row = { spec, past: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
       this.rows.set(field, row);
       this.body.append(
         el(
           "tr",
           { "data-field": field },
           el("th", { scope: "row", title: row.spec.meaning || field }, row.spec.label),
-          ...[row.then, row.now, row.change].map(({ node }) => el("td", {}, node)),
+          ...[row.past, row.now, row.change].map(({ node }) => el("td", {}, node)),
           el("td", { class: "unit" }, row.spec.unit),
         ),
       );
     }
   }
 
-  then(values: ReadonlyMap<string, Value>): void {
+  compare(values: ReadonlyMap<string, Value>): void {
     for (const [field, row] of this.rows) {
       row.value = values.get(field) ?? null;
-      row.then.set(write(row.value, row.spec));
+      row.past.set(write(row.value, row.spec));
     }
     this.now(this.live);
   }
@@ -55,8 +63,15 @@ export class Comparison {
     for (const [field, row] of this.rows) {
       const value = stream && newest(field, stream);
       row.now.set(write(value, row.spec));
-      const change = typeof value === "number" && typeof row.value === "number" ? (value - row.value) * row.spec.scale : NaN;
-      row.change.set(Number.isNaN(change) || row.spec.texts ? NOTHING : `${change > 0 ? "+" : ""}${number(change, row.spec.digits)}`);
+      const change =
+        typeof value === "number" && typeof row.value === "number"
+          ? (value - row.value) * row.spec.scale
+          : NaN;
+      row.change.set(
+        Number.isNaN(change) || row.spec.texts
+          ? NOTHING
+          : `${change > 0 ? "+" : ""}${number(change, row.spec.digits)}`,
+      );
     }
   }
 }

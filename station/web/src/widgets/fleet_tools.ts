@@ -3,29 +3,47 @@
 import type { FieldTable } from "../base/contract";
 import { byName, el } from "../base/dom";
 import { keep, kept } from "../base/kept";
-import { setAddress, type Query } from "../base/route";
+import { type Query, setAddress } from "../base/route";
 import type { Registry } from "../live/registry";
 import { hottest, type Robot } from "../live/robot";
 import { numeric } from "../live/stream";
 
 /** The orders, and what is compared: the smallest comes first, and a car without a value last. */
-const SORTS: Readonly<Record<string, { readonly label: string; readonly of: (robot: Robot, table: FieldTable, now: number) => number }>> = {
+const SORTS: Readonly<
+  Record<
+    string,
+    { readonly label: string; readonly of: (robot: Robot, table: FieldTable, now: number) => number }
+  >
+> = {
   name: { label: "Name", of: () => 0 },
   trouble: {
     label: "Trouble first",
-    of: (robot, table, now) => (robot.fault(table) !== undefined ? 0 : { gone: 1, stale: 2, idle: 3, live: 3 }[robot.freshness(now)]),
+    of: (robot, table, now) =>
+      robot.fault(table) !== undefined ? 0 : { gone: 1, stale: 2, idle: 3, live: 3 }[robot.freshness(now)],
   },
   battery: { label: "Lowest battery", of: (robot, table) => newest(robot, table)("voltage_input") },
   temperature: { label: "Hottest", of: (robot, table) => -hottest(newest(robot, table)) },
   speed: { label: "Fastest", of: (robot, table) => -Math.abs(newest(robot, table)("speed")) },
 };
 
-const newest = (robot: Robot, table: FieldTable) => (field: string): number => numeric(robot.vesc(table)?.sample.get(field));
+const newest =
+  (robot: Robot, table: FieldTable) =>
+  (field: string): number =>
+    numeric(robot.vesc(table)?.sample.get(field));
 
 export class FleetTools {
   readonly node: HTMLElement;
-  private readonly find = el("input", { type: "search", name: "find", placeholder: "Name or tag", "aria-label": "Find cars" });
-  private readonly sort = el("select", { name: "sort" }, ...Object.entries(SORTS).map(([value, { label }]) => el("option", { value }, label)));
+  private readonly find = el("input", {
+    type: "search",
+    name: "find",
+    placeholder: "Name or tag",
+    "aria-label": "Find cars",
+  });
+  private readonly sort = el(
+    "select",
+    { name: "sort" },
+    ...Object.entries(SORTS).map(([value, { label }]) => el("option", { value }, label)),
+  );
   private readonly group = el("select", { name: "group" });
   private readonly grouping = el("label", { hidden: "" }, "Group by ", this.group);
   private wanted = "";
@@ -36,13 +54,24 @@ export class FleetTools {
     private readonly table: FieldTable,
     private readonly changed: () => void,
   ) {
-    this.node = el("form", { class: "range fleet-tools", role: "search" }, this.find, el("label", {}, "Sort by ", this.sort), this.grouping);
+    this.node = el(
+      "form",
+      { class: "range fleet-tools", role: "search" },
+      this.find,
+      el("label", {}, "Sort by ", this.sort),
+      this.grouping,
+    );
     this.node.addEventListener("submit", (event) => event.preventDefault());
-    for (const each of [this.find, this.sort, this.group]) each.addEventListener("input", () => this.choose());
+    for (const each of [this.find, this.sort, this.group])
+      each.addEventListener("input", () => this.choose());
   }
 
   /** Take the address's choices, or the ones of the last visit. */
-  read({ find = "", sort = kept("fleet.sort") ?? "name", group = kept("fleet.group") ?? "" }: Query<"fleet">): void {
+  read({
+    find = "",
+    sort = kept("fleet.sort") ?? "name",
+    group = kept("fleet.group") ?? "",
+  }: Query<"fleet">): void {
     this.find.value = find;
     this.sort.value = Object.hasOwn(SORTS, sort) ? sort : "name";
     this.wanted = group;
@@ -57,10 +86,15 @@ export class FleetTools {
 
   /** Offer the tags that cars have. */
   offer(): void {
-    const names = [...new Set(Object.values(this.registry.tags).flatMap((tags) => Object.keys(tags)))].sort(byName);
+    const names = [...new Set(Object.values(this.registry.tags).flatMap((tags) => Object.keys(tags)))].sort(
+      byName,
+    );
     if (String(names) !== this.known) {
       this.known = String(names);
-      this.group.replaceChildren(el("option", { value: "" }, "Nothing"), ...names.map((name) => el("option", { value: name }, name)));
+      this.group.replaceChildren(
+        el("option", { value: "" }, "Nothing"),
+        ...names.map((name) => el("option", { value: name }, name)),
+      );
     }
     this.grouping.hidden = names.length === 0;
     this.group.value = names.includes(this.wanted) ? this.wanted : "";
@@ -70,7 +104,10 @@ export class FleetTools {
   finds(robot: string): boolean {
     const tags = Object.entries(this.registry.tags[robot] ?? {}).map(([name, value]) => `${name}=${value}`);
     const text = [robot, ...tags].join(" ").toLowerCase();
-    return this.find.value.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+    return this.find.value
+      .toLowerCase()
+      .split(/\s+/)
+      .every((word) => text.includes(word));
   }
 
   /** The cars by their group's heading; without groups, the heading is empty. */
@@ -78,9 +115,12 @@ export class FleetTools {
     const { of } = SORTS[this.sort.value]!;
     const keys = new Map(robots.map((robot) => [robot, of(robot, this.table, now)] as const));
     const key = (robot: Robot): number => (Number.isNaN(keys.get(robot)!) ? Infinity : keys.get(robot)!);
-    const ordered = [...robots].sort((a, b) => (key(a) === key(b) ? byName(a.name, b.name) : key(a) - key(b)));
+    const ordered = [...robots].sort((a, b) =>
+      key(a) === key(b) ? byName(a.name, b.name) : key(a) - key(b),
+    );
     const tag = this.group.value;
-    const heading = (robot: Robot): string => (tag === "" ? "" : (this.registry.tag(robot.name, tag) ?? `no ${tag}`));
+    const heading = (robot: Robot): string =>
+      tag === "" ? "" : (this.registry.tag(robot.name, tag) ?? `no ${tag}`);
     const groups = new Map<string, Robot[]>();
     for (const name of [...new Set(robots.map(heading))].sort(byName)) groups.set(name, []);
     for (const robot of ordered) groups.get(heading(robot))!.push(robot);
@@ -92,7 +132,14 @@ export class FleetTools {
     keep("fleet.sort", this.sort.value);
     keep("fleet.group", this.group.value);
     const told = (value: string, plain: string): string | undefined => (value === plain ? undefined : value);
-    setAddress({ view: "fleet", query: { find: told(this.find.value, ""), sort: told(this.sort.value, "name"), group: told(this.group.value, "") } });
+    setAddress({
+      view: "fleet",
+      query: {
+        find: told(this.find.value, ""),
+        sort: told(this.sort.value, "name"),
+        group: told(this.group.value, ""),
+      },
+    });
     this.changed();
   }
 }

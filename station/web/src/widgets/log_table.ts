@@ -1,9 +1,9 @@
 // A log widget: the rows of its query. It has a request of its own, because Logs Insights takes seconds.
 
 import type { Logs } from "../base/contract";
-import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
+import { AnswerError, ask } from "../server/answers";
 
 // AWS bills a query by the bytes that it reads.
 const AGAIN_S = 60;
@@ -48,7 +48,13 @@ export class LogTable {
 
   private draw({ columns, rows, found, to_s }: Logs): void {
     const until = `until ${when(to_s)}`;
-    this.note.set(found > rows.length ? `the first ${rows.length} of ${found} lines, ${until}` : found === 0 ? `Nothing in this range, ${until}.` : until);
+    this.note.set(
+      found > rows.length
+        ? `the first ${rows.length} of ${found} lines, ${until}`
+        : found === 0
+          ? `Nothing in this range, ${until}.`
+          : until,
+    );
     this.host.replaceChildren(
       ...(rows.length === 0
         ? []
@@ -56,8 +62,20 @@ export class LogTable {
             el(
               "table",
               {},
-              el("thead", {}, el("tr", {}, ...columns.map((column) => el("th", { scope: "col" }, column.replace(/^@/, ""))))),
-              el("tbody", {}, ...rows.map((row) => el("tr", {}, ...row.map((value, i) => cell(columns[i]!, value))))),
+              el(
+                "thead",
+                {},
+                el(
+                  "tr",
+                  {},
+                  ...columns.map((column) => el("th", { scope: "col" }, column.replace(/^@/, ""))),
+                ),
+              ),
+              el(
+                "tbody",
+                {},
+                ...rows.map((row) => el("tr", {}, ...row.map((value, i) => cell(columns[i]!, value)))),
+              ),
             ),
           ]),
     );
@@ -74,5 +92,9 @@ function cell(column: string, value: string): HTMLElement {
   if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));
   const [head = "", ...details] = value.split("\n");
   if (details.length === 0) return el("td", { class: "words" }, head);
-  return el("td", { class: "words" }, el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n"))));
+  return el(
+    "td",
+    { class: "words" },
+    el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n"))),
+  );
 }

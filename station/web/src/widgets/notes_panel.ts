@@ -1,12 +1,12 @@
 // People's notes about a car, or the fleet: a list, and a form that writes one where the server allows it.
 
-import { MAX_NOTE_CHARACTERS, type Config, type NoteEntry, type NotesAnswer } from "../base/contract";
+import { type Config, MAX_NOTE_CHARACTERS, type NoteEntry, type NotesAnswer } from "../base/contract";
 import { el } from "../base/dom";
 import { when } from "../base/format";
-import { writeTime, type Range } from "../base/range";
+import { type Range, writeTime } from "../base/range";
 import { route } from "../base/route";
 import { may } from "../server/admission";
-import { act, ask, AnswerError } from "../server/answers";
+import { AnswerError, act, ask } from "../server/answers";
 
 /** The history around a note, in seconds before and after it. */
 const AROUND_S = 30;
@@ -22,7 +22,14 @@ export class NotesPanel {
   readonly node: HTMLElement;
   private readonly list = el("ul", { class: "notes-list" });
   private readonly said = el("p", { class: "note said", role: "status" });
-  private readonly text = el("input", { type: "text", name: "note", maxlength: String(MAX_NOTE_CHARACTERS), required: "", autocomplete: "off", "aria-label": "Note" });
+  private readonly text = el("input", {
+    type: "text",
+    name: "note",
+    maxlength: String(MAX_NOTE_CHARACTERS),
+    required: "",
+    autocomplete: "off",
+    "aria-label": "Note",
+  });
   private readonly form: HTMLElement;
   private robot: string | undefined;
   private range: Range | undefined;
@@ -33,12 +40,24 @@ export class NotesPanel {
     private readonly options: NotesOptions = {},
   ) {
     this.text.placeholder = options.at ? "What happened at this time?" : "What happened?";
-    this.form = el("form", { class: "range note-form" }, this.text, el("button", { type: "submit", class: "tool" }, "Add note"));
+    this.form = el(
+      "form",
+      { class: "range note-form" },
+      this.text,
+      el("button", { type: "submit", class: "tool" }, "Add note"),
+    );
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
       void this.write();
     });
-    this.node = el("section", { class: "panel notes", "aria-label": "Notes" }, el("header", {}, el("h3", {}, "Notes")), this.list, this.form, this.said);
+    this.node = el(
+      "section",
+      { class: "panel notes", "aria-label": "Notes" },
+      el("header", {}, el("h3", {}, "Notes")),
+      this.list,
+      this.form,
+      this.said,
+    );
   }
 
   /** Show the notes about a car, of a range if there is one; undefined for the fleet's. */
@@ -53,7 +72,10 @@ export class NotesPanel {
     this.loading?.abort();
     const loading = (this.loading = new AbortController());
     const [from, to] = this.range?.map((at) => String(Math.round(at * 1e6))) ?? [];
-    const asked = { ...(this.robot === undefined ? {} : { robot: this.robot }), ...(from === undefined ? {} : { from_us: from, to_us: to! }) };
+    const asked = {
+      ...(this.robot === undefined ? {} : { robot: this.robot }),
+      ...(from === undefined ? {} : { from_us: from, to_us: to! }),
+    };
     try {
       const { notes } = await ask<NotesAnswer>("notes", asked, loading.signal);
       if (loading.signal.aborted) return;
@@ -99,16 +121,26 @@ export class NotesPanel {
     const at = t_us / 1e6;
     const query = { from: writeTime(at - AROUND_S), to: writeTime(at + AROUND_S), at: writeTime(at) };
     const moment = el("a", { href: route({ view: "history", robot, query }) }, when(at));
-    const item = el("li", { "data-note": note.id }, ...(this.options.shown ? [el("b", { class: "mark" }, String(number))] : []), el("span", { class: "note-text" }, text), el("span", { class: "note" }, moment, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`));
+    const item = el(
+      "li",
+      { "data-note": note.id },
+      ...(this.options.shown ? [el("b", { class: "mark" }, String(number))] : []),
+      el("span", { class: "note-text" }, text),
+      el("span", { class: "note" }, moment, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`),
+    );
     if (!may(this.config, "delete_note")) return item;
-    const remove = el("button", { type: "button", class: "tool", "aria-label": `Delete the note: ${text.slice(0, 60)}` }, "Delete");
+    const remove = el(
+      "button",
+      { type: "button", class: "tool", "aria-label": `Delete the note: ${text.slice(0, 60)}` },
+      "Delete",
+    );
     remove.addEventListener("click", () => {
-      if (remove.dataset["sure"] === "true") void this.remove(note);
-      remove.dataset["sure"] = "true";
+      if (remove.dataset.sure === "true") void this.remove(note);
+      remove.dataset.sure = "true";
       remove.textContent = "Really delete";
     });
     remove.addEventListener("blur", () => {
-      remove.dataset["sure"] = "false";
+      remove.dataset.sure = "false";
       remove.textContent = "Delete";
     });
     item.append(remove);
@@ -120,7 +152,7 @@ export class NotesPanel {
   }
 
   private say(kind: string, text: string): void {
-    this.said.dataset["kind"] = kind;
+    this.said.dataset.kind = kind;
     this.said.textContent = text;
   }
 }

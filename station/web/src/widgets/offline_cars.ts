@@ -22,7 +22,10 @@ export class OfflineCars {
   /** List the cars with what is known of each; the list is open while there is nothing else to see. */
   show(cars: readonly (readonly [string, RobotPresence | Robot])[], alone: boolean): void {
     if (!this.chosen) this.node.open = alone;
-    const rows = cars.map(([name, known]) => [name, "heardAt" in known ? `last heard ${when(known.heardAt)}` : presence(known)] as const);
+    const rows = cars.map(
+      ([name, known]) =>
+        [name, "heardAt" in known ? `last heard ${when(known.heardAt)}` : presence(known)] as const,
+    );
     const drawn = JSON.stringify(rows);
     if (drawn === this.drawn) return;
     this.drawn = drawn;
@@ -30,7 +33,15 @@ export class OfflineCars {
     this.title.set(`Not heard: ${rows.length} ${rows.length === 1 ? "car" : "cars"}`);
     const view = this.config.answers ? "history" : "car";
     this.list.replaceChildren(
-      ...rows.map(([name, text]) => el("li", { "data-absent": name }, el("a", { href: route({ view, robot: name }), title: `What ${name} did` }, name), " ", text)),
+      ...rows.map(([name, text]) =>
+        el(
+          "li",
+          { "data-absent": name },
+          el("a", { href: route({ view, robot: name }), title: `What ${name} did` }, name),
+          " ",
+          text,
+        ),
+      ),
     );
   }
 }

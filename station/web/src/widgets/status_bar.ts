@@ -1,17 +1,24 @@
 // The bar above and the line below every view: the cars, the connection, the rejected messages.
 
-import { LIVE, type Config, type FieldTable } from "../base/contract";
-import { byId, setAttribute } from "../base/dom";
-import type { Alarms } from "../live/alarms";
-import type { Viewing } from "../link/viewing";
-import type { Fleet } from "../live/fleet";
-import { age, number } from "../base/format";
 import { now } from "../base/clock";
+import { type Config, type FieldTable, LIVE } from "../base/contract";
+import { byId, setAttribute } from "../base/dom";
+import { age, number } from "../base/format";
+import type { Viewing } from "../link/viewing";
 import type { LinkState } from "../link/worker_messages";
+import type { Alarms } from "../live/alarms";
+import type { Fleet } from "../live/fleet";
+import type { Speed } from "../views/view";
 
-const UNABLE = "This page can only listen: a car sends a value every few seconds until somebody else looks at it more closely.";
+const UNABLE =
+  "This page can only listen: a car sends a value every few seconds until somebody else looks at it more closely.";
 const ANNOUNCE_S = 8;
-const WORDS = { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" } as const;
+const WORDS = {
+  connecting: "Connecting",
+  paused: "Paused",
+  live: "Connected",
+  lost: "Connection lost",
+} as const;
 
 export class StatusBar {
   private reconnected: { readonly at: number; readonly downFor: number } | undefined;
@@ -30,7 +37,8 @@ export class StatusBar {
   }
 
   linked(state: LinkState): void {
-    if (state.kind === "live" && state.downFor !== undefined) this.reconnected = { at: now(), downFor: state.downFor };
+    if (state.kind === "live" && state.downFor !== undefined)
+      this.reconnected = { at: now(), downFor: state.downFor };
   }
 
   clock(at: number, link: LinkState): void {
@@ -40,7 +48,9 @@ export class StatusBar {
     const counts = (["live", "idle", "stale", "gone"] as const).filter((state) => count[state] > 0);
     const words = counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`);
     // The state of a car that is gone is unknown.
-    const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
+    const faulty = [...fleet.robots.values()].filter(
+      (robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined,
+    ).length;
     write("count", words.join(" · "));
     write("faulty", faulty === 0 ? "" : `${faulty} with a fault`);
     this.badge(at);
@@ -58,7 +68,7 @@ export class StatusBar {
   }
 
   /** The car's speed beside its stop, in sight while the page scrolls. */
-  speed(speed: { readonly text: string; readonly old: boolean } | undefined): void {
+  speed(speed: Speed | undefined): void {
     const node = byId("speed-now");
     node.hidden = speed === undefined;
     if (!speed) return;
@@ -73,7 +83,11 @@ export class StatusBar {
     const fresh = raised.filter((alarm) => alarm.fresh).length;
     const badge = byId("alarms");
     setAttribute(badge, "data-fresh", String(fresh > 0));
-    setAttribute(badge, "aria-label", this.alarms.error || `${raised.length} raised, ${fresh} of them not acknowledged`);
+    setAttribute(
+      badge,
+      "aria-label",
+      this.alarms.error || `${raised.length} raised, ${fresh} of them not acknowledged`,
+    );
     // It keeps its room, so that nothing moves when it comes and goes.
     write("alarms", raised.length > 0 ? String(raised.length) : this.alarms.error ? "?" : "");
     badge.title = this.alarms.error;

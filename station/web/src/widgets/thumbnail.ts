@@ -1,17 +1,19 @@
 // A thumbnail on a canvas. It is decoded from its bytes and never loaded by address, because the page's policy
 // allows no pictures but its own. Its size is checked first: three kilobytes can claim a billion pixels.
 
-import { bytes, type Claim } from "../live/attachments";
 import { el, setAttribute, Text } from "../base/dom";
 import { age } from "../base/format";
+import { bytes, type Claim } from "../live/attachments";
 
 // The cars' thumbnails have 96 pixels; see device/iort_agent/lanes/attachment.py.
 const MOST_PIXELS = 256;
 // The marker of a frame of any coding; three markers of the range are tables (ITU T.81, table B.1).
-const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);
+const START_OF_FRAME = (marker: number): boolean =>
+  marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);
 // Markers that may come before it: tables, the application's own and comments. All have a length; after a marker
 // without one, a decoder would look for the next marker in another place.
-const BEFORE_FRAME = (marker: number): boolean => [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
+const BEFORE_FRAME = (marker: number): boolean =>
+  [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
 
 export class Thumbnail {
   readonly node: HTMLElement;
@@ -21,7 +23,10 @@ export class Thumbnail {
   private readonly about = new Text("picture-about");
   private shown: string | undefined;
 
-  constructor(private readonly label: string, field: string) {
+  constructor(
+    private readonly label: string,
+    field: string,
+  ) {
     this.node = el(
       "figure",
       { class: "tile picture", "data-picture": field },
@@ -39,7 +44,8 @@ export class Thumbnail {
     const { key, size, contentType, thumbnail } = claim;
     this.about.set([contentType, bytes(size)].filter(Boolean).join(", "));
     setAttribute(this.node, "title", `iort files get: ${key}`);
-    if (thumbnail === undefined) this.blank(contentType.startsWith("image/") ? "the car makes no thumbnails" : "no picture");
+    if (thumbnail === undefined)
+      this.blank(contentType.startsWith("image/") ? "the car makes no thumbnails" : "no picture");
     else if (thumbnail !== this.shown) void this.decode(thumbnail);
   }
 
@@ -62,7 +68,8 @@ export class Thumbnail {
   private async decode(base64: string): Promise<void> {
     this.shown = base64;
     const jpeg = jpegOf(base64);
-    const bitmap = jpeg && (await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined));
+    const bitmap =
+      jpeg && (await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined));
     // A newer one has arrived meanwhile.
     if (this.shown !== base64) return bitmap?.close();
     if (!bitmap) return this.blank("a thumbnail that is no picture");
@@ -71,7 +78,11 @@ export class Thumbnail {
     bitmap.close();
     this.canvas.hidden = false;
     this.state.set("");
-    setAttribute(this.canvas, "aria-label", `${this.label}, ${this.canvas.width} by ${this.canvas.height} pixels`);
+    setAttribute(
+      this.canvas,
+      "aria-label",
+      `${this.label}, ${this.canvas.width} by ${this.canvas.height} pixels`,
+    );
   }
 }
 

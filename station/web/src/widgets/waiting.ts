@@ -24,10 +24,21 @@ export class Waiting {
     const unknown = robot !== undefined && robots !== undefined && !known;
     const off = known && !known.online ? known : undefined;
     const comes = "It appears here with its first live message.";
-    write("empty-title", unknown ? `There is no car ${robot}` : off ? `${robot} is offline` : `Waiting for ${robot ?? "a car"}`);
+    write(
+      "empty-title",
+      unknown ? `There is no car ${robot}` : off ? `${robot} is offline` : `Waiting for ${robot ?? "a car"}`,
+    );
     const refused = robot === undefined ? undefined : this.fleet.refused.get(robot);
-    if (refused) write("empty-text", `${refused.messages} live messages came and could not be read; the last: ${refused.reason}.`);
-    else write("empty-text", unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes);
+    if (refused)
+      write(
+        "empty-text",
+        `${refused.messages} live messages came and could not be read; the last: ${refused.reason}.`,
+      );
+    else
+      write(
+        "empty-text",
+        unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes,
+      );
     byId("empty-listening").hidden = unknown || off !== undefined;
     const past = byId("empty-past");
     past.hidden = robot === undefined || unknown || !this.config.answers;

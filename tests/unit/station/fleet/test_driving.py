@@ -70,7 +70,7 @@ LINK = {"way": 40, "outcome": "accepted", "driver": None, "by": "", "silent": Fa
 def driven(limits: Mapping[str, Any], steps: list[Any]) -> dict[str, Any]:
     """What a driver has done after the steps; a step is how often 50 ms pass, and what changes before. The
     car is ``way`` ms away in each direction, answers at 10 Hz, and its clock is 3 s ahead. `CAR` in
-    tests/web/logic/test_drive_logic.py is the same for the page's driver."""
+    station/web/test/drive.test.ts is the same for the page's driver."""
     names = (f"{i:08d}" for i in itertools.count(1))
     driver = Driver(DriveLimits(**limits), "ada", 1.0, lambda: next(names))
     now = due = 1_000_000
