@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest mutants check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -46,6 +46,9 @@ test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS
 	@$(PYTHON) scripts/setup.py --oldest $(or $(OLDEST),any)
 	@build/oldest/bin/python -m pytest -W "ignore:Python 3.8 is no longer supported" \
 		tests/device tests/unit/agent tests/unit/contract
+
+mutants: setup ## count how many of 300 fixed small faults the unit tests notice: an hour on two quiet cores
+	@$(BIN)/python scripts/mutants.py run
 
 check: setup ## run the linters, the type checkers, the links of docs/, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
