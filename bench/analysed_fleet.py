@@ -32,7 +32,7 @@ from iort_contract.messages.analysis.run import AnalysisRequest
 from iort_contract.tables import ROBOT, SAMPLES, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud

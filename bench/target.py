@@ -18,8 +18,8 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import robots
-from iort_station.page import keys
-from iort_station.page.live.listener import Listener
+from iort_station.page.page import load_keys
+from iort_station.page.pubnub import Listener
 from local.cloud import EmbeddedCloud
 
 EMBEDDED, AWS = "embedded", "aws"
@@ -54,7 +54,7 @@ class Target:
 
     def listener(self, robot: str) -> Listener:
         """A subscriber of the robot's channel."""
-        pubnub = keys.load(self.cloud)
+        pubnub = load_keys(self.cloud)
         return Listener(
             robot=robot,
             namespace=self.cloud.namespace,

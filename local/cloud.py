@@ -29,8 +29,7 @@ from iort_contract.cloud import PUBNUB
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.kept import LEDGER, announced
-from iort_station.page import keys
-from iort_station.page.keys import PubNubKeys
+from iort_station.page.page import PubNubKeys, store_keys
 from local.deployment import ROOT, deploy
 from local.emulator import first_calls, patched
 from local.errors import EmulatorError, LocalError
@@ -150,7 +149,7 @@ class EmbeddedCloud:
             self._start_pubnub(self.ports["pubnub"])
         deploy(self.cloud, self.folder, self._progress, live=self.live, kept=self.kept)
         if self.live == PUBNUB:
-            keys.store(self.cloud, self.keys)
+            store_keys(self.cloud, self.keys)
         self._progress("functions")
         first_calls.warm_up(self.cloud, self.live)
         if self.kept:

@@ -15,8 +15,7 @@ from iort_contract.cloud import PUBNUB
 from iort_contract.tables import ROBOT
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import files, robots
-from iort_station.fleet.identity import claims
+from iort_station.fleet import files, identity, robots
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
@@ -126,7 +125,7 @@ class Deployment:
 
     def _revoke_claims(self) -> None:
         if self._stack("fleet") is not None:
-            claims.revoke_all(self._cloud)
+            identity.revoke_claims(self._cloud)
 
     def _delete_files(self) -> None:
         """CloudFormation deletes no bucket that holds something."""

@@ -36,8 +36,8 @@ from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page.answers import socket
-from iort_station.page.answers.index import actions, answers
+from iort_station.page import motion
+from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.proxy import Proxy
@@ -248,7 +248,7 @@ def _sleeps(counted: Counted) -> float:
 def _served(cloud: Cloud) -> PageServer:
     return PageServer(
         namespace=cloud.namespace,
-        **socket.reaching(cloud, "iot"),
+        **motion.reaching(cloud, "iot"),
         vehicles={_WATCHED: robots.F1TENTH},
         answers=answers(cloud),
         open_actions=actions(cloud),

@@ -38,14 +38,13 @@ from iort_contract.messages.analysis.findings import DriveKey
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data.analysis import findings
-from iort_station.data.analysis.laps import laps_of_runs
-from iort_station.data.runs import runs
+from iort_station.data import findings
+from iort_station.data.runs import laps_of_runs, runs
 from iort_station.fleet import robots
 from iort_station.kept import CLOUD
-from iort_station.page.answers import control
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import actions, answers
+from iort_station.page import answers as control
+from iort_station.page.answers import actions, answers
+from iort_station.page.history import downloads
 from iort_station.page.server import PageServer
 from iort_station.times import iso
 from local.cloud import EmbeddedCloud
@@ -106,7 +105,7 @@ def _take(views: Sequence[str], out: Path) -> None:
             answers=answers(cloud.cloud),
             downloads=downloads(cloud.cloud),
             open_actions=actions(cloud.cloud),
-            actions=control.actions(cloud.cloud),
+            actions=control.keyed_actions(cloud.cloud),
         )
         stack.enter_context(server)
         pages = {
@@ -222,7 +221,7 @@ def _analyse(cloud: Cloud) -> None:
         ).result
         for number in range(_EARLIER)
     ]
-    table = findings.table(cloud)
+    table = findings.findings_table(cloud)
     for one in (*earlier, result):
         mined = one.mined
         table.put_drive(

@@ -28,11 +28,11 @@ from bench.load.agent_process import AgentProcess
 from bench.meters import chromium
 from bench.meters.waiting import wait_for
 from bench.report.result import Table
-from iort_station.fleet import robots
-from iort_station.fleet.control import stopping
-from iort_station.page.answers import control, socket
-from iort_station.page.answers.index import actions, answers
-from iort_station.page.server import Answer, PageServer
+from iort_station.fleet import robots, stopping
+from iort_station.page import answers as control
+from iort_station.page import motion
+from iort_station.page.answers import actions, answers
+from iort_station.page.server import Handler, PageServer
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from local.figures import Spread
@@ -79,11 +79,11 @@ class Course:
             self.cloud = embedded.cloud
             bundle = robots.add(self.cloud, _ROBOT, out=self._folder)
             stack.enter_context(AgentProcess(bundle, drain_s=0.0))
-            keyed = control.actions(self.cloud)
+            keyed = control.keyed_actions(self.cloud)
             self.server = stack.enter_context(
                 PageServer(
                     namespace=self.cloud.namespace,
-                    **socket.reaching(self.cloud, "iot"),
+                    **motion.reaching(self.cloud, "iot"),
                     answers={**answers(self.cloud), **dict.fromkeys(_HELD, self._hold)},
                     open_actions=actions(self.cloud),
                     actions={**keyed, "stop": self._timed(keyed["stop"])},
@@ -123,7 +123,7 @@ class Course:
         self._go.wait()
         return {"robots": {}}
 
-    def _timed(self, stop: Answer) -> Answer:
+    def _timed(self, stop: Handler) -> Handler:
         def timed(asked: Mapping[str, str]) -> Mapping[str, Any]:
             self.taken_ms.append(time.time() * 1000)
             answer = cast("Mapping[str, Any]", stop(asked))  # it waits for no robot

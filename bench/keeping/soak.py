@@ -24,7 +24,7 @@ from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 

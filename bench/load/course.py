@@ -20,8 +20,9 @@ from bench.errors import BenchError
 from bench.load.tries import Heard
 from bench.ros.graph import RosGraph
 from iort_station.fleet import robots
-from iort_station.page.answers import control, socket
-from iort_station.page.answers.index import actions, answers
+from iort_station.page import answers as control
+from iort_station.page import motion
+from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.proxy import Proxy
@@ -73,10 +74,10 @@ class Course:
             self.start_agent()
             server = PageServer(
                 namespace=self.cloud.namespace,
-                **socket.reaching(self.cloud, "iot"),
+                **motion.reaching(self.cloud, "iot"),
                 answers=answers(self.cloud),
                 open_actions=actions(self.cloud),
-                actions=control.actions(self.cloud),
+                actions=control.keyed_actions(self.cloud),
             )
             self.server = stack.enter_context(server)
             self._exit = stack.pop_all()

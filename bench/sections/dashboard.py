@@ -19,9 +19,8 @@ from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.operations.delivery import audit, trace
-from iort_station.page import keys
-from iort_station.page.live.listener import Listener
-from iort_station.page.page import BUILT
+from iort_station.page.page import BUILT, load_keys
+from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
 from local.figures import THESIS
 
@@ -63,7 +62,7 @@ def run(target: Target, say: Say) -> Section:
         live={"when": "always"},
         ping={"rate_hz": 1},
     )
-    pubnub = keys.load(target.cloud)
+    pubnub = load_keys(target.cloud)
     found: list[trace.Times] = []
     listener = Listener(
         robot=bundle.robot,
@@ -152,7 +151,7 @@ def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
         say("no Chromium, or the page is not built: measured to the subscriber only")
         yield None
         return
-    server = PageServer(namespace=target.cloud.namespace, **keys.load(target.cloud).reading())
+    server = PageServer(namespace=target.cloud.namespace, **load_keys(target.cloud).reading())
     with server as page_server, chromium.opened() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(page_server.url)

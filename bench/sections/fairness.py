@@ -21,7 +21,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND
 from iort_contract.topics import LIVE, build_topic, record_topic
-from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.data.recorded import summary_table, topic_of
 
 # AWS IoT accepts this many publishes a second from a connection.
 RATE_HZ = 100

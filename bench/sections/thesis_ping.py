@@ -22,8 +22,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import T_US
 from iort_contract.topics import BROKER, PING_PATHS
 from iort_station.fleet.robots import Bundle
-from iort_station.page import keys
-from iort_station.page.live.listener import Listener
+from iort_station.page.page import load_keys
+from iort_station.page.pubnub import Listener
 from local.figures import THESIS, THESIS_MS
 from local.network.proxy import Proxy
 
@@ -61,7 +61,7 @@ def _to_subscriber(target: Target, port: int) -> list[float]:
     """Return the delays in ms from the sample in a driving car to the subscriber, by one clock."""
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}
     bundle = target.robot("bench-far", port=port, sources=[source], live={"when": "always"})
-    pubnub = keys.load(target.cloud).reading()
+    pubnub = load_keys(target.cloud).reading()
     host, _, its_port = pubnub.pop("origin").partition(":")
     delays_ms: list[float] = []
     with (

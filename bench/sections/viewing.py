@@ -25,8 +25,8 @@ from iort_station.cost.usage import Usage
 from iort_station.fleet import viewing
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page import keys
-from iort_station.page.live.listener import Listener
+from iort_station.page.page import load_keys
+from iort_station.page.pubnub import Listener
 
 ROBOT = "bench-viewing"
 IDLE_S, WATCHED_S, WAKES = 60, 20, 20
@@ -100,7 +100,7 @@ def _listening(target: Target, robot: str) -> Iterator[Viewers]:
             robot=robot,
             namespace=cloud.namespace,
             on_update=lambda update, *_: viewers.take(PUBNUB, decode_live_update(update).live),
-            **keys.load(cloud).reading(),
+            **load_keys(cloud).reading(),
         ),
     ):
         yield viewers

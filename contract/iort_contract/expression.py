@@ -7,7 +7,7 @@ arithmetic gives null and every comparison is false; division by zero gives null
 if it is neither null, zero nor empty. A comparison of a number with a text, or arithmetic with a text, is an
 error, since no sample could match.
 
-The query function evaluates over lists; iort_station.data.conditions evaluates over numpy's columns, with the
+The query function evaluates over lists; iort_station.data.selection evaluates over numpy's columns, with the
 same answers.
 """
 

@@ -32,11 +32,11 @@ from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations.delivery import counts
-from iort_station.page.answers import control
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import actions, answers
-from iort_station.page.answers.socket import reaching
-from iort_station.page.live.listening import Listening, listening
+from iort_station.page import answers as control
+from iort_station.page.answers import actions, answers
+from iort_station.page.history import downloads
+from iort_station.page.listening import Listening, listening
+from iort_station.page.motion import reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.demo import options
@@ -108,7 +108,7 @@ class _Demo:
                     downloads=downloads(embedded.cloud),
                     track=HALL if self._options.bag is None else None,
                     open_actions=actions(embedded.cloud),
-                    actions=control.actions(embedded.cloud),
+                    actions=control.keyed_actions(embedded.cloud),
                     port=self._options.port,
                     invitations=kept.pages(),
                 )

@@ -14,10 +14,10 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import Cloud
 from iort_station.fleet import registry
-from iort_station.page.answers import control
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import actions, answers
-from iort_station.page.answers.socket import prompt, reaching
+from iort_station.page import answers as control
+from iort_station.page.answers import actions, answers
+from iort_station.page.history import downloads
+from iort_station.page.motion import prompt, reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.listen import Listen
@@ -76,5 +76,5 @@ def shown(cloud: Cloud) -> dict[str, Any]:
         "answers": answers(cloud),
         "downloads": downloads(cloud),
         "open_actions": actions(cloud),
-        "actions": control.actions(cloud),
+        "actions": control.keyed_actions(cloud),
     }

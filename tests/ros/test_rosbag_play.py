@@ -15,7 +15,7 @@ from iort_agent.common.threads import SystemClock
 from iort_agent.sources.recording import BagConfig
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.message import RosMessage
-from iort_station.recordings import recordings
+from iort_station.data import bags
 from tests.recordings import recording
 from tests.ros.conftest import Graph
 from tests.ros.test_source import emitted
@@ -52,7 +52,7 @@ def driven(path: Path) -> tuple[dict[str, MessageType], dict[str, list[tuple[int
 def test_rosbag_play_replays_every_message(graph: Graph, player: list[str], tmp_path: Path) -> None:
     kinds, went = driven(recording("f1tenth-motor-servo.bag"))
     ride = tmp_path / "ride.bag"
-    with recordings.bag(ride) as file:
+    with bags.bag(ride) as file:
         for stream, messages in went.items():
             kind = kinds[stream]
             write = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum)

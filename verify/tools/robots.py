@@ -13,7 +13,7 @@ from iort_contract.topics import PING, PONG, RECORD, build_topic, record_topic
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
-from iort_station.page.live.listener import Listener
+from iort_station.page.pubnub import Listener
 from verify.errors import CannotAskError, VerifyError
 from verify.tools.robot import Robot
 from verify.tools.spoofing import spoofed

@@ -25,7 +25,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from iort_station.operations.delivery.audit import headers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from iort_station.fleet.control.driving import Stick
+from iort_station.fleet.driving import Stick
 
 # The longest usual time from a press to its first repetition, and several times the time between two.
 FIRST_US, NEXT_US = 700_000, 200_000

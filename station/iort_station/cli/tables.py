@@ -11,7 +11,7 @@ from rich.table import Table
 from iort_analysis.samples.positions import in_degrees
 from iort_station.cli.console import Lines
 from iort_station.data import Result
-from iort_station.recordings.tabular import texts_of_time
+from iort_station.data.tabular import texts_of_time
 from iort_station.texts import one_line
 
 # A terminal shows the beginning and the end of a long result: this many rows each.

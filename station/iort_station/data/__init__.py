@@ -1,4 +1,4 @@
-"""Recorded samples as numpy arrays or a pandas frame; this package exports what a notebook needs.
+"""Recorded samples: queried, listed by run, exported, and what the analysis says of them.
 
     from iort_station import data
     from iort_station.cloud import Cloud

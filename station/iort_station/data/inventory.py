@@ -1,39 +1,97 @@
-"""What a deployment has: robots, their parameters, streams and fields; and the errors that name them."""
+"""What is stored of a robot: streams, types, fields and units; and the errors that name them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from functools import lru_cache
 
 from iort_analysis.samples.batches import RefusedItems, in_order, part
 from iort_analysis.samples.blocks import EMPTY, Block, join, values
-from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
-from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
-from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
+from iort_contract.catalog.ros_types import ROS_UNITS, TYPE_UNITS
+from iort_contract.catalog.streams import ACCOUNT_STREAM, CATALOG, OWN_STREAMS, TYPES_STREAM
+from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.dynamodb import with_samples_between
-from iort_contract.limits import ContractError
+from iort_contract.limits import ContractError, MessageError
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.tables import STREAMS
+from iort_contract.ros1.definition import Fields, parse
+from iort_contract.tables import STATS, STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data.reports import last_reports
+from iort_station.data.recorded import Recorded, last_reports
 from iort_station.data.selection import Selection
-from iort_station.data.stored.recorded import Recorded
-from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import registry
 from iort_station.times import iso
 
+VESC_KIND = "vesc_msgs/VescState"
+
+
+def unit(stream: str, name: str, *, ros2: bool = False, kind: MessageType | None = None) -> str:
+    """The unit of a field or of one of its statistics; empty if unknown.
+
+    ``ros2`` tells that the samples are the ROS 2 driver's; ``kind`` is the type of the stream's messages.
+    """
+    stem, _, statistic = name.rpartition("_")
+    for field in (name, stem) if statistic in STATS else (name,):
+        if found := _unit(stream, field, kind, ros2=ros2):
+            return found
+    return ""
+
+
+def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> str:
+    if field in DERIVED:
+        return DERIVED[field].unit
+    if kind is None and stream in CATALOG and (found := CATALOG[stream].unit(field, ros2=ros2)):
+        return found
+    if kind is not None and (found := _by_type(kind, field, ros2=ros2)):
+        return found
+    if stream == VESC_STREAM and (found := VESC.unit(field, ros2=ros2)):
+        return found
+    if field in LOG_UNITS and (stream == VESC_STREAM if kind is None else kind.kind == VESC_KIND):
+        return LOG_UNITS[field]
+    # The driver's VescImu has fields of these names in other units.
+    if kind is not None and kind.kind.startswith("vesc_msgs/"):
+        return ""
+    within, _, axis = field.rpartition(".")
+    known_as = (of for of in ROS_UNITS if within == of or within.endswith(f".{of}"))
+    return next((ROS_UNITS[of] for of in known_as), "") if axis in {"x", "y", "z"} else ""
+
+
+def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
+    types = _fields_of_type(kind.kind, kind.definition)
+    body = [field for field in types.get(kind.kind, ()) if field.name != "header"]
+    # With a header and one other field, the sample's fields are that field's: see
+    # contract/iort_contract/ros1/decode.py.
+    starts = [body[0].kind, kind.kind] if len(body) == 1 else [kind.kind]
+    return next(filter(None, (_on_the_way(types, start, path, ros2=ros2) for start in starts)), "")
+
+
+def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool) -> str:
+    """The unit that a type along the path gives to the next part of the path."""
+    for name in path.split("."):
+        if name.isdecimal():
+            continue
+        if kind.startswith(VESC_KIND) and (known := VESC.unit(name, ros2=ros2)):
+            return known
+        if name in TYPE_UNITS.get(kind, {}):
+            return TYPE_UNITS[kind][name]
+        kind = next((field.kind for field in types.get(kind, ()) if field.name == name), "")
+    return ""
+
+
+@lru_cache(maxsize=256)
+def _fields_of_type(kind: str, definition: str) -> Mapping[str, Fields]:
+    """The fields of a type and of the types inside it; empty for an invalid definition."""
+    try:
+        return parse(kind, definition).types
+    except MessageError:
+        return {}
+
+
 # Every driver's VescState has these fields, and hardly any other message has.
 _VESC_FIELDS = frozenset({"voltage_input", "current_motor", "duty_cycle"})
-
-
-def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
-    """The robot's vehicle parameters from the registry; None if it has none."""
-    row = registry.find(cloud, robot)
-    if row is None or not row.get("speed_to_erpm_gain"):
-        return None
-    return Vehicle(float(row["speed_to_erpm_gain"]), float(row.get("speed_to_erpm_offset", 0)))
 
 
 def check_there(cloud: Cloud, robot: str, stream: str) -> None:

@@ -1,4 +1,4 @@
-"""The runs of a robot's agent, found without reading what they recorded.
+"""The runs of a robot's agent, what each recorded, and the laps in it; the runs are found without reading it.
 
 The key of a batch has its time, its run and its number within the run. A batch spans at most a second, so the
 number tells how far back the run may have begun; the batch before its first one is the last of another run.
@@ -9,29 +9,44 @@ stream at the same time may look shorter than they are.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import NamedTuple
 
-from iort_analysis.archive.stored import Origin
+from iort_analysis.archive.stored import Origin, PageProgress
+from iort_analysis.drives.building import build
+from iort_analysis.drives.motion import motion_of
+from iort_analysis.mining import laps
+from iort_analysis.mining.gain import with_gain
+from iort_analysis.results import Mined
 from iort_analysis.samples.batches import ATTRIBUTES
+from iort_analysis.samples.blocks import Block
+from iort_analysis.samples.positions import position_fields
+from iort_contract.catalog.derived import registered_vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import plain, starting_between, whole
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
+from iort_contract.messages.analysis.findings import DriveKey
 from iort_contract.messages.analysis.insights import Extent
 from iort_contract.messages.batch import BatchId, decode_batch
 from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.queries import has_fraction, query
+from iort_station.data.recorded import Recorded
+from iort_station.fleet import registry
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
 _READERS = 8
+# The runs that an overview counts.
+_MOST_RUNS = 100
 
 
 class Part(NamedTuple):
@@ -102,6 +117,46 @@ def runs(
         elif i and run["state"] == "running":
             run["state"] = "cut off"
     return {"runs": made[:count], "older": len(made) > count, "streams": extents}
+
+
+@dataclass(frozen=True)
+class StreamOverview:
+    """A stream: its extent, its newest runs, and the fields of its newest batch with their units.
+
+    ``older`` tells whether there are more runs than those counted.
+    """
+
+    stream: str
+    extent: Extent
+    runs: int
+    older: bool
+    fields: Mapping[str, str]
+
+
+def overview(cloud: Cloud, robot: str, *, origin: Origin | None = None) -> list[StreamOverview]:
+    """The robot's streams, the agent's own ones last; at most `_MOST_RUNS` runs are counted.
+
+    It reads the newest batch of each stream, and for each run what `runs` reads. ``origin`` learns
+    which hours of the archive that was. Raises `StationError` for an unknown robot.
+    """
+    streams = sorted(inventory.check_recorded(cloud, robot), key=lambda name: (name in OWN_STREAMS, name))
+    answer = runs(cloud, robot, streams=streams, count=_MOST_RUNS, origin=origin)
+    kinds = {kind.stream: kind for _, kind in inventory.types_of(cloud, robot)}
+
+    def described(stream: str) -> StreamOverview:
+        newest = inventory.newest_block(cloud, robot, stream)
+        kind = kinds.get(stream) or inventory.assumed_kind(stream, newest.columns.keys())
+        kind = None if stream in {VESC_STREAM, *OWN_STREAMS} else kind
+        ros2 = has_fraction(newest)
+        return StreamOverview(
+            stream,
+            answer["streams"][stream],
+            sum(stream in run["streams"] for run in answer["runs"]),
+            answer["older"],
+            {name: inventory.unit(stream, name, ros2=ros2, kind=kind) for name in newest.columns},
+        )
+
+    return [described(stream) for stream in streams if stream in answer["streams"]]
 
 
 def _by_run(found: dict[str, list[Part]], accounts: dict[str, _Account]) -> list[Run]:
@@ -214,3 +269,60 @@ class _Reader:
     def _end_us(self, last: BatchId) -> int:
         times_us = self._recorded.block(last, lambda _name: False).times_us
         return int(times_us[-1] if len(times_us) else last.t_us) + 1
+
+
+class RunLaps(NamedTuple):
+    """What was found in a run, or in the part of it that a range has."""
+
+    run: str
+    start_us: int
+    end_us: int
+    mined: Mined
+
+
+def laps_of_runs(
+    cloud: Cloud,
+    robot: str,
+    start_us: int | None,
+    end_us: int | None,
+    *,
+    count: int,
+    progress: PageProgress | None = None,
+) -> Iterator[RunLaps]:
+    """The laps of the newest ``count`` runs in a range, the oldest first."""
+    found = runs(cloud, robot, start_us=start_us, end_us=end_us, count=count)["runs"]
+    for run in reversed(found):
+        first_us = max(run["from_us"], start_us or 0)
+        last_us = run["to_us"] if end_us is None else min(run["to_us"], end_us)
+        mined = laps_within(cloud, robot, first_us, last_us, progress=progress)
+        yield RunLaps(run["run"], first_us, last_us, mined)
+
+
+def laps_within(
+    cloud: Cloud,
+    robot: str,
+    start_us: int,
+    end_us: int,
+    *,
+    progress: PageProgress | None = None,
+    most: int | None = None,
+) -> Mined:
+    """The laps from ``start_us`` to before ``end_us``; raises `StationError` over ``most`` values."""
+    streams: dict[str, Block] = {}
+    notes: dict[str, str] = {}
+    for name in inventory.check_recorded(cloud, robot):
+        if name in OWN_STREAMS or not _tells_laps(name, inventory.newest_block(cloud, robot, name)):
+            continue
+        read = query(cloud, robot, name, start_us, end_us, progress=progress, most=most)
+        streams[name] = Block(read.times_us, dict(read.columns))
+        if read.refused:
+            notes[f"{name} items"] = f"{read.refused:,} cannot be read; the first: {read.reason}"
+    vehicle = registered_vehicle(registry.find(cloud, robot) or {})
+    drive = build(DriveKey(robot, start_us, ""), streams, vehicle)
+    mined = laps.mine(with_gain(drive))
+    return replace(mined, missing={**notes, **mined.missing})
+
+
+def _tells_laps(stream: str, block: Block) -> bool:
+    """Whether a stream like this one has a position or a speed."""
+    return position_fields(block.columns) is not None or motion_of(stream, block.columns) is not None

@@ -73,6 +73,13 @@ def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
     }
 
 
+def vehicle_of(cloud: Cloud, robot: str) -> derived.Vehicle | None:
+    """A robot's vehicle parameters; None without a gain."""
+    row = find(cloud, robot) or {}
+    gain = float(row.get("speed_to_erpm_gain") or 0)
+    return derived.Vehicle(gain, float(row.get("speed_to_erpm_offset") or 0)) if gain else None
+
+
 def presence(cloud: Cloud) -> dict[str, RobotPresence]:
     """Whether each robot is ``online``, and ``since_ms`` when; None if it has never connected."""
     found: dict[str, RobotPresence] = {}

@@ -1,8 +1,9 @@
-"""Adds and removes robots: thing, certificate, policy and the registry's row."""
+"""Robots as a fleet has them: added and removed with thing, certificate, policy and row; and their tags."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,8 @@ from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry
-from iort_station.fleet.identity import certificates
-from iort_station.fleet.identity.bundle import Bundle, configure, write_bundle
+from iort_station.fleet import identity, registry
+from iort_station.fleet.identity import Bundle, configure, write_bundle
 from iort_station.fleet.registry import F1TENTH, listed
 
 __all__ = ["F1TENTH", "Bundle", "add", "checked_vehicle", "configure", "listed", "remove"]
@@ -83,7 +83,7 @@ def equip(cloud: Cloud, bundle: Bundle, settings: Mapping[str, Any] | None = Non
     iot, robot = cloud.client("iot"), bundle.robot
     try:
         make_thing(cloud, robot, attributes(cloud, robot) or {"vehicle": "vesc"})
-        made = certificates.make(iot, robot)
+        made = identity.make_certificate(iot, robot)
         iot.attach_policy(policyName=fleet_name(cloud.namespace), target=made.arn)
         iot.attach_thing_principal(thingName=robot, principal=made.arn)
     except ClientError as error:
@@ -122,17 +122,62 @@ def remove(cloud: Cloud, robot: str) -> None:
     registry.get(cloud, robot)
     # A claim must not get it a new certificate now.
     registry.close_name(cloud, robot)
-    held = certificates.attached(cloud, robot)
+    held = identity.certificates(cloud, robot)
     for certificate in held:
-        certificates.revoke(cloud, certificate)
-    certificates.cut(cloud, robot)
+        identity.revoke_certificate(cloud, certificate)
+    identity.end_session(cloud, robot)
     for certificate in held:
-        certificates.delete(cloud, robot, certificate)
+        identity.delete_certificate(cloud, robot, certificate)
     # It may have reconnected before all servers knew of the revocation; without its policy it cannot again.
-    certificates.cut(cloud, robot)
+    identity.end_session(cloud, robot)
     iot, data = cloud.client("iot"), cloud.client("iot-data")
     # The next robot of this name must not inherit its settings. A robot that never connected has no shadow.
     with contextlib.suppress(data.exceptions.ResourceNotFoundException):
         data.delete_thing_shadow(thingName=robot, shadowName=SHADOW)
-    certificates.once_detached(iot, iot.delete_thing, thingName=robot)
+    identity.once_detached(iot, iot.delete_thing, thingName=robot)
     registry.forget(cloud, robot)
+
+
+# Provisioning compares it, so it is no tag.
+_SERIAL = "serial"
+# What AWS IoT allows.
+_TAG = re.compile(r"[A-Za-z0-9_.,@/:#-]{1,128}")
+_TAG_VALUE = re.compile(r"[A-Za-z0-9_.,@/:#=\[\]-]{1,800}")
+
+
+def tags(cloud: Cloud) -> dict[str, dict[str, str]]:
+    """Each robot's tags."""
+    pages = (
+        cloud.client("iot").get_paginator("list_things").paginate(thingTypeName=fleet_name(cloud.namespace))
+    )
+    return {
+        str(thing["thingName"]): _tags(thing.get("attributes", {}))
+        for page in pages
+        for thing in page["things"]
+    }
+
+
+def change_tags(cloud: Cloud, robot: str, wanted: Mapping[str, str | None]) -> dict[str, str]:
+    """Set tags, or remove those that are None; returns all tags of the robot.
+
+    Raises `StationError` if the robot is not registered, `UsageError` for a tag that AWS IoT does not allow.
+    """
+    for name, value in wanted.items():
+        if name == _SERIAL or not _TAG.fullmatch(name):
+            raise UsageError(f"a tag's name must be letters, digits or _.,@/:#- and not serial, got {name}")
+        if value is not None and not _TAG_VALUE.fullmatch(value):
+            raise UsageError(f"a tag's value must be letters, digits or _.,@/:#=[]- , got {value!r}")
+    iot = cloud.client("iot")
+    try:
+        known = iot.describe_thing(thingName=registry.checked(robot)).get("attributes", {})
+        changed = {**known, **wanted}
+        kept = {name: value for name, value in changed.items() if value is not None}
+        if kept != known:
+            iot.update_thing(thingName=robot, attributePayload={"attributes": kept, "merge": False})
+    except iot.exceptions.ResourceNotFoundException as error:
+        raise registry.not_registered(cloud, robot) from error
+    return _tags(kept)
+
+
+def _tags(attributes: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in sorted(attributes.items()) if name != _SERIAL}

@@ -15,7 +15,7 @@ from iort_analysis.archive.writing import described, write_day
 from iort_contract.archive import ArchivedHour, hour_key, parse_hour, refused_key
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data.recorded import archive_of
 from iort_station.errors import StationError
 
 

@@ -16,7 +16,7 @@ from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.dynamodb import starting_between
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.recorded import Recorded
 from iort_station.errors import StationError
 from iort_station.moving.recorded import BatchProgress
 from iort_station.operations.delivery.audit import Audit, audit

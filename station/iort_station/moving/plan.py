@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from iort_contract.tables import MOVED_FROM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.batches import topic_of
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data.recorded import archive_of, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import files, registry
 from iort_station.fleet.files import StoredFile

@@ -12,8 +12,7 @@ from iort_analysis.samples.batches import Item
 from iort_contract.dynamodb import WRITE_ITEMS, Keys, TableError, TelemetryTable, whole
 from iort_contract.tables import BATCH, EXPIRES_S
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import telemetry_table
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data.recorded import archive_of, telemetry_table
 from iort_station.errors import StationError
 
 # A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half

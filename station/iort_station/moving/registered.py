@@ -30,9 +30,8 @@ from iort_contract.tables import (
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import registry, robots
-from iort_station.fleet.identity import certificates
-from iort_station.fleet.identity.bundle import Bundle
+from iort_station.fleet import identity, registry, robots
+from iort_station.fleet.identity import Bundle
 from iort_station.moving.plan import origin
 
 # What a registry's row says of the deployment and not of the robot.
@@ -132,7 +131,7 @@ def _is_of(cloud: Cloud, bundle: Bundle) -> bool:
     """Whether the bundle's certificate is one that the robot has in this cloud."""
     try:
         named = yaml.safe_load(bundle.config.read_text())["certificate"]
-        found = certificates.fingerprint((bundle.folder / named).read_text())
+        found = identity.fingerprint((bundle.folder / named).read_text())
     except (KeyError, OSError, TypeError, ValueError, yaml.YAMLError):
         return False
-    return found in {one.id for one in certificates.attached(cloud, bundle.robot)}
+    return found in {one.id for one in identity.certificates(cloud, bundle.robot)}

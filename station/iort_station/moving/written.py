@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iort_station.cloud import Cloud
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 
 
 def copy(source: Cloud, target: Cloud, robot: str) -> int:
@@ -11,7 +11,7 @@ def copy(source: Cloud, target: Cloud, robot: str) -> int:
 
     A note that was deleted on either side is deleted in the target.
     """
-    old, new = findings.table(source), findings.table(target)
+    old, new = findings.findings_table(source), findings.findings_table(target)
     # The target may have analysed a drive again, with all of its batches.
     analysed, there = {one.drive for one in new.drives(robot)}, {note.id for note in new.notes(robot)}
     # A drive whose analysis failed has a finding, and no row.

@@ -35,8 +35,7 @@ from iort_contract.tables import TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.data.stored.batches import telemetry_table, topic_of
-from iort_station.data.stored.recorded import stores
+from iort_station.data.recorded import stores, telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 

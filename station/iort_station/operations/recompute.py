@@ -23,9 +23,9 @@ from iort_contract.tables import (
     VEHICLE_CACHE_S,
 )
 from iort_station.cloud import Cloud
-from iort_station.data import inventory, summary
+from iort_station.data import inventory, recorded
+from iort_station.data.recorded import Recorded
 from iort_station.data.selection import Selection
-from iort_station.data.stored.recorded import Recorded
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
 
@@ -98,7 +98,7 @@ def _from(robot: str, stream: str, since_us: int | None) -> Selection:
 
 
 def _has_speed(cloud: Cloud, selection: Selection) -> bool:
-    pages = summary.stored(cloud, selection)
+    pages = recorded.stored_seconds(cloud, selection)
     return any(name.startswith("speed") for items in pages for item in items for name in item)
 
 

@@ -31,7 +31,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import RECORD
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import telemetry_table
+from iort_station.data.recorded import telemetry_table
 from iort_station.errors import StationError
 from iort_station.operations.quarantine import CONTENTS, DeadLetter, key, load
 

@@ -1,23 +1,30 @@
-"""The live page's files and its configuration.
+"""The live page: its files, its configuration with PubNub's keys, and its publication on the web.
 
-``npm run build`` makes it from station/web into the folder `built`. `iort_station.page.server` serves it, and
-`iort_station.page.site` publishes it on the web.
+``npm run build`` makes the files from station/web into the folder `built`; `iort_station.page.server` serves
+them. PubNub's keys are kept encrypted in Parameter Store; only `live` and the operator read them.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from iort_contract.cloud import PUBNUB
+from botocore.exceptions import ClientError
+
+from iort_contract.cloud import PUBNUB, pubnub_parameter
 from iort_contract.limits import ContractError
 from iort_contract.messages.page import Config, Identity, TrackMap
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_contract.topics import check_namespace, check_robot
 from iort_contract.track import Track, parse_track
+from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
@@ -113,6 +120,54 @@ def config(
     }
 
 
+@dataclass(frozen=True, kw_only=True)
+class PubNubKeys:
+    """A key set; ``origin`` and ``tls`` select a server other than PubNub's own."""
+
+    publish_key: str = field(repr=False)
+    subscribe_key: str = field(repr=False)
+    origin: str = ""
+    tls: bool = True
+
+    def reading(self) -> dict[str, Any]:
+        """Keyword arguments for a listener or a page: the subscribe key, and a server other than PubNub's."""
+        server = {"origin": self.origin, "tls": self.tls} if self.origin else {}
+        return {"subscribe_key": self.subscribe_key, **server}
+
+
+def typed_keys(publish_key: str, subscribe_key: str) -> PubNubKeys:
+    """Check keys of PubNub's own servers that somebody typed.
+
+    Raises `StationError` for any other text, without repeating it: it may be the secret key.
+    """
+    typed_keys = {"publish": publish_key.strip(), "subscribe": subscribe_key.strip()}
+    for kind, key in typed_keys.items():
+        if not key.startswith(f"{kind[:3]}-c-"):
+            raise StationError(f"the {kind} key must be {kind[:3]}-c-..., as PubNub's admin portal shows it")
+    return PubNubKeys(publish_key=typed_keys["publish"], subscribe_key=typed_keys["subscribe"])
+
+
+def store_keys(cloud: Cloud, keys: PubNubKeys) -> None:
+    """Write the keys, in place of stored ones."""
+    value = {"publish_key": keys.publish_key, **keys.reading()}
+    cloud.client("ssm").put_parameter(
+        Name=pubnub_parameter(cloud.namespace), Value=json.dumps(value), Type="SecureString", Overwrite=True
+    )
+
+
+def load_keys(cloud: Cloud) -> PubNubKeys:
+    """Read the keys; raises `StationError` if none are stored."""
+    ssm, name = cloud.client("ssm"), pubnub_parameter(cloud.namespace)
+    try:
+        answer = ssm.get_parameter(Name=name, WithDecryption=True)
+    except ssm.exceptions.ParameterNotFound as error:
+        raise StationError("PubNub's keys are not stored yet: run `iort pubnub`") from error
+    try:
+        return PubNubKeys(**json.loads(answer["Parameter"]["Value"]))
+    except (TypeError, ValueError) as error:
+        raise StationError(f"parameter {name} does not hold PubNub's keys") from error
+
+
 def load_track(file: Path) -> Track:
     """The track of a CSV file; raises `StationError` for another file."""
     try:
@@ -128,3 +183,62 @@ def _track_map(track: Track) -> TrackMap:
         "w_right_m": list(track.w_right_m),
         "w_left_m": list(track.w_left_m),
     }
+
+
+if TYPE_CHECKING:
+    from types_boto3_s3 import S3Client
+    from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
+
+# Names do not change with their content, so a browser must ask each time if a file is still the same.
+_CACHE = "no-cache"
+_MANY = 1_000
+
+
+def site_files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
+    """Every file of the static page by its key; ``told`` is `iort_station.page.page.config`'s.
+
+    Raises `StationError` if the page is not built.
+    """
+    tables = {"config.json": told}
+    return built_files(built) | {
+        name: json.dumps(value, allow_nan=False).encode() for name, value in tables.items()
+    }
+
+
+def upload(s3: S3Client, bucket: str, content: Mapping[str, bytes]) -> list[str]:
+    """Make the bucket hold exactly ``content``; returns the other keys, which are deleted.
+
+    The page itself comes last, after the files that it needs.
+    """
+    for key in sorted(content, key=lambda key: key == "index.html"):
+        kind = TYPES[Path(key).suffix]
+        s3.put_object(Bucket=bucket, Key=key, Body=content[key], ContentType=kind, CacheControl=_CACHE)
+    pages = s3.get_paginator("list_objects_v2").paginate(Bucket=bucket)
+    old = [
+        entry["Key"] for page in pages for entry in page.get("Contents", []) if entry["Key"] not in content
+    ]
+    for at in range(0, len(old), _MANY):
+        gone: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in old[at : at + _MANY]]
+        s3.delete_objects(Bucket=bucket, Delete={"Objects": gone, "Quiet": True})
+    return old
+
+
+def publish(cloud: Cloud, told: Mapping[str, Any]) -> str:
+    """Upload the page, renew CloudFront's copies, and return the page's address.
+
+    Raises `StationError` if the stack is not deployed.
+    """
+    content = site_files(told)
+    bucket, distribution = cloud.output("site", "PageBucket"), cloud.output("site", "PageDistribution")
+    try:
+        upload(cloud.client("s3"), bucket, content)
+        cloud.client("cloudfront").create_invalidation(
+            DistributionId=distribution,
+            InvalidationBatch={
+                "Paths": {"Quantity": 1, "Items": ["/*"]},
+                "CallerReference": str(time.time_ns()),
+            },
+        )
+    except ClientError as error:
+        raise StationError(f"the page could not be uploaded: {error}") from error
+    return cloud.output("site", "PageUrl")

@@ -43,14 +43,14 @@ from iort_contract.page import (
 from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
-from iort_station.page.bodies import Body, as_json, packed, takes_gzip
 from iort_station.page.invitations import COMMAND, answer, listening
 from iort_station.page.page import BUILT, DRIVE, TYPES, built_files, config
 from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of, off_the_loop
+from iort_station.page.requests import Body, as_json, packed, takes_gzip
 
 # What waits yields whenever it does, and holds no place meanwhile.
 Waiting = Generator[None, None, Mapping[str, Any]]
-Answer = Callable[[Mapping[str, str]], Mapping[str, Any] | Waiting]
+Handler = Callable[[Mapping[str, str]], Mapping[str, Any] | Waiting]
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
 Vehicles = Mapping[str, Mapping[str, float]]
@@ -102,9 +102,9 @@ class PageServer(BackgroundServer):
         tls: bool = True,
         vehicles: Vehicles | Callable[[], Vehicles] | None = None,
         token: str = "",
-        answers: Mapping[str, Answer] | None = None,
-        actions: Mapping[str, Answer] | None = None,
-        open_actions: Mapping[str, Answer] | None = None,
+        answers: Mapping[str, Handler] | None = None,
+        actions: Mapping[str, Handler] | None = None,
+        open_actions: Mapping[str, Handler] | None = None,
         admitted: Callable[[str], None] | None = None,
         downloads: Mapping[str, Download] | None = None,
         track: Track | None = None,
@@ -268,7 +268,7 @@ class PageServer(BackgroundServer):
         self,
         request: web.BaseRequest,
         path: str,
-        answer: Answer,
+        answer: Handler,
         parameters: Mapping[str, str],
         lane: str,
     ) -> web.Response:
@@ -339,7 +339,7 @@ class PageServer(BackgroundServer):
         return secrets.compare_digest(told.encode(errors="surrogateescape"), self._key.encode())
 
     async def _act(
-        self, request: web.BaseRequest, path: str, action: Answer, *, keyed: bool = False
+        self, request: web.BaseRequest, path: str, action: Handler, *, keyed: bool = False
     ) -> web.StreamResponse:
         """Answer with the result of an action; its parameters are texts in a JSON object."""
         # Every browser sends the origin with a POST, and no script can change it.
@@ -399,7 +399,7 @@ def on_loopback(host: str) -> bool:
         return False
 
 
-def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
+def _answered(answer: Handler, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
     def begun() -> tuple[int, Body] | Waiting:
         result = answer(parameters)
         return result if isinstance(result, Generator) else (200, as_json(result, level=1))

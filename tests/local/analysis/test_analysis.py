@@ -22,7 +22,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.tables import ROBOT, STREAMS
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud
 from tests.fakes import item_of

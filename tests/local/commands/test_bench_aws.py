@@ -14,8 +14,7 @@ from bench.load.events import live_event
 from bench.report import spending
 from bench.sections import SECTIONS, utilisation
 from bench.target import AWS, open_target
-from iort_station.fleet import robots
-from iort_station.fleet.identity import certificates
+from iort_station.fleet import identity, robots
 
 
 def memory_mb(cloud) -> int:
@@ -33,7 +32,7 @@ def test_each_run_has_its_own_robots_and_removes_them(embedded):
         with open_target(AWS, cloud=embedded.cloud) as target:
             made.append(target.robot("bench-car").robot)
             assert iot.describe_thing(thingName=made[-1])["thingName"] == target.name("bench-car")
-            assert certificates.attached(embedded.cloud, made[-1])
+            assert identity.certificates(embedded.cloud, made[-1])
     assert len(set(made)) == 2
     for name in made:
         with pytest.raises(ClientError):

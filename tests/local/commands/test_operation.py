@@ -19,7 +19,7 @@ from iort_agent.sources import OK, Finding
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_contract.messages.requests.files import File, file_key
-from iort_station.data.stored.batches import topic_of
+from iort_station.data.recorded import topic_of
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import until

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_station.cli.main import app
-from iort_station.fleet import registry, robots
-from iort_station.fleet.identity import certificates, claims
+from iort_station.fleet import identity, registry, robots
 from local.deployment import deploy
 from scripts import destroy
 from tests.local.conftest import until
@@ -51,8 +50,8 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
     kept = bundle()
     for name in ("lab-car1", "lab-car2"):
         robots.add(cloud, name, out=tmp_path)
-    claims.register(cloud, "lab-expected")
-    claims.claim(cloud, None, out=tmp_path / "claim", lasting=True)
+    identity.register(cloud, "lab-expected")
+    identity.claim(cloud, None, out=tmp_path / "claim", lasting=True)
     bucket = cloud.output("storage", "FilesBucket")
     cloud.client("s3").put_object(Bucket=bucket, Key=f"{FILES_PREFIX}lab-car1/drive.bag", Body=b"drive")
 
@@ -100,5 +99,5 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
         assert destroyed(cloud, noun) == (True, ""), noun
 
     assert registry.get(embedded.cloud, kept.robot)
-    (certificate,) = certificates.attached(embedded.cloud, kept.robot)
+    (certificate,) = identity.certificates(embedded.cloud, kept.robot)
     assert certificate.status == "ACTIVE"

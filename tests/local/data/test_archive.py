@@ -13,11 +13,11 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import telemetry_table, topic_of
+from iort_station.data import bags, export
+from iort_station.data.recorded import telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
 from iort_station.operations.delivery import audit
-from iort_station.recordings import export, recordings
 from local.cloud import EmbeddedCloud
 
 HOUR_US, S = 3_600_000_000, 1_000_000
@@ -63,7 +63,7 @@ def answers(embedded: EmbeddedCloud, folder: Path) -> tuple:
     """What the operator gets of the stream."""
     cloud = embedded.cloud
     found = data.query(cloud, ROBOT, STREAM, fields=["speed", "on"], where="speed > 10")
-    with recordings.mcap(folder / "ride.mcap", force=True) as file:
+    with bags.mcap(folder / "ride.mcap", force=True) as file:
         export.write(cloud, data.select(ROBOT, STREAM), file)
     columns = {name: column.tolist() for name, column in found.columns.items()}
     audited = audit.audit(STREAM, audit.headers(cloud, ROBOT, STREAM))

@@ -22,7 +22,7 @@ from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations.delivery import counts
-from iort_station.page.live.listening import listening
+from iort_station.page.listening import listening
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
 from tests.local.conftest import until

@@ -38,13 +38,10 @@ from iort_contract.tables import ROBOT as ROBOT_KEY
 from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
-from iort_station.data.analysis import notes
-from iort_station.data.stored.batches import telemetry_table, topic_of
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data import findings
+from iort_station.data.recorded import archive_of, telemetry_table, topic_of
 from iort_station.errors import StationError
-from iort_station.fleet import files, registry, robots, tags
-from iort_station.fleet.control import shadow
-from iort_station.fleet.identity import claims
+from iort_station.fleet import control, files, identity, registry, robots
 from iort_station.moving import recorded, stored_files
 from iort_station.moving.stored_files import base64_sha256
 from iort_station.operations import archive, quarantine, replay
@@ -227,9 +224,9 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
 ) -> None:
     robot, source, target = "known", embedded.cloud, other.cloud
     robots.add(source, robot, out=tmp_path / "source", vehicle=VEHICLE)
-    tags.change(source, robot, {"lab": "north"})
-    note = notes.write(source, robot, "new tyres", by="anna")
-    shadow.Shadow(source, robot).desire({"live.rate_hz": 5.0, "motion.stopped": True})
+    robots.change_tags(source, robot, {"lab": "north"})
+    note = findings.write_note(source, robot, "new tyres", by="anna")
+    control.Shadow(source, robot).desire({"live.rate_hz": 5.0, "motion.stopped": True})
     now_ms = {"N": str(int(time.time() * 1000))}
     letter: dict[str, Any] = {
         ROBOT_KEY: {"S": robot},
@@ -251,20 +248,20 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
         assert done.exit_code == 0, done.stdout
 
     def desired() -> dict[str, Any]:
-        return dict(shadow.read(target.client("iot-data"), robot).desired.settings)
+        return dict(control.read(target.client("iot-data"), robot).desired.settings)
 
     move()
     row = registry.get(target, robot)
     assert {name: float(row[name]) for name in VEHICLE} == VEHICLE
-    assert tags.listed(target)[robot]["lab"] == "north"
-    assert notes.notes(target, robot) == [note]
+    assert robots.tags(target)[robot]["lab"] == "north"
+    assert findings.notes(target, robot) == [note]
     kept, replayed = sorted(quarantine.entries(target, robot=robot), key=lambda one: one.id)
     assert quarantine.load(target, kept) == quarantine.load(source, kept)
     assert [one.fate for one in replay.replay(target, [replayed])] == [replay.Fate.REPLAYED]
     assert desired() == {"live.rate_hz": 5.0, "motion.stopped": True}
     # Until the robot is there, changes follow.
     registry.set_vehicle(source, robot, {"speed_to_erpm_gain": 5000.0})
-    shadow.Shadow(source, robot).desire({"live.rate_hz": None, "motion.stopped": False})
+    control.Shadow(source, robot).desire({"live.rate_hz": None, "motion.stopped": False})
     move()
     assert float(registry.get(target, robot)["speed_to_erpm_gain"]) == 5000.0
     assert desired() == {"motion.stopped": False}
@@ -273,11 +270,11 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     with Robot(tmp_path / "new" / robot) as there:
         there.online()
     until(lambda: CONNECTED_MS in registry.get(target, robot))
-    shadow.Shadow(target, robot).desire({"motion.stopped": True})
-    notes.remove(target, robot, note.id)
+    control.Shadow(target, robot).desire({"motion.stopped": True})
+    findings.remove_note(target, robot, note.id)
     move()
     assert desired() == {"motion.stopped": True}
-    assert notes.notes(target, robot) == []
+    assert findings.notes(target, robot) == []
 
 
 def test_two_robots_of_one_name_are_not_mixed(
@@ -342,7 +339,7 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     else:
         done = iort(embedded, *move_)
         # The claim's files beside car.yaml, which keeps the robot's own settings.
-        claim = claims.claim(target, robot, out=car.folder)
+        claim = identity.claim(target, robot, out=car.folder)
         command = [Path(sys.executable).parent / "iort-agent", "provision", "--config", claim]
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     assert done.exit_code == 0, done.stdout

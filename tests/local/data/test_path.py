@@ -15,7 +15,7 @@ from iort_contract.tables import STATS
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
 from iort_station.operations.delivery import counts
-from iort_station.page.live.listener import Listener
+from iort_station.page.pubnub import Listener
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import run_agent, until
 from tests.local.data.drives import Agent

@@ -12,7 +12,6 @@ import pytest
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
 from iort_station import data
-from iort_station.data import inventory
 from iort_station.fleet import registry
 from iort_station.operations import recompute
 from iort_station.operations.delivery import counts
@@ -61,7 +60,7 @@ def test_a_corrected_gain_applies_to_queries_and_summaries(embedded, bundle, ior
     for _ in range(2):
         assert recompute.recompute(cloud, car.robot, "vesc", None) == Recomputed(SECONDS, 0)
         assert speeds(embedded, car.robot) == pytest.approx(range(SECONDS))
-    assert inventory.vehicle_of(cloud, car.robot).speed_to_erpm_gain == 1060
+    assert registry.vehicle_of(cloud, car.robot).speed_to_erpm_gain == 1060
     # Later samples have the new gain, too.
     drive(embedded, car, "esc")
     assert speeds(embedded, car.robot, "esc") == pytest.approx(range(SECONDS))

@@ -20,8 +20,7 @@ import pytest
 
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
-from iort_station.fleet import robots
-from iort_station.fleet.identity import claims
+from iort_station.fleet import identity, robots
 from iort_station.operations.delivery import accounts, audit, counts
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
@@ -123,7 +122,7 @@ def test_a_network_fault_loses_no_sample(embedded, drives, name):
 
 
 def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
-    from iort_station.page.live.listener import Listener
+    from iort_station.page.pubnub import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port), live={"when": "always"})
@@ -171,7 +170,7 @@ def test_a_killed_agent_resumes_its_queue(embedded, bundle, proxy, tmp_path, bro
 
 def test_a_claimed_robot_that_is_killed_in_an_outage_loses_only_its_open_batch(embedded, proxy, tmp_path):
     """The recommended way to a robot sets no queue, and it is on the disk."""
-    claim = claims.claim(embedded.cloud, "claimed-killed", out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, "claimed-killed", out=tmp_path / "claim")
     car = robots.Bundle("claimed-killed", claim.parent)
     provision = [Path(sys.executable).parent / "iort-agent", "provision", "--config", claim]
     subprocess.run(provision, check=True, timeout=GUARD_S)

@@ -19,7 +19,7 @@ from bench.target import AWS, EMBEDDED, Target
 from iort_contract.tables import ROBOT
 from iort_station.errors import StationError
 from iort_station.fleet import robots
-from iort_station.page import keys
+from iort_station.page.page import load_keys
 from verify import price, report, run
 from verify.deployment import CHANGES
 from verify.errors import VerifyError
@@ -46,12 +46,12 @@ def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
 def test_pubnub_keys_are_lent_to_a_deployment_without_keys_and_removed(embedded, tmp_path):
     cloud = replace(embedded.cloud, namespace="other")
     with live.keys_lent(Target(EMBEDDED, cloud, tmp_path)):
-        assert keys.load(cloud) == keys.load(embedded.cloud)
+        assert load_keys(cloud) == load_keys(embedded.cloud)
     with pytest.raises(StationError, match="not stored yet"):
-        keys.load(cloud)
+        load_keys(cloud)
     with live.keys_lent(Target(EMBEDDED, embedded.cloud, tmp_path)):
         pass
-    assert keys.load(embedded.cloud)
+    assert load_keys(embedded.cloud)
 
 
 class Recorder:
@@ -135,10 +135,10 @@ def question(name, seen, ask):
 
 def test_a_run_lends_pubnub_keys_to_every_question(embedded, tmp_path):
     cloud = replace(embedded.cloud, namespace="other")
-    lent = question("a.question", {"lent": True}, lambda target: {"lent": bool(keys.load(target.cloud))})
+    lent = question("a.question", {"lent": True}, lambda target: {"lent": bool(load_keys(target.cloud))})
     assert run.run(options(tmp_path, only=(lent,)), cloud, Recorder()) == 0
     with pytest.raises(StationError, match="not stored yet"):
-        keys.load(cloud)
+        load_keys(cloud)
 
 
 def test_the_last_questions_may_take_the_deployment_down(embedded, tmp_path):

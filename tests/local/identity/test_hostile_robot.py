@@ -15,7 +15,7 @@ from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.messages.requests.files import decode_file_answer
 from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_topic
 from iort_station.operations import quarantine
-from iort_station.page.live.listener import Listener
+from iort_station.page.pubnub import Listener
 from tests.local.conftest import until
 from verify.tools.robot import Robot
 

@@ -14,8 +14,7 @@ import yaml
 
 from iort_contract.cloud import claim_name
 from iort_contract.tables import ROBOT
-from iort_station.fleet import robots
-from iort_station.fleet.identity import claims
+from iort_station.fleet import identity, robots
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
 from tests.local.conftest import run_agent, until
@@ -39,7 +38,7 @@ def certificates(embedded: Any, robot: str) -> list[str]:
 
 
 def test_a_claim_provisions_a_robot_that_drives(embedded, tmp_path):
-    claim = claims.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
     command("provision", "--config", claim)
     bundle = robots.Bundle("claimed", tmp_path / "claim")
     for name in ("private.key", "certificate.pem", "car.yaml", "claim-private.key", "claim.yaml"):
@@ -54,9 +53,9 @@ def test_a_claim_provisions_a_robot_that_drives(embedded, tmp_path):
 
 
 def test_a_second_robot_cannot_take_a_taken_name(embedded, tmp_path):
-    first = claims.claim(embedded.cloud, "taken", out=tmp_path / "first")
+    first = identity.claim(embedded.cloud, "taken", out=tmp_path / "first")
     command("provision", "--config", first)
-    second = claims.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
+    second = identity.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
     settings = yaml.safe_load(second.read_text())
     owner = embedded.cloud.client("iot").describe_thing(thingName="taken")["attributes"]["serial"]
     for serial in ("another-machine", owner):
@@ -69,11 +68,11 @@ def test_a_second_robot_cannot_take_a_taken_name(embedded, tmp_path):
 
 
 def test_a_lasting_claim_allows_only_provisioning(embedded, tmp_path):
-    claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    claim = identity.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     command("provision", "--config", claim, status=2)  # no name
     refused = command("provision", "--config", claim, "--robot", "lasting", status=1)
     assert "AccessDenied" in refused.stderr  # the name is not registered
-    claims.register(embedded.cloud, "lasting")
+    identity.register(embedded.cloud, "lasting")
     command("provision", "--config", claim, "--robot", "lasting")
     # The claim may do nothing as a robot.
     for name in ("certificate.pem", "private.key"):
@@ -88,7 +87,7 @@ def test_a_lasting_claim_allows_only_provisioning(embedded, tmp_path):
 
 
 def test_a_revoked_claim_is_reported(embedded, tmp_path):
-    claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    claim = identity.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     iot = embedded.cloud.client("iot")
     for certificate in iot.list_targets_for_policy(policyName=claim_name())["targets"]:
         iot.update_certificate(certificateId=certificate.rsplit("/", 1)[-1], newStatus="REVOKED")
@@ -98,7 +97,7 @@ def test_a_revoked_claim_is_reported(embedded, tmp_path):
 
 
 def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, tmp_path):
-    claim = claims.claim(embedded.cloud, "updated", out=tmp_path)
+    claim = identity.claim(embedded.cloud, "updated", out=tmp_path)
     car = tmp_path / "car.yaml"
     car.write_text("# my car\nrobot: other\nport: 1  # wrong\nsources:\n  - type: sim # a comment\n")
     command("provision", "--config", claim)
@@ -112,7 +111,7 @@ def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, t
 def test_a_certificate_is_renewed_without_an_agent(embedded, bundle, tmp_path):
     car = bundle()
     before = (car.folder / "certificate.pem").read_text()
-    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     command("renew", "--config", car.config, "--claim", claim)
     assert (car.folder / "certificate.pem").read_text() != before
     assert not list(car.folder.glob("*.previous"))
@@ -127,7 +126,7 @@ def test_a_failed_renewal_keeps_the_old_certificate(embedded, bundle, tmp_path, 
 
     car = bundle()
     before = (car.folder / "certificate.pem").read_text(), (car.folder / "private.key").read_text()
-    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
 
     def fails(*_: object) -> None:
         raise IdentityError("no")
@@ -143,7 +142,7 @@ def test_a_failed_renewal_keeps_the_old_certificate(embedded, bundle, tmp_path, 
 
 def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_path):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
-    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     report = tmp_path / "report.json"
     with subprocess.Popen([AGENT, "--config", car.config, "--report", report], cwd=ROOT) as agent:
         try:

@@ -18,8 +18,7 @@ import pytest
 from functions.admit import SETTLED_MS
 from iort_agent.identity import parse_certificate
 from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
-from iort_station.fleet import registry
-from iort_station.fleet.identity import claims
+from iort_station.fleet import identity, registry
 from local.cloud import ROOT
 from tests.local.identity.test_identity import certificates, command
 from verify.tools.robot import Robot
@@ -69,9 +68,9 @@ def killed(when: str, verb: str, file: Path, other: object) -> dict[str, Any]:
 def made(embedded: Any, name: str, folder: Path, *, lasting: bool) -> Path:
     """Make a claim of either kind that can take the name."""
     if not lasting:
-        return claims.claim(embedded.cloud, name, out=folder)
-    claims.register(embedded.cloud, name)
-    return claims.claim(embedded.cloud, None, out=folder, lasting=True)
+        return identity.claim(embedded.cloud, name, out=folder)
+    identity.register(embedded.cloud, name)
+    return identity.claim(embedded.cloud, None, out=folder, lasting=True)
 
 
 def drives(folder: Path, left: dict[str, Any]) -> None:
@@ -108,7 +107,7 @@ def test_an_issued_certificate_needs_no_valid_claim(embedded, tmp_path):
             assert "the claim does not connect" in done.stderr
             # The next claim continues the provisioning.
             assert (claim.parent / NAME).exists()
-            claims.claim(embedded.cloud, None, out=claim.parent, lasting=True)
+            identity.claim(embedded.cloud, None, out=claim.parent, lasting=True)
             command("provision", "--config", claim, "--robot", name)
             drives(claim.parent, left)
 
@@ -169,7 +168,7 @@ def test_another_robot_cannot_take_the_name_during_provisioning(embedded, tmp_pa
     left = killed("before", "provision", claim, "wanted")
     admit(embedded, left, "wanted")
     later(embedded, "wanted")
-    other = claims.claim(embedded.cloud, None, out=tmp_path / "other", lasting=True)
+    other = identity.claim(embedded.cloud, None, out=tmp_path / "other", lasting=True)
     refused = command("provision", "--config", other, "--robot", "wanted", status=1)
     assert "AccessDenied" in refused.stderr
     command("provision", "--config", claim)
@@ -180,7 +179,7 @@ def test_another_robot_cannot_take_the_name_during_provisioning(embedded, tmp_pa
 def test_a_killed_renewal_is_resumed(embedded, bundle, tmp_path, when):
     car = bundle()
     before = (car.folder / "certificate.pem").read_text()
-    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     left = killed(when, "renew", car.config, claim)
     assert (car.folder / "certificate.pem").read_text() == before
     command("renew", "--config", car.config, "--claim", claim)

@@ -17,8 +17,7 @@ from ministack.services import iot
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import CMD, FLEET, PING, PONG, RULE, build_topic
-from iort_station.fleet import robots
-from iort_station.fleet.identity import claims
+from iort_station.fleet import identity, robots
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
 from verify.tools.robot import Robot, payload_for
@@ -33,7 +32,7 @@ def folders(embedded, tmp_path_factory):
     out = tmp_path_factory.mktemp("robots")
     folders = {name: robots.add(embedded.cloud, name, out=out).folder for name in (A, B)}
     folders[CLAIM] = out / "claim"
-    claims.claim(embedded.cloud, None, out=folders[CLAIM], lasting=True)
+    identity.claim(embedded.cloud, None, out=folders[CLAIM], lasting=True)
     # The robots' own form of a folder.
     for name in ("certificate.pem", "private.key"):
         (folders[CLAIM] / f"claim-{name}").rename(folders[CLAIM] / name)

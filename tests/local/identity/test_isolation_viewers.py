@@ -20,7 +20,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import broker
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role, signed_url
-from iort_station.page.answers import socket
+from iort_station.page import motion
 from tests.isolation import (
     CONNECT,
     DRIVER,
@@ -57,7 +57,7 @@ class Everybody(Person):
             verify=cloud.ca_bundle,
             config=Config(signature_version=UNSIGNED),
         )
-        identity = cognito.get_id(IdentityPoolId=socket.identity(cloud)["pool"])["IdentityId"]
+        identity = cognito.get_id(IdentityPoolId=motion.identity(cloud)["pool"])["IdentityId"]
         got = cognito.get_credentials_for_identity(IdentityId=identity)["Credentials"]
         return ReadOnlyCredentials(got["AccessKeyId"], got["SecretKey"], got["SessionToken"])
 

@@ -17,7 +17,7 @@ from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
-from iort_station.data.stored.batches import summary_table, topic_of
+from iort_station.data.recorded import summary_table, topic_of
 from iort_station.operations import quarantine
 from iort_station.operations.delivery import counts
 from tests.local.conftest import until

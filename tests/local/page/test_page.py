@@ -14,8 +14,8 @@ from pathlib import Path
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.cloud import EMBEDDED
-from iort_station.page.answers.index import actions, answers
-from iort_station.page.live.listener import Listener
+from iort_station.page.answers import actions, answers
+from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT

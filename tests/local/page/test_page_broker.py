@@ -12,8 +12,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ, Value
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE, build_topic
-from iort_station.page.answers import socket
-from iort_station.page.answers.index import actions, answers
+from iort_station.page import motion
+from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.network.proxy import PASS, REFUSE, Proxy
 from tests.browser import plain, show, shown, until
@@ -47,7 +47,7 @@ class Car:
 def served(cloud: Cloud) -> PageServer:
     return PageServer(
         namespace=cloud.namespace,
-        **socket.reaching(cloud, "iot"),
+        **motion.reaching(cloud, "iot"),
         answers=answers(cloud),
         open_actions=actions(cloud),
     )
@@ -109,7 +109,7 @@ def test_a_site_without_a_server_listens_as_everybody_and_wakes_nobody(
         namespace=embedded.namespace,
         live="iot",
         broker=embedded.cloud.websocket_url.removesuffix("/mqtt"),
-        identity=socket.identity(embedded.cloud),
+        identity=motion.identity(embedded.cloud),
     ) as site:
         page = open_page(f"{site.url}#/car/public")
         show(page, Car(embedded.cloud, "public").send())

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import pytest
 from pubnub.pubnub import SubscribeListener
 
-from iort_station.page.live.listener import Listener
+from iort_station.page.pubnub import Listener
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish

@@ -12,9 +12,9 @@ from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
-from iort_station.fleet.control.shadow import slept
+from iort_station.fleet.control import slept
 from iort_station.operations.delivery import counts
-from iort_station.page.answers import control
+from iort_station.page import answers
 from tests.local.conftest import until
 from tests.local.robots.test_shadow import driving
 
@@ -118,12 +118,12 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
         # The page's server does what both commands do.
         again = {"robot": car.robot, "command": "drive", "message": '{"drive": {"speed": -1.0}}'}
         # On a slow machine it is too late, and what is changed is not confirmed in time.
-        until(lambda: slept(control.send(embedded.cloud, again))["reason"].startswith("without lease, sent "))
-        until(lambda: slept(control.send(embedded.cloud, {**again, "lease_ms": "3000"}))["accepted"])
+        until(lambda: slept(answers.send(embedded.cloud, again))["reason"].startswith("without lease, sent "))
+        until(lambda: slept(answers.send(embedded.cloud, {**again, "lease_ms": "3000"}))["accepted"])
         rate = {"robot": car.robot, "name": "live.rate_hz", "value": "4"}
 
         def changed() -> bool:
-            told = control.change(embedded.cloud, rate)["settings"]
+            told = answers.change(embedded.cloud, rate)["settings"]
             (entry,) = (one for one in told if one["name"] == "live.rate_hz")
             return (entry["value"], entry["desired"], entry["pending"]) == ("4", True, None)
 
@@ -131,13 +131,13 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
         wrong = {**rate, "name": "fields.vesc", "value": "sped"}
 
         def reason() -> str:
-            told = control.change(embedded.cloud, wrong)["settings"]
+            told = answers.change(embedded.cloud, wrong)["settings"]
             assert "motion.stopped" not in {one["name"] for one in told}
             return told[-1]["reason"]
 
         assert "did you mean speed?" in until(reason)
         with pytest.raises(StationError, match="got 40; nothing is changed"):
-            control.change(embedded.cloud, {**rate, "value": "40"})
+            answers.change(embedded.cloud, {**rate, "value": "40"})
         ended = "command drive: nobody renews it, stopping"
         until(lambda: ended in recorded(LOG_STREAM, "text"))
         # Then its own driver drives on.

@@ -14,8 +14,9 @@ from bench.load.agent_process import AgentProcess
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
-from iort_station.page.answers import control, socket
-from iort_station.page.answers.index import actions, answers
+from iort_station.page import answers as control
+from iort_station.page import motion
+from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from tests.browser import until
 
@@ -116,7 +117,10 @@ def test_one_drives_the_other_sees_it_and_takes_over(
     cloud, ada = embedded.cloud, Ada(embedded.cloud, car.robot)
     told: dict[str, Any] = {"answers": answers(cloud), "open_actions": actions(cloud)}
     with PageServer(
-        namespace=cloud.namespace, **socket.reaching(cloud, "iot"), **told, actions=control.actions(cloud)
+        namespace=cloud.namespace,
+        **motion.reaching(cloud, "iot"),
+        **told,
+        actions=control.keyed_actions(cloud),
     ) as server:
         bob = open_page(server.invitation(f"#/car/{car.robot}"))
         onlooker = open_page(f"{server.url}#/")

@@ -25,8 +25,7 @@ from iort_contract.tables import (
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.errors import StationError
-from iort_station.fleet import registry, robots
-from iort_station.fleet.identity import certificates, claims, rotation
+from iort_station.fleet import identity, registry, robots
 from local.cloud import ROOT
 from tests.local.conftest import until
 from tests.waiting import GUARD_S
@@ -59,7 +58,7 @@ def iort(embedded):
 def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
     assert iort("robots", "register", "expected", "--serial", "s1").exit_code == 0
     assert "expected until" in iort("robots", "list").output
-    lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    lasting = identity.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     text = lasting.read_text()
     lasting.write_text(f"{text}serial: s2\n")
     assert "AccessDenied" in command("provision", "--config", lasting, "--robot", "expected", status=1).stderr
@@ -68,7 +67,7 @@ def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
     after = row(embedded, "expected")
     assert after[SERIAL] == "s1"
     assert "expected until" not in iort("robots", "show", "expected").output
-    (held,) = certificates.attached(embedded.cloud, "expected")
+    (held,) = identity.certificates(embedded.cloud, "expected")
     assert (held.id, held.status) == (after[ADMITTED_CERTIFICATE], "ACTIVE")
     # The same machine with the same claim gets the name once; a second time needs a new registration.
     command("provision", "--config", lasting, "--robot", "expected", status=1)
@@ -77,12 +76,12 @@ def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
 
 
 def test_a_claim_for_one_name_cannot_take_another(embedded, tmp_path):
-    claims.register(embedded.cloud, "other-name")
-    claim = claims.claim(embedded.cloud, "one-name", out=tmp_path)
+    identity.register(embedded.cloud, "other-name")
+    claim = identity.claim(embedded.cloud, "one-name", out=tmp_path)
     refused = command("provision", "--config", claim, "--robot", "nobodys-name", status=1)
     assert "AccessDenied" in refused.stderr
     # Another claim cannot take the name that was opened for this one.
-    lasting = claims.claim(embedded.cloud, None, out=tmp_path / "lasting", lasting=True)
+    lasting = identity.claim(embedded.cloud, None, out=tmp_path / "lasting", lasting=True)
     refused = command("provision", "--config", lasting, "--robot", "one-name", status=1)
     assert "AccessDenied" in refused.stderr
     command("provision", "--config", claim)
@@ -101,7 +100,7 @@ def test_the_registry_follows_a_robot(embedded, bundle, iort):
     assert after[DISCONNECT_REASON] == "CLIENT_INITIATED_DISCONNECT"
     assert after[LAST_SEEN_MS] >= after[CONNECTED_MS] > 0
     assert after[AGENT_VERSION] == version("iort-agent")
-    (held,) = certificates.attached(embedded.cloud, car.robot)
+    (held,) = identity.certificates(embedded.cloud, car.robot)
     assert after[CERTIFICATE_ID] == held.id
     assert "offline since" in iort("robots", "list").output
     with Robot(car.folder) as robot:
@@ -135,7 +134,7 @@ def test_a_session_ends_with_its_certificate(embedded, bundle):
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()
-        (held,) = certificates.attached(embedded.cloud, car.robot)
+        (held,) = identity.certificates(embedded.cloud, car.robot)
         embedded.cloud.client("iot").update_certificate(certificateId=held.id, newStatus="INACTIVE")
         assert robot.lost.wait(GUARD_S)
     until(
@@ -148,33 +147,33 @@ def test_delete_connection_disconnects_only_one_client(embedded, bundle):
     with Robot(first.folder) as one, Robot(second.folder) as two:
         one.online()
         two.online()
-        assert certificates.cut(embedded.cloud, first.robot) is True
+        assert identity.end_session(embedded.cloud, first.robot) is True
         assert one.lost.wait(GUARD_S)
         assert two.publish(f"live/iort/{second.robot}/vesc", STALE) == "SUCCESS"
     until(
         lambda: row(embedded, first.robot).get(DISCONNECT_REASON) == "API_INITIATED_DISCONNECT",
     )
-    assert certificates.cut(embedded.cloud, first.robot) is False
+    assert identity.end_session(embedded.cloud, first.robot) is False
 
 
 def test_rotation_waits_for_the_new_certificate(embedded, bundle, tmp_path):
     car = bundle()
-    (old,) = certificates.attached(embedded.cloud, car.robot)
+    (old,) = identity.certificates(embedded.cloud, car.robot)
     heard, done = [], threading.Event()
 
     def finish():
-        heard.append(rotation.finish(embedded.cloud, car.robot, settled_s=0, progress=heard.append))
+        heard.append(identity.finish_rotation(embedded.cloud, car.robot, settled_s=0, progress=heard.append))
         done.set()
 
     with Robot(car.folder) as robot:
         robot.online()
-        claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+        claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
         (tmp_path / "new").mkdir()
         (tmp_path / "new" / "car.yaml").write_text(car.config.read_text())
         for file in ("private.key", "certificate.pem", "root-ca.pem"):
             (tmp_path / "new" / file).write_bytes((car.folder / file).read_bytes())
         command("provision", "--config", _writing_to(claim, tmp_path / "new" / "car.yaml"))
-        assert len(certificates.attached(embedded.cloud, car.robot)) == 2
+        assert len(identity.certificates(embedded.cloud, car.robot)) == 2
         waiting = threading.Thread(target=finish)
         waiting.start()
         until(lambda: heard)
@@ -200,20 +199,20 @@ def _writing_to(claim, config):
 def test_rotation_keeps_the_old_certificate_of_an_offline_robot(embedded, bundle):
     car = bundle()
     with pytest.raises(StationError, match="not connected; its old certificate stays"):
-        rotation.finish(embedded.cloud, car.robot, wait_s=0)
-    (held,) = certificates.attached(embedded.cloud, car.robot)
+        identity.finish_rotation(embedded.cloud, car.robot, wait_s=0)
+    (held,) = identity.certificates(embedded.cloud, car.robot)
     assert held.status == "ACTIVE"
 
 
 def test_a_revoked_claim_cannot_provision(embedded, tmp_path, iort):
-    claims.register(embedded.cloud, "too-late")
-    lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    identity.register(embedded.cloud, "too-late")
+    lasting = identity.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     assert "lasting claims revoked: " in iort("robots", "revoke-claims", "--yes").output
     assert (
         "the claim does not connect"
         in command("provision", "--config", lasting, "--robot", "too-late", status=1).stderr
     )
-    assert claims.revoke_all(embedded.cloud) == 0
+    assert identity.revoke_claims(embedded.cloud) == 0
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from iort_station.fleet import registry, robots
-from iort_station.fleet.identity import claims
+from iort_station.fleet import identity, registry, robots
 from iort_station.operations import quarantine
-from iort_station.page.live.listener import Listener
+from iort_station.page.pubnub import Listener
 from local.deployment import ROOT
 from tests.local.conftest import recorded, until
 from tests.waiting import GUARD_S
@@ -42,13 +41,13 @@ def car(request, bundle, embedded, tmp_path):
     if request.param == "added":
         return bundle()
     name, folder = f"foreign-{request.param}", tmp_path / "claim"
-    claims.claim(embedded.cloud, name, out=folder)
+    identity.claim(embedded.cloud, name, out=folder)
     subprocess.run([sys.executable, PROVISION, folder, name], check=True, timeout=GUARD_S)
     return robots.Bundle(name, folder)
 
 
 def test_a_claim_cannot_provision_another_name(embedded, tmp_path):
-    claims.claim(embedded.cloud, "foreign-own", out=tmp_path)
+    identity.claim(embedded.cloud, "foreign-own", out=tmp_path)
     command = [sys.executable, PROVISION, tmp_path, "foreign-other"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=GUARD_S, check=False)
     assert done.returncode == 1

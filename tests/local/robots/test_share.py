@@ -15,8 +15,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
-from iort_station.data.stored.batches import summary_table, topic_of
-from iort_station.fleet.control import shadow
+from iort_station.data.recorded import summary_table, topic_of
+from iort_station.fleet import control
 from iort_station.operations.delivery import counts
 from tests.local.conftest import until
 from verify.tools.robot import Robot
@@ -52,9 +52,9 @@ def test_expensive_batches_of_one_robot_do_not_delay_other_robots(embedded, bund
     expected = list(range(first, first + len(range(0, count, count // GOOD))))
     until(lambda: len(seconds_of(embedded, good.robot)) == len(expected))
     assert seconds_of(embedded, good.robot) == expected
-    over = until(lambda: shadow.over_share(embedded.cloud, bad.robot))
+    over = until(lambda: control.over_share(embedded.cloud, bad.robot))
     assert over.batches > 0
-    assert shadow.over_share(embedded.cloud, good.robot) is None
+    assert control.over_share(embedded.cloud, good.robot) is None
     shown = json.loads(iort("robots", "show", bad.robot, "--json").stdout)
     assert shown[OVER_SHARE]["batches"] >= over.batches
     stored = list(counts.batches(embedded.cloud, bad.robot, VESC_STREAM))

@@ -25,8 +25,8 @@ from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import BATCH, RECOMPUTE_FROM_S, TOPIC
 from iort_station import data
 from iort_station.operations.delivery import audit
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import answers
+from iort_station.page.answers import answers
+from iort_station.page.history import downloads
 from tests.archived import FakeS3, archive, expire
 from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, item_of
 from tests.mutation import ODD_ATTRIBUTES, mutated_item

@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import answers
+from iort_station.page.answers import answers
+from iort_station.page.history import downloads
 from iort_station.page.server import PageServer
 from tests.archived import FakeS3, archive, expire
 from tests.browser import plain, until
@@ -282,8 +282,8 @@ def test_the_range_is_saved_as_csv_parquet_and_mcap(page: Page, server: PageServ
 def test_a_download_says_what_is_wrong_before_it_sends_anything(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("iort_station.page.answers.downloads.MOST_VALUES", 1000)
-    monkeypatch.setattr("iort_station.page.answers.downloads.MOST_BYTES", 1000)
+    monkeypatch.setattr("iort_station.page.history.MOST_VALUES", 1000)
+    monkeypatch.setattr("iort_station.page.history.MOST_BYTES", 1000)
     note = page.locator(".download .note")
     page.get_by_role("button", name="CSV").click()
     until(lambda: "more than 1,000 values: choose a shorter one" in note.inner_text(), "the reason")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_station.page.answers import laps
+from iort_station.page import insights as laps
 from iort_station.page.server import PageServer
 from tests.browser import plain, until
 from tests.unit.station.analysis.test_laps import driven_cloud
@@ -43,7 +43,7 @@ class Analysed(Lab):
         told = {"insights": self.insights, "runs": lambda _: runs, "analysis": self.progress}
         of_car = {
             name: lambda asked, answer=answer: answer({**asked, "robot": "car"})
-            for name, answer in laps.answers(driven_cloud()).items()  # type: ignore[arg-type]  # a fake
+            for name, answer in laps.laps_answers(driven_cloud()).items()  # type: ignore[arg-type]  # a fake
         }
         return {**super().answers(), **told, **of_car}
 

@@ -9,8 +9,7 @@ import time
 from bench.target import Target
 from iort_agent.errors import IdentityError
 from iort_agent.verbs import provision
-from iort_station.fleet import robots
-from iort_station.fleet.identity import certificates, claims, rotation
+from iort_station.fleet import identity, robots
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal, soon_refused
@@ -35,7 +34,7 @@ POLICY = "verify-policy"
     source=f"{_GUIDE}/provision-wo-cert.html and {_GUIDE}/life-cycle-events.html",
     relied_on_by=(
         "device/iort_agent/verbs/provision.py",
-        "station/iort_station/fleet/identity/rotation.py",
+        "station/iort_station/fleet/identity.py",
         "functions/presence.py",
     ),
 )
@@ -45,16 +44,16 @@ def rotated(target: Target) -> Seen:
     bundle = registered(target, "verify-rotated")
     before = target.folder / "claims" / f"{bundle.robot}-before"
     shutil.copytree(bundle.folder, before)
-    claim = claims.claim(target.cloud, bundle.robot, out=target.folder / "claims" / bundle.robot)
+    claim = identity.claim(target.cloud, bundle.robot, out=target.folder / "claims" / bundle.robot)
     try:
         provision.renew(bundle.config, claim, status_socket=bundle.folder / "none.sock")
     except IdentityError as error:
         raise VerifyError(str(error)) from error
-    renewed = len(certificates.attached(target.cloud, bundle.robot))
+    renewed = len(identity.certificates(target.cloud, bundle.robot))
     time.sleep(CONNECT_AGAIN_S)
     with Robot(bundle.folder) as robot:
         robot.online()
-        ended = rotation.finish(target.cloud, bundle.robot, settled_s=0, wait_s=50)
+        ended = identity.finish_rotation(target.cloud, bundle.robot, settled_s=0, wait_s=50)
         code = soon_refused(before)
         stays = not robot.lost.is_set()
     return {
@@ -89,7 +88,7 @@ def policy_deleted_after_detach(target: Target) -> Seen:
             return False
         return True
 
-    made = certificates.make(iot, name)
+    made = identity.make_certificate(iot, name)
     try:
         iot.create_policy(policyName=name, policyDocument=document)
         iot.attach_policy(policyName=name, target=made.arn)
@@ -97,7 +96,7 @@ def policy_deleted_after_detach(target: Target) -> Seen:
         until(deleted, "the deletion of a detached policy", within_s=360)
     finally:
         iot.update_certificate(certificateId=made.id, newStatus="REVOKED")
-        certificates.once_detached(iot, iot.delete_certificate, certificateId=made.id, forceDelete=True)
+        identity.once_detached(iot, iot.delete_certificate, certificateId=made.id, forceDelete=True)
     return {"deleted_within_six_minutes": True, "note_at_once": not codes, "note_refused_with": sorted(codes)}
 
 
@@ -107,7 +106,7 @@ def policy_deleted_after_detach(target: Target) -> Seen:
     source=f"{_MQTT} and {_API}/API_DeleteCertificate.html",
     relied_on_by=(
         "station/iort_station/fleet/robots.py",
-        "station/iort_station/fleet/identity/certificates.py",
+        "station/iort_station/fleet/identity.py",
     ),
 )
 def robot_removed(target: Target) -> Seen:
@@ -127,13 +126,13 @@ def robot_removed(target: Target) -> Seen:
     "removal.certificate_deactivated",
     expected={"connects_before": True, "connects_after": False},
     source=f"{_API}/API_UpdateCertificate.html",
-    relied_on_by=("station/iort_station/fleet/identity/rotation.py", "device/iort_agent/mqtt/failures.py"),
+    relied_on_by=("station/iort_station/fleet/identity.py", "device/iort_agent/mqtt/failures.py"),
 )
 def certificate_deactivated(target: Target) -> Seen:
     """A certificate that is not active does not connect."""
     bundle = registered(target, "verify-deactivated")
     before = refusal(bundle.folder)
-    (certificate,) = certificates.attached(target.cloud, bundle.robot)
+    (certificate,) = identity.certificates(target.cloud, bundle.robot)
     target.cloud.client("iot").update_certificate(certificateId=certificate.id, newStatus="INACTIVE")
     code = soon_refused(bundle.folder)
     return {"connects_before": before is None, "connects_after": code is None, "note_code": code}

@@ -22,7 +22,7 @@ from iort_contract.cloud import DRIVER, VIEWER
 from iort_contract.messages.viewing import lease_topic
 from iort_contract.topics import CMD, LIVE, build_topic
 from iort_station.fleet.roles import Role
-from iort_station.page.answers import socket
+from iort_station.page import motion
 from verify.errors import VerifyError
 from verify.question import CHANGED, Seen, question
 from verify.tools.robot import STALE, WAIT_S, Person
@@ -163,7 +163,7 @@ def everybody(target: Target) -> Seen:
     """Amazon Cognito gives anybody an identity and credentials without a signature. With these a signed
     WebSocket hears the live messages of the page's robots: AWS IoT asks the identity's IAM role alone, and
     Cognito's session policies allow it, which AWS does not document. Log, commands and leases are refused."""
-    identity = socket.identity(target.cloud)
+    identity = motion.identity(target.cloud)
 
     def cognito(action: str, **body: str) -> dict[str, Any]:
         """As the page asks."""

@@ -22,8 +22,7 @@ from iort_contract.tables import (
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
 )
-from iort_station.fleet import registry
-from iort_station.fleet.identity import certificates, claims
+from iort_station.fleet import identity, registry
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.robot import refusal
@@ -74,7 +73,7 @@ def _provision(file: Path, robot: str | None = None) -> str:
 
 def _claim(target: Target, robot: str | None, folder: Path, *, lasting: bool = False) -> Path:
     """A claim's file with a serial number: not every machine here has one."""
-    file = claims.claim(target.cloud, robot, out=folder, lasting=lasting)
+    file = identity.claim(target.cloud, robot, out=folder, lasting=lasting)
     file.write_text(file.read_text() + yaml.safe_dump({"serial": _SERIAL}))
     return file
 
@@ -88,7 +87,7 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
         "refused": "",
         "thing_type_is_the_fleets": thing.get("thingTypeName") == fleet_name(target.cloud.namespace),
         "attributes": sorted(thing["attributes"]),
-        "certificates": [one.status for one in certificates.attached(target.cloud, robot)],
+        "certificates": [one.status for one in identity.certificates(target.cloud, robot)],
         "name_is_closed_again": ADMITTED_CERTIFICATE in registry.get(target.cloud, robot),
         "connects": refusal(folder) is None,
     }
@@ -99,7 +98,7 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
     expected=_MADE,
     source=f"{_PROVISION} and {_HOOK}",
     relied_on_by=(
-        "station/iort_station/fleet/identity/claims.py",
+        "station/iort_station/fleet/identity.py",
         "functions/admit.py",
         "device/iort_agent/verbs/provision.py",
         "stacks/fleet.py",
@@ -118,7 +117,7 @@ def claim_for_minutes(target: Target) -> Seen:
     expected=_MADE,
     source=f"{_PROVISION} and {_HOOK}",
     relied_on_by=(
-        "station/iort_station/fleet/identity/claims.py",
+        "station/iort_station/fleet/identity.py",
         "functions/admit.py",
         "stacks/parts/documents.py",
     ),
@@ -128,10 +127,10 @@ def claim_that_lasts(target: Target) -> Seen:
     with removed_after(target, "verify-lasting-claim") as (name, folder):
         file = _claim(target, None, folder, lasting=True)
         try:
-            claims.register(target.cloud, name, days=1)
+            identity.register(target.cloud, name, days=1)
             return _made(target, name, folder, file)
         finally:
-            claims.revoke_all(target.cloud)
+            identity.revoke_claims(target.cloud)
 
 
 @question(
@@ -181,7 +180,7 @@ def registered_again(target: Target) -> Seen:
                     exchange.register(token, parameters)
             except _RefusedError as error:
                 code = str(error)
-        held = certificates.attached(target.cloud, name)
+        held = identity.certificates(target.cloud, name)
     return {
         "first_is_its_own": first == name,
         "again_refused": code,
@@ -201,5 +200,5 @@ def name_taken(target: Target) -> Seen:
     with removed_after(target, "verify-taken") as (name, folder):
         file = _claim(target, name, folder)
         first, second = _provision(file), _provision(file)
-        held = certificates.attached(target.cloud, name)
+        held = identity.certificates(target.cloud, name)
     return {"first": first, "second_is_refused": bool(second), "certificates": len(held), "note_code": second}

@@ -20,7 +20,7 @@ from iort_contract.topics import live_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import viewing
-from iort_station.page import keys
+from iort_station.page.page import PubNubKeys, load_keys, store_keys
 from verify.errors import CannotAskError
 from verify.question import Seen, question
 from verify.tools.robot import Robot
@@ -48,7 +48,7 @@ def keys_lent(target: Target) -> Iterator[None]:
         others = _stored(replace(cloud, namespace=DEFAULT_NAMESPACE))
         if others is None:
             raise CannotAskError(f"no PubNub keys: `iort pubnub` stores them for {DEFAULT_NAMESPACE}")
-        keys.store(cloud, others)
+        store_keys(cloud, others)
     try:
         yield
     finally:
@@ -56,9 +56,9 @@ def keys_lent(target: Target) -> Iterator[None]:
             cloud.client("ssm").delete_parameter(Name=pubnub_parameter(cloud.namespace))
 
 
-def _stored(cloud: Cloud) -> keys.PubNubKeys | None:
+def _stored(cloud: Cloud) -> PubNubKeys | None:
     try:
-        return keys.load(cloud)
+        return load_keys(cloud)
     except StationError:
         return None
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from bench.target import Target
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.messages.analysis.run import AnalysisRequest
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import analysis

@@ -134,7 +134,7 @@ def late_batch(target: Target) -> Seen:
     source=f"{_S3}/range-get-olap.html",
     relied_on_by=(
         "analysis/iort_analysis/archive/hours.py",
-        "station/iort_station/data/stored/recorded.py",
+        "station/iort_station/data/recorded.py",
     ),
 )
 def read_back(target: Target) -> Seen:

@@ -12,8 +12,8 @@ from bench.load.worst_case import worst_batches
 from bench.target import Target, temporary_function
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
-from iort_station.data.stored.batches import summary_table
-from iort_station.fleet.control import shadow
+from iort_station.data.recorded import summary_table
+from iort_station.fleet import control
 from iort_station.operations.replay import replay
 from verify.question import Seen, question
 from verify.tools.logs import lines
@@ -157,7 +157,7 @@ def put_off(target: Target) -> Seen:
     robot's group. The function later summarises them all, and the robot is told in its shadow."""
     bundle, cloud = target.robot("verify-put-off"), target.cloud
     send(target, bundle, *worst_batches(_EXPENSIVE, first_us=int(time.time() - _EXPENSIVE) * 1_000_000))
-    over = until(lambda: shadow.over_share(cloud, bundle.robot), "the notice in the robot's shadow")
+    over = until(lambda: control.over_share(cloud, bundle.robot), "the notice in the robot's shadow")
 
     def seconds() -> int:
         pages = summary_table(cloud).pages(topic(target, bundle.robot))

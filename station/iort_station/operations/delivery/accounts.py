@@ -14,7 +14,7 @@ from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, Strea
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
-from iort_station.data.reports import last_reports
+from iort_station.data.recorded import last_reports
 from iort_station.operations.delivery.audit import Audit, RunAudit, Shortfall
 
 # A run that has been silent for this long has ended.

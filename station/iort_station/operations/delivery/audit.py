@@ -22,7 +22,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.recorded import Recorded
 
 # So many batches are decoded together.
 _TOGETHER = 200

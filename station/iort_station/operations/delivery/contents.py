@@ -11,7 +11,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import ENVELOPE
 from iort_station.cloud import Cloud
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.recorded import Recorded
 
 
 def hashes(

@@ -10,8 +10,7 @@ from iort_contract.dynamodb import plain, starting_between
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.stored.batches import summary_table, topic_of
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.recorded import Recorded, summary_table, topic_of
 
 
 @dataclass(frozen=True)

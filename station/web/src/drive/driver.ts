@@ -5,7 +5,7 @@
 // move because an obstacle to driving has gone away. Who has let go still has the wheel: the car is told to stand, so
 // that no planner on board drives off, until the viewer leaves the wheel or loses it.
 //
-// iort_station.fleet.control.driving does the same and draws the phases; tests/unit/station/fleet/driving.json tests both.
+// iort_station.fleet.driving does the same and draws the phases; tests/unit/station/fleet/driving.json tests both.
 
 import {
   DRIVE_ANSWER_MS,

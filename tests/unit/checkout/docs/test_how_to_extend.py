@@ -148,7 +148,10 @@ def test_the_page_lists_each_of_its_sections() -> None:
 def test_the_way_to_add_a_field_works(deployed: Deployed) -> None:
     copy = deployed.copy
     assert len(set(deployed.touched["A field"])) == 1
-    assert copy.show("unit('vesc', 'temp_battery_max')", "from iort_station.data.units import unit") == "degC"
+    assert (
+        copy.show("unit('vesc', 'temp_battery_max')", "from iort_station.data.inventory import unit")
+        == "degC"
+    )
     hottest = "from iort_contract.catalog.vesc import hottest_degc"
     assert copy.show("hottest_degc({'temp_battery': 81.5, 'temp_fet': 40})", hottest) == 81.5
     assert "| `temp_battery` | degC |" in (copy.root / "docs/reference/fields.md").read_text()
@@ -171,7 +174,7 @@ def test_the_way_to_add_a_derived_field_works(deployed: Deployed) -> None:
     found = copy.show(
         f"values(derive({arrays}, None)['motor_power_w'])",
         "import numpy as np",
-        "from iort_station.data.conditions import derive, values",
+        "from iort_station.data.selection import derive, values",
     )
     assert found == [60.0, None]
     needs = "select('car', 'vesc', where='motor_power_w > 5').needs('duty_cycle')"

@@ -70,7 +70,7 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_contract.topics import ACCEPTED, build_topic
-from iort_station.fleet.control.shadow import State, outcome
+from iort_station.fleet.control import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
 RUN, T_US = "3f2a9c01d4e5b678", 1_767_261_600_000_000

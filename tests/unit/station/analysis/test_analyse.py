@@ -13,8 +13,7 @@ from iort_contract.messages.analysis.findings import DriveKey, Finding
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.cli.verbs.operations import analyse
-from iort_station.data import inventory
-from iort_station.data.analysis import findings
+from iort_station.data import findings, inventory
 from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.analysis import RUNNING, SUCCEEDED, Progress

@@ -14,8 +14,8 @@ from iort_contract.messages.analysis.findings import DriveKey, Estimate
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.data import inventory
-from iort_station.data.analysis import findings
+from iort_station.data import findings
+from iort_station.fleet import registry
 
 DAY_US = 86_400_000_000
 
@@ -35,7 +35,7 @@ def iort(monkeypatch):
     def run(drives, *arguments, registered=4614.0):
         monkeypatch.setattr(CloudOptions, "cloud", lambda _self: None)
         monkeypatch.setattr(findings, "drives", lambda *_given, most: drives[:most])
-        monkeypatch.setattr(inventory, "vehicle_of", lambda *_given: Vehicle(registered, -180.4))
+        monkeypatch.setattr(registry, "vehicle_of", lambda *_given: Vehicle(registered, -180.4))
         done = CliRunner().invoke(app, ["calibrate", "car7", *arguments], env={"COLUMNS": "120"})
         return done.stdout, done.stderr + str(done.exception or "")
 

@@ -11,7 +11,7 @@ from iort_contract.page import history_link
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.cloud import Cloud
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.fleet import registry
 from tests.unit.functions.test_analysis import finding
 

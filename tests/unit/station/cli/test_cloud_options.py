@@ -14,7 +14,7 @@ from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
 from iort_station.cloud import EMBEDDED, Cloud, find_embedded
 from iort_station.errors import StationError
-from iort_station.page import keys
+from iort_station.page.page import typed_keys
 
 
 @pytest.fixture(autouse=True)
@@ -192,12 +192,12 @@ def test_keys_are_asked_for_only_after_the_cloud_is_found(tmp_path):
 )
 def test_a_key_of_another_kind_is_refused_and_not_printed(publish, subscribe, said):
     with pytest.raises(StationError, match=said) as raised:
-        keys.typed(publish, subscribe)
+        typed_keys(publish, subscribe)
     assert "-c-1" not in str(raised.value)
 
 
 def test_whitespace_around_a_typed_key_is_removed():
-    typed = keys.typed(" pub-c-1", "sub-c-1\n")
+    typed = typed_keys(" pub-c-1", "sub-c-1\n")
     assert (typed.publish_key, typed.subscribe_key) == ("pub-c-1", "sub-c-1")
 
 

@@ -14,9 +14,8 @@ from rich.console import Console
 
 from iort_station.cli import tables
 from iort_station.cli.options import Range, When
-from iort_station.data import Result
+from iort_station.data import Result, tabular
 from iort_station.errors import StationError
-from iort_station.recordings import tabular
 
 
 def result(n=3):

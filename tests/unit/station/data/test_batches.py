@@ -21,7 +21,7 @@ from iort_contract.dynamodb import starting_between
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
-from iort_station.data.stored.recorded import Recorded
+from iort_station.data.recorded import Recorded
 from tests.examples import examples
 from tests.fakes import TELEMETRY, item_of_message
 from tests.recordings import recording

@@ -23,7 +23,8 @@ from iort_contract.messages.message_type import MessageType
 from iort_contract.topics import build_topic
 from iort_station import data
 from iort_station.cli.verbs.data import query
-from iort_station.data import conditions, select
+from iort_station.data import select
+from iort_station.data import selection as conditions
 from iort_station.errors import StationError
 from tests.fakes import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
 

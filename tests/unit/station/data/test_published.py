@@ -11,8 +11,8 @@ from iort_contract.messages.message_type import MessageType
 from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_contract.ros1.decode import Large
 from iort_contract.ros1.message import Messages, RosType, cut
+from iort_station.data.export import Export
 from iort_station.data.selection import select
-from iort_station.recordings.published import Export
 from tests.fakes import TELEMETRY, item_of, serialize
 from tests.unit.contract.ros1.ros1_messages import LINE, text, u32
 from tests.unit.station.data.test_data import START, cloud_of

@@ -29,13 +29,12 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station import data
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.data.overview import overview
-from iort_station.data.runs import runs
+from iort_station.data import tabular
+from iort_station.data.runs import overview, runs
 from iort_station.errors import StationError
 from iort_station.operations.delivery import accounts, audit
-from iort_station.page.answers.downloads import downloads
-from iort_station.page.answers.index import answers
-from iort_station.recordings import tabular
+from iort_station.page.answers import answers
+from iort_station.page.history import downloads
 from iort_station.upkeep import deep
 from iort_station.upkeep.finding import FAIL
 from tests import archived

@@ -7,7 +7,7 @@ import pytest
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.message_type import MessageType
-from iort_station.data.units import unit
+from iort_station.data.inventory import unit
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from iort_contract.messages.control.commands import decode_command
 from iort_contract.messages.control.driving import DriveLimits
 from iort_station.cli.verbs.fleet.drive import _Seat
 from iort_station.errors import StationError
-from iort_station.fleet.control import stopping
-from iort_station.fleet.control.driving import Driver, Phase
+from iort_station.fleet import stopping
+from iort_station.fleet.driving import Driver, Phase
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 

@@ -15,7 +15,7 @@ from iort_contract.messages.control.commands import Command, decode_command, enc
 from iort_contract.messages.control.driving import DriveLimits
 from iort_contract.messages.live import LiveSample
 from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
-from iort_station.fleet.control.driving import Driver, Phase, Stick
+from iort_station.fleet.driving import Driver, Phase, Stick
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 CLOUD_US = 1_700_000_000_000_000

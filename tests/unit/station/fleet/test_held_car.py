@@ -8,8 +8,8 @@ import pytest
 
 from iort_contract.messages.control.commands import encode_command
 from iort_contract.messages.live import LiveSample
-from iort_station.fleet.control.driving import Driver as TerminalDriver
-from iort_station.fleet.control.driving import Stick
+from iort_station.fleet.driving import Driver as TerminalDriver
+from iort_station.fleet.driving import Stick
 from tests.unit.agent.sources.test_sim import CAR_LIMITS, Commanded
 
 

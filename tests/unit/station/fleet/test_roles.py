@@ -15,7 +15,7 @@ from iort_contract.cloud import DRIVER, PUBNUB, VIEWER
 from iort_station.errors import StationError
 from iort_station.fleet import registry, roles
 from iort_station.fleet.roles import Role, has_drivers, signed_url, transport
-from iort_station.page.answers.socket import actions, everybody, reaching
+from iort_station.page.motion import everybody, reaching, socket_actions
 from iort_station.page.page import config
 
 BROKER = "wss://abc-ats.iot.eu-west-1.amazonaws.com/mqtt"
@@ -90,8 +90,8 @@ def test_a_page_is_told_where_it_listens_and_may_connect_there(monkeypatch):
     assert reaching(cloud, "iot") == {"live": "iot", "broker": "wss://abc-ats.iot.eu-west-1.amazonaws.com"}
     with pytest.raises(StationError, match="sends nothing to PubNub"):
         reaching(cloud, "pubnub")
-    assert actions(cloud).keys() == {"drive"}
-    assert not actions(Cloud())  # type: ignore[arg-type]  # a fake
+    assert socket_actions(cloud).keys() == {"drive"}
+    assert not socket_actions(Cloud())  # type: ignore[arg-type]  # a fake
 
 
 def test_a_role_is_assumed_again_before_its_credentials_end(monkeypatch):

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from iort_contract.messages.control.commands import Command, decode_command
 from iort_contract.messages.control.driving import DRIVEN_BY_ANOTHER, NO_LEASE
 from iort_station.cli.verbs.fleet.send import commands
-from iort_station.fleet.control.shadow import slept
-from iort_station.page.answers import control
+from iort_station.fleet.control import slept
+from iort_station.page import answers
 
 
 class Cloud:
@@ -69,7 +69,7 @@ def test_the_wheel_is_taken_only_if_that_is_asked_for(options: tuple[str, ...], 
         "message": "{}",
         **({"takeover": "true"} if takeover else {}),
     }
-    assert slept(control.send(cloud, asked))["accepted"]  # type: ignore[arg-type]  # a fake
+    assert slept(answers.send(cloud, asked))["accepted"]  # type: ignore[arg-type]  # a fake
     assert [command.takeover for command in cloud.sent] == [takeover, takeover]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from iort_contract.messages.control.shadow import OverShare, Reported, decode_desired, decode_reported
 from iort_station.errors import StationError
-from iort_station.fleet.control.shadow import State, _check_clock, answered, outcome, over_share
+from iort_station.fleet.control import State, _check_clock, outcome, over_share, settled
 
 REPORTED = {
     "live": {"enabled": True, "rate_hz": 10},
@@ -96,15 +96,15 @@ def test_the_clouds_notice_of_a_share_is_no_desired_setting():
     ],
 )
 def test_an_answer_is_recognised_for_each_desired_setting(desired, said):
-    assert answered(desired, STATE) is said
+    assert settled(desired, STATE) is said
 
 
 def test_a_long_rejected_value_is_recognised_by_its_beginning():
     long = ["x" * 300]
     rejected = {"fields.vesc": {"value": ('["' + "x" * 300)[:200] + "...", "reason": "no"}}
     state = State(reported=decode_reported({"rejected": rejected}))
-    assert answered({"fields.vesc": long}, state)
-    assert answered({"fields.vesc": ["y" * 300]}, state) is None
+    assert settled({"fields.vesc": long}, state)
+    assert settled({"fields.vesc": ["y" * 300]}, state) is None
 
 
 def test_the_outcome_of_a_command_is_read_by_run_and_number():

@@ -16,7 +16,7 @@ from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, decode_lease, l
 from iort_contract.topics import parse_topic
 from iort_station.errors import StationError
 from iort_station.fleet import viewing
-from iort_station.page.live.watch import GONE_S, STALE_S, FleetWatch
+from iort_station.page.live import GONE_S, STALE_S, FleetWatch
 
 LEASE = Lease("0badcafe", 10, VIEW_LEASE_MS)
 

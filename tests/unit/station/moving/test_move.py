@@ -105,7 +105,7 @@ def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
             self.rows = account.rows.copy
 
     monkeypatch.setattr(archived, "archive_of", Rows)
-    monkeypatch.setattr(written.findings, "table", lambda account: account.findings)
+    monkeypatch.setattr(written.findings, "findings_table", lambda account: account.findings)
 
 
 def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.MonkeyPatch) -> None:

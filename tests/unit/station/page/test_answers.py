@@ -10,8 +10,8 @@ import pytest
 from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
-from iort_station.page.answers.history import MAX_ROWS, history
-from iort_station.page.answers.index import answers
+from iort_station.page.answers import answers
+from iort_station.page.history import MAX_ROWS, history
 from tests.unit.station.data.test_data import START, cloud_of, ride
 
 ASKED = {

@@ -10,7 +10,8 @@ from iort_contract.catalog.analysis.parameters import GROUPS
 from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
 from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_station.errors import StationError
-from iort_station.page.answers import insights, laps
+from iort_station.page import insights
+from iort_station.page import insights as laps
 from tests.unit.station.analysis.test_laps import driven_cloud
 from tests.unit.station.data.test_data import START
 
@@ -45,7 +46,7 @@ class Table:
 
 @pytest.fixture(autouse=True)
 def _table(monkeypatch):
-    monkeypatch.setattr(insights.stored, "table", lambda _cloud: Table())
+    monkeypatch.setattr(insights.stored, "findings_table", lambda _cloud: Table())
     monkeypatch.setattr(insights.registry, "presence", lambda _cloud: {"car": {}, "other": {}})
 
 
@@ -73,7 +74,7 @@ def test_the_fleets_insights_are_of_all_robots():
 
 
 def test_laps_and_their_delta_are_answered_from_the_samples():
-    answers = laps.answers(driven_cloud())
+    answers = laps.laps_answers(driven_cloud())
     told = json.loads(json.dumps(answers["laps"](WHOLE), allow_nan=False))
     assert told["method"] == "gate"
     assert len(told["laps"]) >= 6
@@ -86,7 +87,7 @@ def test_laps_and_their_delta_are_answered_from_the_samples():
 
 
 def test_a_range_without_laps_says_why():
-    told = laps.answers(driven_cloud())["laps"]({**WHOLE, "to_us": str(START + 10_000_000)})
+    told = laps.laps_answers(driven_cloud())["laps"]({**WHOLE, "to_us": str(START + 10_000_000)})
     assert told["laps"] == []
     assert told["reason"].startswith("no laps: ")
 

@@ -14,10 +14,9 @@ from iort_station.cloud import Cloud
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.fleet.viewing import Viewer
-from iort_station.page.live.heard import heard_of
-from iort_station.page.live.listener import _Callback
-from iort_station.page.live.listening import BrokerListener, update_of
-from iort_station.page.live.watch import FleetWatch, problem
+from iort_station.page.listening import BrokerListener, update_of
+from iort_station.page.live import FleetWatch, heard_of, problem
+from iort_station.page.pubnub import _Callback
 
 LIVE = LiveSample("0badcafe", 7, 1_000_000, 2_000_000, {"speed": 1.5, "temp_motor": -1e9}, 0, 5, 100)
 

@@ -10,7 +10,7 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
-from iort_station.page.live.watch import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch
+from iort_station.page.live import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch
 
 NOW_US = 1_700_000_000_000_000
 

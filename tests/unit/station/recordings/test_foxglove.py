@@ -11,8 +11,8 @@ import pytest
 from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.limits import Value
 from iort_contract.messages.message_type import MessageType
-from iort_station.recordings import recordings
-from iort_station.recordings.messages import Maker, made_of
+from iort_station.data import bags
+from iort_station.data.ros_messages import Maker, made_of
 from tests.foxglove import flat, opened
 from tests.unit.station.recordings.test_messages import RICH, STAMPED
 
@@ -49,7 +49,7 @@ def test_foxglove_reads_every_message_of_every_type(tmp_path: Path, suffix: str)
         "/rtt": Maker(own, list(untyped[0]), own=True),
     }
     path = tmp_path / f"ride{suffix}"
-    with recordings.KINDS[suffix](path) as file:
+    with bags.KINDS[suffix](path) as file:
         for maker, samples in zip(makers.values(), (stamped, rich, untyped), strict=True):
             write = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
             for block in blocks(samples):

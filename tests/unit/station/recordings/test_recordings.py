@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import pytest
 
+from iort_station.data import bags
 from iort_station.errors import StationError
-from iort_station.recordings import recordings
 
 
-@pytest.mark.parametrize("ending", recordings.KINDS)
+@pytest.mark.parametrize("ending", bags.KINDS)
 def test_an_interrupted_export_leaves_no_file(tmp_path, ending):
     path = tmp_path / f"ride{ending}"
-    with pytest.raises(StationError, match="broke off"), recordings.KINDS[ending](path):
+    with pytest.raises(StationError, match="broke off"), bags.KINDS[ending](path):
         raise StationError("broke off")
     assert list(tmp_path.iterdir()) == []
-    with recordings.KINDS[ending](path):
+    with bags.KINDS[ending](path):
         pass
     assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(StationError, match="exists"), recordings.KINDS[ending](path):
+    with pytest.raises(StationError, match="exists"), bags.KINDS[ending](path):
         pass

@@ -22,9 +22,9 @@ from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.recording import BagConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
+from iort_station.data import bags
+from iort_station.data.export import write
 from iort_station.data.selection import select
-from iort_station.recordings import recordings
-from iort_station.recordings.export import write
 from tests.agent_fakes import ManualClock
 from tests.fakes import TELEMETRY, item_of_message
 from tests.ros.mixed.robot import MESSAGES
@@ -77,7 +77,7 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
     cloud = stored(play)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.bag"
-        with recordings.bag(path) as file:
+        with bags.bag(path) as file:
             write(cloud, select("car", "made"), file)
         with Reader(path) as reader:
             assert {(c.topic, c.digest) for c in reader.connections} == {("/made", definition.md5sum)}
@@ -165,11 +165,11 @@ def test_what_ros_2_recorded_is_exported_in_its_form(tmp_path: Path, topic: str)
 
     cloud, path = stored(play), tmp_path / "made.mcap"
     lines: list[str] = []
-    with recordings.mcap(path) as file:
+    with bags.mcap(path) as file:
         write(cloud, select("car", "made"), file, say=lines.append)
     assert "of ROS 2, converted to ROS 1 when they were recorded and back for this file" in lines[0]
     assert read_ros2(path, topic) == read_ros2(source, topic)
-    with recordings.bag(tmp_path / "made.bag") as bag:
+    with bags.bag(tmp_path / "made.bag") as bag:
         write(cloud, select("car", "made"), bag, say=lines.append)
     assert lines[-1].endswith("of ROS 2, converted to ROS 1 when they were recorded")
 

@@ -12,12 +12,12 @@ from iort_contract.messages.analysis.findings import encode_estimate
 from iort_station.cli.console import Lines, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
-from iort_station.data import inventory
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 
 if TYPE_CHECKING:
-    from iort_station.data.analysis.calibration import Calibration
+    from iort_station.data.findings import Calibration
 
 commands = typer.Typer()
 
@@ -36,15 +36,12 @@ def calibrate(
     They come from the newest drives that were analysed: battery, motor, forces and heat. What a drive does
     not tell is listed with the reason.
     """
-    # numpy takes longer to load than most commands to run.
-    from iort_station.data.analysis import calibration  # noqa: PLC0415 - see above
-
     within, cloud = when.range(), context.obj.cloud()
     drives = findings.drives(cloud, robot, within.start_us, within.end_us, most=count)
     if not drives:
         raise StationError(f"{robot} has no analysed drives in this range")
-    found, vehicle = calibration.calibration(drives), inventory.vehicle_of(cloud, robot)
-    lines = calibration.vesc_yaml(found, vehicle)
+    found, vehicle = findings.calibration(drives), registry.vehicle_of(cloud, robot)
+    lines = findings.vesc_yaml(found, vehicle)
     if as_json:
         told = {
             name: {**encode_estimate(one.estimate), "drives": one.drives} for name, one in found.found.items()
@@ -57,11 +54,11 @@ def calibrate(
     if not lines:
         return
     out.print(Lines(f"\nvesc.yaml:\n{lines}", end=""))
-    gain = found.found[calibration.GAIN].estimate
+    gain = found.found[findings.GAIN].estimate
     if vehicle is not None and not gain.low <= vehicle.speed_to_erpm_gain <= gain.high:
         say(
             f"registered is {vehicle.speed_to_erpm_gain:.12g}; to correct speeds, also the recorded ones: "
-            f"iort robots set {robot} {calibration.GAIN}={gain.value:.1f}"
+            f"iort robots set {robot} {findings.GAIN}={gain.value:.1f}"
         )
 
 

@@ -46,14 +46,14 @@ def export(
     """
     # numpy takes longer to load than most commands to run.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
+    from iort_station.data import bags  # noqa: PLC0415 - as above
+    from iort_station.data.export import write  # noqa: PLC0415 - as above
     from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
     from iort_station.data.selection import select  # noqa: PLC0415 - as above
-    from iort_station.recordings import recordings  # noqa: PLC0415 - as above
-    from iort_station.recordings.export import write  # noqa: PLC0415 - as above
 
-    kind = recordings.KINDS.get(out.suffix)
+    kind = bags.KINDS.get(out.suffix)
     if kind is None:
-        raise UsageError(f"the file must end in {' or '.join(recordings.KINDS)}, got {out}")
+        raise UsageError(f"the file must end in {' or '.join(bags.KINDS)}, got {out}")
     check_free(out, force=force)
     within = when.range(SHORT)
     cloud = context.obj.cloud()

@@ -16,7 +16,7 @@ from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples
-from iort_station.data.analysis import findings as stored
+from iort_station.data import findings as stored
 from iort_station.fleet import registry
 from iort_station.times import between, iso_s, stamped
 

@@ -21,7 +21,7 @@ from iort_station.times import iso, iso_s
 
 if TYPE_CHECKING:
     from iort_analysis.results import Table as Columns
-    from iort_station.data.analysis.laps import RunLaps
+    from iort_station.data.runs import RunLaps
 
 commands = typer.Typer()
 # The rows of a comparison in a terminal; JSON and the picture have every place.
@@ -63,7 +63,7 @@ def laps(
     below a table says which. Without a range, the newest run is searched. Intervals are of 90 %.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data.analysis.laps import laps_of_runs  # noqa: PLC0415 - see above
+    from iort_station.data.runs import laps_of_runs  # noqa: PLC0415 - see above
 
     if file is not None:
         if compare is None:

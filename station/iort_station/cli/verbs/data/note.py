@@ -11,7 +11,7 @@ from iort_contract.messages.analysis.notes import MAX_NOTE_CHARACTERS, Note
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say
-from iort_station.data.analysis import notes as stored
+from iort_station.data import findings as stored
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations.monitoring.alarms import user
@@ -50,12 +50,12 @@ def note(
     if text is None and (at is not None or by is not None):
         raise UsageError("--at and --by need a text to write")
     if remove is not None:
-        stored.remove(cloud, robot, remove)
+        stored.remove_note(cloud, robot, remove)
         say(f"note {remove} of {robot} is deleted")
         return
     if text is not None:
         t_us = None if at is None else time_us(at, time.time_ns() // 1000)
-        found = [stored.write(cloud, robot, text, by=user() if by is None else by, t_us=t_us)]
+        found = [stored.write_note(cloud, robot, text, by=user() if by is None else by, t_us=t_us)]
     else:
         registry.get(cloud, robot)
         found = stored.notes(cloud, robot, within.start_us, within.end_us, most=count)

@@ -28,6 +28,7 @@ from iort_station.cli.progress import reading
 from iort_station.cli.words import examples, say, say_archived, say_refused
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
+from iort_station.fleet import registry
 from iort_station.output import check_free
 from iort_station.times import between_hours
 
@@ -111,14 +112,13 @@ def plot(
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
     from iort_station import data  # noqa: PLC0415 - as above
-    from iort_station.data import inventory  # noqa: PLC0415 - as above
-    from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
+    from iort_station.data.selection import derive  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
         result = data.query(cloud, robot, stream, within.start_us, within.end_us, progress=progress, **asked)
     columns = dict(result.columns)
     if asked["fields"] is None and "speed" in columns:
-        columns |= derive(columns, inventory.vehicle_of(cloud, robot))
+        columns |= derive(columns, registry.vehicle_of(cloud, robot))
     return replace(result, columns=columns)
 
 

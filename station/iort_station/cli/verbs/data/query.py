@@ -152,7 +152,7 @@ def _form_of(out: Path | None) -> Format:
 
 def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
     from iort_station.cli import tables  # noqa: PLC0415 - as above
-    from iort_station.recordings import tabular  # noqa: PLC0415 - as above
+    from iort_station.data import tabular  # noqa: PLC0415 - as above
 
     if form == "parquet":
         tabular.to_parquet(result, file.buffer)

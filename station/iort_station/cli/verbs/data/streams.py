@@ -14,7 +14,7 @@ from iort_station.cli.words import examples, say_archived
 from iort_station.times import between, between_hours, iso_s
 
 if TYPE_CHECKING:
-    from iort_station.data.overview import StreamOverview
+    from iort_station.data.runs import StreamOverview
 
 commands = typer.Typer()
 
@@ -27,7 +27,7 @@ def streams(context: typer.Context, robot: Robot, as_json: AsJson = False) -> No
     """
     # numpy takes longer to load than TAB may take.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
-    from iort_station.data.overview import overview  # noqa: PLC0415 - see above
+    from iort_station.data.runs import overview  # noqa: PLC0415 - see above
 
     cloud, origin = context.obj.cloud(), Origin()
     with errors.status("reading"):

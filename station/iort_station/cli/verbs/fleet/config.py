@@ -12,8 +12,8 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet.control import settings
-from iort_station.fleet.control.shadow import Shadow, State
+from iort_station.fleet import control
+from iort_station.fleet.control import Shadow, State
 
 commands = typer.Typer()
 
@@ -52,7 +52,7 @@ def config(
             errors.print(f"`iort config {robot} {options}` withdraws what is rejected", soft_wrap=True)
         return
     with errors.status(f"waiting for {robot}"):
-        state, rejected, online, answer = settings.change(cloud, robot, wanted, seconds)
+        state, rejected, online, answer = control.change_settings(cloud, robot, wanted, seconds)
     _print(robot, state, rejected, wanted, as_json=as_json)
     pending = state.pending().keys() & wanted.keys()
     if not answer and online:
@@ -70,7 +70,7 @@ def _change(text: str) -> tuple[str, Any]:
     name, equals, written = text.partition("=")
     if not name or not equals:
         raise UsageError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
-    return name, settings.parsed(name, written)
+    return name, control.parse_setting(name, written)
 
 
 def _print(
@@ -90,8 +90,8 @@ def _print(
         out.print(f"{robot} has reported no settings yet")
     said = {name: "  (withdrawn)" if value is None else "  (changed)" for name, value in wanted.items()}
     said |= dict.fromkeys(rejected, "  (unchanged: the change is rejected)")
-    said |= {name: f"  (pending: {settings.written(value)})" for name, value in pending.items()}
+    said |= {name: f"  (pending: {control.setting_text(value)})" for name, value in pending.items()}
     for name, value in {**dict.fromkeys(pending, "?"), **in_force}.items():
-        out.print(f"{name}={settings.written(value)}{said.get(name, '')}")
+        out.print(f"{name}={control.setting_text(value)}{said.get(name, '')}")
     for one in rejected.values():
         errors.print(f"rejected: {one.reason}", style="red")

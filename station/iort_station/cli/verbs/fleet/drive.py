@@ -37,11 +37,10 @@ from iort_station.cli.options import Robot
 from iort_station.cli.words import examples
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry
+from iort_station.fleet import registry, stopping
 from iort_station.fleet.broker import Broker
-from iort_station.fleet.control import stopping
-from iort_station.fleet.control.commands import operator
-from iort_station.fleet.control.driving import Driver, Phase
+from iort_station.fleet.control import operator
+from iort_station.fleet.driving import Driver, Phase
 from iort_station.fleet.roles import Role
 
 commands = typer.Typer()

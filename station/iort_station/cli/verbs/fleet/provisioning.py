@@ -13,8 +13,7 @@ from iort_station.cli.console import Lines, errors, tell
 from iort_station.cli.options import AsJson, Force, Robot, Yes, agreed, to_file
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
-from iort_station.fleet import registry, robots
-from iort_station.fleet.identity import claims, rotation
+from iort_station.fleet import identity, registry, robots
 from iort_station.output import check_free
 
 commands = typer.Typer()
@@ -62,7 +61,9 @@ def register(
     serial: Annotated[
         str | None, typer.Option(help="The serial number of the one machine that may claim the name.")
     ] = None,
-    days: Annotated[float, typer.Option(help="How many days the name can be claimed.", min=0)] = claims.DAYS,
+    days: Annotated[
+        float, typer.Option(help="How many days the name can be claimed.", min=0)
+    ] = identity.DAYS,
     speed_to_erpm_gain: _Gain = None,
     as_json: AsJson = False,
 ) -> None:
@@ -71,7 +72,7 @@ def register(
         raise UsageError("--serial is for one machine: give one name with it")
     cloud, vehicle = context.obj.cloud(), _vehicle(speed_to_erpm_gain)
     for name in names:
-        claims.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
+        identity.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
         tell({"robot": name, "days": days}, f"{name} is expected for {days:g} days", as_json=as_json)
 
 
@@ -91,8 +92,8 @@ def claim(
     """
     if name is None and not lasting:
         raise UsageError("give the robot's name, or --lasting for a claim of many robots")
-    check_free(folder / claims.FILE, force=force)
-    path = claims.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
+    check_free(folder / identity.CLAIM_FILE, force=force)
+    path = identity.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
     text = (
         f"Copy {folder} to the robot, then run there:\n\n"
         f"  iort-agent provision --config {folder.name}/{path.name}"
@@ -111,7 +112,7 @@ def rotate(
     wait: Annotated[bool, typer.Option(help="Wait for the robot, then revoke the old certificate.")] = True,
     settled_s: Annotated[
         float, typer.Option(help="Seconds that the robot must be connected with the new one.", min=0)
-    ] = rotation.SETTLED_S,
+    ] = identity.SETTLED_S,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -122,8 +123,8 @@ def rotate(
     cloud = context.obj.cloud()
     if not finish:
         registry.get(cloud, name)
-        check_free(folder / claims.FILE, force=force)
-        path = claims.claim(cloud, name, out=folder)
+        check_free(folder / identity.CLAIM_FILE, force=force)
+        path = identity.claim(cloud, name, out=folder)
         text = (
             f"Copy {folder} to {name} within five minutes, then run there:\n\n"
             f"  iort-agent renew --config car.yaml --claim {folder.name}/{path.name}\n"
@@ -131,7 +132,7 @@ def rotate(
         tell({"robot": name, "folder": str(folder), "claim": str(path)}, Lines(text), as_json=as_json)
     if finish or wait:
         with errors.status("waiting") as status:
-            old = rotation.finish(cloud, name, settled_s=settled_s, progress=status.update)
+            old = identity.finish_rotation(cloud, name, settled_s=settled_s, progress=status.update)
         text = f"{name} has settled with its new certificate; revoked: {len(old)}"
         tell({"robot": name, "revoked": len(old)}, text, as_json=as_json)
 
@@ -140,7 +141,7 @@ def rotate(
 def revoke_claims(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
     agreed("Revoke every lasting claim?", yes=yes)
-    count = claims.revoke_all(context.obj.cloud())
+    count = identity.revoke_claims(context.obj.cloud())
     tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 

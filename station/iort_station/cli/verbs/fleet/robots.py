@@ -43,9 +43,7 @@ from iort_station.cli.verbs.fleet import provisioning, tags
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
-from iort_station.fleet import registry, robots
-from iort_station.fleet.control import shadow, stopping
-from iort_station.fleet.identity import certificates, claims
+from iort_station.fleet import control, identity, registry, robots, stopping
 from iort_station.times import iso_s, stamped, time_us
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
@@ -154,8 +152,8 @@ def show(
 ) -> None:
     """Show a robot: its connection, its share of Lambda 2, its provisioning, its certificates."""
     cloud = context.obj.cloud()
-    row, held = registry.get(cloud, name), certificates.attached(cloud, name)
-    over, motion = shadow.over_share(cloud, name), stopping.motion(cloud, [name])[name]
+    row, held = registry.get(cloud, name), identity.certificates(cloud, name)
+    over, motion = control.over_share(cloud, name), stopping.motion(cloud, [name])[name]
     if as_json:
         print_json(
             {
@@ -226,7 +224,7 @@ def remove(
     for one in names:
         robots.remove(cloud, one)
         tell({"removed": one}, f"{one} is removed", as_json=as_json)
-    count = claims.revoke_all(cloud)
+    count = identity.revoke_claims(cloud)
     tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
 

@@ -13,7 +13,7 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet.control import commands as fleet_commands
+from iort_station.fleet import control as fleet_commands
 from iort_station.texts import one_line
 
 commands = typer.Typer()

@@ -26,9 +26,8 @@ from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry
-from iort_station.fleet.control import stopping
-from iort_station.fleet.control.stopping import Motion
+from iort_station.fleet import registry, stopping
+from iort_station.fleet.stopping import Motion
 from iort_station.operations.monitoring import alarms
 from iort_station.times import iso_s
 

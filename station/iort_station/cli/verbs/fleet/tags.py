@@ -10,7 +10,7 @@ from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
-from iort_station.fleet import tags
+from iort_station.fleet import robots
 
 commands = typer.Typer()
 
@@ -30,7 +30,7 @@ def tag(
 ) -> None:
     """Show or change a robot's tags. The page finds and groups robots by them."""
     wanted = {**dict(map(_change, changes or [])), **dict.fromkeys(remove or [])}
-    now = tags.change(context.obj.cloud(), name, wanted)
+    now = robots.change_tags(context.obj.cloud(), name, wanted)
     if as_json:
         print_json({"robot": name, "tags": now})
         return

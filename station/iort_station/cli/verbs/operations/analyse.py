@@ -19,7 +19,7 @@ from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged
 from iort_station.cli.words import examples, say
 from iort_station.cloud import Cloud
-from iort_station.data.analysis import findings
+from iort_station.data import findings
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
@@ -75,7 +75,7 @@ def analyse(
     facts = {"run": name, "drives": done.drives or 0, "failed": len(failed), "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
     if not done.drives:
-        for line in _recorded(cloud, robots or sorted(findings.named(cloud, None)), request):
+        for line in _recorded(cloud, robots or sorted(findings.robots_of(cloud, None)), request):
             say(line)
     for one in failed:
         say(f"{one.drive.robot}: {one.text}")

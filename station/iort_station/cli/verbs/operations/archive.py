@@ -12,7 +12,7 @@ from iort_station.cli import completion, console
 from iort_station.cli.options import AsJson
 from iort_station.cli.progress import bar
 from iort_station.cli.words import examples, say
-from iort_station.data.stored.recorded import archive_of
+from iort_station.data.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
 

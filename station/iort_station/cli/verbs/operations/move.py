@@ -147,7 +147,7 @@ class _Moving:
             self._problem(f"{robot}: the target lacks {len(lacking):,} quarantined messages: move again")
 
     def _stream(self, robot: str, stream: str) -> None:
-        from iort_station.data.stored.batches import topic_of  # noqa: PLC0415 - as above
+        from iort_station.data.recorded import topic_of  # noqa: PLC0415 - as above
         from iort_station.moving import archived, compared, recorded  # noqa: PLC0415 - as above
 
         source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)

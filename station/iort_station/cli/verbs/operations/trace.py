@@ -24,8 +24,8 @@ from iort_station.fleet import registry
 from iort_station.fleet.roles import transport
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations.delivery import audit, trace
-from iort_station.page import keys
-from iort_station.page.live.listening import listening
+from iort_station.page.listening import listening
+from iort_station.page.page import load_keys
 
 commands = typer.Typer()
 # Characters of the other columns, and of the longest and shortest whole bar.
@@ -83,7 +83,7 @@ def trace_(
 
 
 def _pubnub_clock(cloud: Cloud) -> trace.ClockOffset:
-    pubnub = keys.load(cloud)
+    pubnub = load_keys(cloud)
     with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
         return trace.clock_of(ask, lambda: time.time_ns() // 1000)
 

@@ -39,10 +39,10 @@ def dashboard(
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
-    from iort_station.page.answers import control  # noqa: PLC0415 - as above
-    from iort_station.page.answers.downloads import downloads  # noqa: PLC0415 - as above
-    from iort_station.page.answers.index import actions, answers  # noqa: PLC0415 - see above
-    from iort_station.page.answers.socket import reaching  # noqa: PLC0415 - as above
+    from iort_station.page import answers as control  # noqa: PLC0415 - as above
+    from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
+    from iort_station.page.history import downloads  # noqa: PLC0415 - as above
+    from iort_station.page.motion import reaching  # noqa: PLC0415 - as above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
@@ -55,7 +55,7 @@ def dashboard(
         downloads=downloads(cloud),
         open_actions=actions(cloud),
         # Only people at this machine may move a robot.
-        actions=control.actions(cloud) if on_loopback(host) else {},
+        actions=control.keyed_actions(cloud) if on_loopback(host) else {},
         admitted=lambda address: say(f"another browser: {address}"),
         track=None if track is None else load_track(track),
         host=host,

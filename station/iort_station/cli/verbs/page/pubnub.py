@@ -10,7 +10,7 @@ from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples
 from iort_station.errors import StationError
-from iort_station.page import keys
+from iort_station.page.page import store_keys, typed_keys
 
 commands = typer.Typer()
 
@@ -34,5 +34,5 @@ def pubnub(
         raise StationError("the embedded cloud has a stand-in for PubNub, with its own keys")
     publish_key = publish_key or typer.prompt("Publish key", hide_input=True)
     subscribe_key = subscribe_key or typer.prompt("Subscribe key", hide_input=True)
-    keys.store(cloud, keys.typed(publish_key, subscribe_key))
+    store_keys(cloud, typed_keys(publish_key, subscribe_key))
     tell({"stored": True}, "stored; Lambda 1 uses them after its next cold start", as_json=as_json)

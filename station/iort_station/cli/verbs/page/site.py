@@ -9,9 +9,8 @@ import typer
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, TrackFile, Yes, agreed
 from iort_station.cli.words import examples
-from iort_station.page.answers.socket import everybody
-from iort_station.page.page import config, load_track
-from iort_station.page.site import publish, upload
+from iort_station.page.motion import everybody
+from iort_station.page.page import config, load_track, publish, upload
 
 commands = typer.Typer()
 

@@ -24,8 +24,8 @@ from iort_station.cli.options import LiveWay, Token
 from iort_station.cli.words import examples, say
 from iort_station.fleet import registry, viewing
 from iort_station.fleet.roles import transport
-from iort_station.page.live.listening import listening
-from iort_station.page.live.watch import FleetWatch, problem
+from iort_station.page.listening import listening
+from iort_station.page.live import FleetWatch, problem
 from iort_station.times import iso
 
 commands = typer.Typer()

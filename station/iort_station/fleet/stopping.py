@@ -24,7 +24,7 @@ from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
-from iort_station.fleet.control.shadow import read
+from iort_station.fleet.control import read
 
 _T = TypeVar("_T")
 # A fleet is stopped at once, not robot by robot.

@@ -1,4 +1,4 @@
-"""Bodies of the page's answers, plain and packed."""
+"""Requests to the page's server and its answers: parameters, and bodies, plain and packed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from iort_station.errors import StationError
 from iort_station.page.page import TYPES
 
 # A coding of Accept-Encoding and its weight.
@@ -53,3 +54,28 @@ def takes_gzip(accepted: str) -> bool:
     weights: dict[str, str] = dict(_CODING.findall(accepted.lower()))
     weight = weights.get("gzip", weights.get("*", "0"))
     return weight == "" or weight.strip("0.") != ""
+
+
+def text(asked: Mapping[str, str], name: str) -> str:
+    """A text that is not empty; raises `StationError`."""
+    if not asked.get(name):
+        raise StationError(f"the request must have the parameter {name}")
+    return asked[name]
+
+
+def number(asked: Mapping[str, str], name: str) -> float:
+    """A number; raises `StationError`."""
+    found = text(asked, name)
+    try:
+        return float(found)
+    except ValueError as error:
+        raise StationError(f"{name} must be a number, got {found[:40]!r}") from error
+
+
+def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
+    """A whole number in the range; raises `StationError`."""
+    found = text(asked, name)
+    # Sixteen digits are enough for every allowed number.
+    if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
+        raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
+    return int(found)

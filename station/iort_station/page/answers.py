@@ -1,41 +1,90 @@
-"""What the page's server does with a robot: one command, as `iort send`, and settings, as `iort config`."""
+"""Every answer and action of the live page's server, by its name.
+
+Each is a function of the request's parameters; its type is in `iort_contract.messages.page`.
+"""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
 from iort_contract.messages.control.commands import MAX_LEASE_MS
 from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
-from iort_contract.messages.page import SendAnswer, SettingEntry, SettingKind, SettingsAnswer
+from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, SettingKind, SettingsAnswer
 from iort_contract.tables import ONLINE
-from iort_contract.topics import ACCEPTED
+from iort_contract.topics import ACCEPTED, check_robot
 from iort_station.cloud import Cloud
+from iort_station.data import inventory
 from iort_station.errors import StationError
-from iort_station.fleet import registry
-from iort_station.fleet.control import commands
-from iort_station.fleet.control import settings as fleet_settings
-from iort_station.fleet.control.shadow import Shadow, State
-from iort_station.page.answers import insights, motion, notes, socket
-from iort_station.page.answers.parameters import text, whole
-from iort_station.page.server import Answer
+from iort_station.fleet import control, registry, robots
+from iort_station.fleet import control as fleet_settings
+from iort_station.fleet.control import Shadow, State
+from iort_station.operations.monitoring import alarms, cloudwatch, cloudwatch_logs
+from iort_station.page import history, insights, motion
+from iort_station.page import insights as laps
+from iort_station.page import insights as notes
+from iort_station.page import motion as socket
+from iort_station.page import motion as viewing
+from iort_station.page.requests import text, whole
+from iort_station.page.server import Handler
+
+
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """Every answer, by its name."""
+    return {
+        "robots": lambda _asked: {"robots": registry.presence(cloud)},
+        "tags": lambda _asked: {"tags": robots.tags(cloud)},
+        "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
+        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(text(asked, "robot")))},
+        "runs": lambda asked: history.runs_of(cloud, asked),
+        "history": lambda asked: history.history(cloud, asked),
+        "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
+        "dashboard": lambda asked: cloudwatch.dashboard(
+            cloud, text(asked, "name"), minutes=whole(asked, "minutes", 1, 14 * 24 * 60)
+        ),
+        "log": lambda asked: cloudwatch_logs.rows(
+            cloud,
+            text(asked, "name"),
+            whole(asked, "widget", 0, 500),
+            minutes=whole(asked, "minutes", 1, 14 * 24 * 60),
+        ),
+        "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
+        "rejected": lambda _asked: alarms.rejected(cloud),
+        "insights": lambda asked: insights.insights(cloud, asked),
+        "analysis": lambda asked: insights.progress(cloud, asked),
+        **laps.laps_answers(cloud),
+        **socket.socket_answers(cloud),
+        **notes.notes_answers(cloud),
+        **motion.motion_answers(cloud),
+    }
+
+
+def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
+    """What everybody who reaches the page may do, by its name."""
+    return {
+        "view": lambda asked: viewing.view(socket.prompt(cloud), asked),
+        "acknowledge": lambda asked: alarms.acknowledge(
+            cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
+        ),
+    }
+
 
 # A viewer waits for it.
 _ANSWER_S = 10.0
 
 
-def actions(cloud: Cloud) -> dict[str, Answer]:
+def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
     """What moves or changes a robot, or costs something, by its name; only for a server on loopback."""
     return {
         "send": lambda asked: send(cloud, asked),
         "settings": lambda asked: settings(cloud, asked),
         "set": lambda asked: change(cloud, asked),
         "analyse": lambda asked: insights.analyse(cloud, asked),
-        **socket.actions(cloud),
-        **notes.actions(cloud),
-        **motion.actions(cloud),
+        **socket.socket_actions(cloud),
+        **notes.notes_actions(cloud),
+        **motion.motion_actions(cloud),
     }
 
 
@@ -51,7 +100,7 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> Generator[None, None, SendAn
     lease_ms = whole(asked, "lease_ms", 1, MAX_LEASE_MS) if asked.get("lease_ms") else None
     began = time.monotonic()
     robot, name, takeover = text(asked, "robot"), text(asked, "command"), asked.get("takeover") == "true"
-    sent = yield from commands.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
+    sent = yield from control.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
         return {"accepted": None, "reason": sent.offline, "after_ms": after_ms}
@@ -71,8 +120,8 @@ def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
     robot, name = text(asked, "robot"), text(asked, "name")
     if name == MOTION_STOPPED:
         raise StationError("the emergency stop has a button of its own")
-    value = fleet_settings.parsed(name, asked["value"]) if "value" in asked else None
-    changed = fleet_settings.change(cloud, robot, {name: value}, _ANSWER_S)
+    value = fleet_settings.parse_setting(name, asked["value"]) if "value" in asked else None
+    changed = fleet_settings.change_settings(cloud, robot, {name: value}, _ANSWER_S)
     reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
     return {"settings": _entries(changed.state, reasons), "online": changed.online}
 
@@ -108,4 +157,4 @@ def _kind(setting: Flag | Number | Choice | None) -> SettingKind:
 
 
 def _written(value: Any) -> str:
-    return "" if value is None else fleet_settings.written(value)
+    return "" if value is None else fleet_settings.setting_text(value)

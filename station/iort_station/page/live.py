@@ -1,12 +1,12 @@
-"""The newest values of every car, for `iort watch`."""
+"""Live updates as this machine hears them: what is kept of one, and the newest values of every car."""
 
 from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.table import Table
 from rich.text import Text
@@ -15,10 +15,41 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import FAULTS, hottest_degc
 from iort_contract.limits import GONE_S, STALE_S, ContractError
 from iort_contract.messages.live import decode_live_update, silent_s
-from iort_contract.tables import ROBOT
+from iort_contract.tables import ROBOT, T_US
 
 MAX_ROBOTS = 256
 _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
+
+
+class Heard(NamedTuple):
+    """One update: its delay from the car to this machine, its sample's time in microseconds, and the hops."""
+
+    robot: str
+    stream: str
+    boot: str
+    seq: int
+    delay_ms: float
+    t_us: int
+    hops: Mapping[str, int]
+
+
+# Takes an update, the time at which PubNub took it (0 from the broker) and the time of its arrival here, in
+# microseconds. It is called in the listener's own thread.
+OnUpdate = Callable[[dict[str, Any], int, int], None]
+
+
+def heard_of(update: Mapping[str, Any], now_us: int) -> Heard:
+    """What is kept of an update that arrives now."""
+    hops = update["hops"]
+    return Heard(
+        robot=update[ROBOT],
+        stream=update["stream"],
+        boot=update["boot"],
+        seq=update["seq"],
+        delay_ms=(now_us - hops["sent_us"]) / 1000,
+        t_us=update[T_US],
+        hops=hops,
+    )
 
 
 @dataclass

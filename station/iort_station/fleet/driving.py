@@ -14,8 +14,7 @@ it.
 The page does the same in station/web/src/drive/driver.ts; tests/unit/station/fleet/driving.json tests both.
 
 Times are microseconds of this computer's monotonic clock. The cloud's time is learned from the car's
-messages, so this computer's own clock may be wrong.
-"""
+messages, so this computer's own clock may be wrong."""
 
 from __future__ import annotations
 

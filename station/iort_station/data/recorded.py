@@ -1,41 +1,122 @@
-"""The summary, with one sample per second: as Lambda 2 has written it, or computed from the archive."""
+"""What is stored of a stream: its batches, in table and archive, the agent's last reports, and its seconds.
+
+`iort_analysis.archive.stored` merges table and archive; this module gives it a deployment's. Seconds are
+read as the summary has them, or computed from the archive once they have expired.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import Any
 
-from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Pages, Source, ahead, only
-from iort_analysis.samples.batches import Item, RefusedItems
+from iort_analysis.archive.hours import Archive, Stores
+from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Pages, Source, Stored, ahead, only
+from iort_analysis.samples.batches import ATTRIBUTES, Item, RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, objects
 from iort_analysis.samples.seconds import reach, summarized
 from iort_contract import expression
-from iort_contract.archive import Hour
+from iort_contract.archive import ArchiveTable, Hour
 from iort_contract.catalog.derived import SOURCES
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.codec.seconds import flat_second
-from iort_contract.dynamodb import deserialize, seconds_between, starting_between, with_samples_between
-from iort_contract.limits import MAX_BATCH_SPAN_US
+from iort_contract.dynamodb import (
+    SummaryTable,
+    TelemetryTable,
+    deserialize,
+    seconds_between,
+    starting_between,
+    with_samples_between,
+)
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
+from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import (
     ABSENT,
+    BATCH,
     BATCHES,
     EXPIRES_S,
     GAPS,
     MISSING_BATCHES,
     NONFINITE,
+    RECEIVED_MS,
     SAMPLES,
     SECOND,
     STATS,
     TOPIC,
 )
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data import inventory
-from iort_station.data.conditions import derive, holds
-from iort_station.data.selection import Selection
-from iort_station.data.stored.batches import summary_table, topic_of
-from iort_station.data.stored.recorded import Recorded
-from iort_station.errors import unknown
+from iort_station.data.selection import Selection, derive, holds
+from iort_station.errors import StationError, unknown
+from iort_station.fleet import registry
+
+
+def telemetry_table(cloud: Cloud) -> TelemetryTable:
+    """The deployment's telemetry table."""
+    return TelemetryTable(cloud.client("dynamodb"), cloud.output("storage", "TelemetryTable"))
+
+
+def summary_table(cloud: Cloud) -> SummaryTable:
+    """The deployment's summary table."""
+    return SummaryTable(cloud.client("dynamodb"), cloud.output("storage", "SummaryTable"))
+
+
+def topic_of(cloud: Cloud, robot: str, stream: str) -> str:
+    """The topic of a robot's stream on the record lane."""
+    return build_topic(RECORD, robot, stream, cloud.namespace)
+
+
+class Recorded(Stored):
+    """The batches of a robot's stream. ``origin`` and ``refused`` grow while they are read."""
+
+    def __init__(
+        self,
+        cloud: Cloud,
+        robot: str,
+        stream: str,
+        *,
+        source: Source = AUTO,
+        origin: Origin | None = None,
+        refused: RefusedItems | None = None,
+    ) -> None:
+        topic = topic_of(cloud, robot, stream)
+        super().__init__(stores(cloud), topic, source=source, origin=origin, refused=refused)
+
+
+def archive_of(cloud: Cloud, topic: str) -> Archive:
+    """The archive of a topic."""
+    return Archive(stores(cloud), topic)
+
+
+def stores(cloud: Cloud) -> Stores:
+    """Where a deployment's recordings are. One from before the archive has no table of it."""
+    manifest = None
+    with suppress(StationError):
+        manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
+    return Stores(
+        telemetry_table(cloud), manifest, lambda: (cloud.client("s3"), cloud.output("storage", "FilesBucket"))
+    )
+
+
+def last_reports(cloud: Cloud, robot: str) -> Iterator[Item]:
+    """The stored items with the last report of each run, and others beside them. A report counts from the
+    start of its run, so that the earlier ones say nothing more."""
+    recorded = Recorded(cloud, robot, ACCOUNT_STREAM)
+    last: dict[str, BatchId] = {}
+    for item in recorded.headers(starting_between(None, None)):
+        with suppress(ContractError):
+            one = batch_id(item[BATCH]["S"])
+            # Its number decides, since the car's clock may be set back.
+            if one.boot not in last or last[one.boot].seq <= one.seq:
+                last[one.boot] = one
+    for one in last.values():
+        # An agent that does not batch sends a report in several messages.
+        keys = starting_between(one.t_us - MAX_BATCH_SPAN_US, one.t_us)
+        for items in recorded.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
+            yield from items
+
 
 _SECOND_US = 1_000_000
 # The counts of a second.
@@ -85,16 +166,16 @@ def seconds(
 
 def _blocks(cloud: Cloud, selection: Selection, recorded: Recorded, *, scan: bool) -> Iterator[Block]:
     """The seconds as they are stored or computed, in order of time."""
-    table = Pages(stored(cloud, selection, scan=scan) if recorded.reads_table else iter(()), _second)
+    table = Pages(stored_seconds(cloud, selection, scan=scan) if recorded.reads_table else iter(()), _second)
     first, last = _range_s(selection)
     keys = with_samples_between(selection.start_us, selection.end_us)
     for start_s, end_s in _spans(recorded.archived(keys)):
         start, end = max(start_s, first or start_s), min(end_s, end_s if last is None else last + 1)
-        yield from map(_block, table.until(start))
+        yield from map(_block_of_seconds, table.until(start))
         # Some of these may still be there.
         deque(table.until(end), maxlen=0)
         yield from _computed(cloud, selection, recorded, start, end)
-    yield from map(_block, table.until(None))
+    yield from map(_block_of_seconds, table.until(None))
 
 
 def _spans(hours: Iterable[Hour]) -> list[tuple[int, int]]:
@@ -112,7 +193,7 @@ def _computed(
     cloud: Cloud, selection: Selection, recorded: Recorded, first: int, end: int
 ) -> Iterator[Block]:
     """The seconds from ``first`` until ``end``, made from their batches."""
-    vehicle = inventory.vehicle_of(cloud, selection.robot)
+    vehicle = registry.vehicle_of(cloud, selection.robot)
     keys = starting_between(*reach(first, end))
     wanted = _needs(selection)
     before = recorded.before(reach(first, end)[0])
@@ -131,7 +212,7 @@ def _needs(selection: Selection) -> Callable[[str], bool]:
     return fields.__contains__
 
 
-def stored(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:
+def stored_seconds(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:
     """Pages of the summary's seconds that start in the selection's range, in order of time."""
     topic = topic_of(cloud, selection.robot, selection.stream)
     pages = summary_table(cloud).pages(topic, seconds_between(*_range_s(selection)), scan=scan)
@@ -166,7 +247,7 @@ def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
     return [full for statistic in STATS if (full := f"{name}_{statistic}") in there]
 
 
-def _block(items: Sequence[Item]) -> Block:
+def _block_of_seconds(items: Sequence[Item]) -> Block:
     rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
     names = dict.fromkeys(name for row in rows for name in row if name not in {TOPIC, SECOND, EXPIRES_S})
     times = objects([row[SECOND] for row in rows]).astype("int64") * 1_000_000

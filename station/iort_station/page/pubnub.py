@@ -19,7 +19,7 @@ from iort_contract.cloud import channel
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace
 from iort_station.errors import StationError
-from iort_station.page.live.heard import Heard, OnUpdate, heard_of
+from iort_station.page.live import Heard, OnUpdate, heard_of
 
 _log = logging.getLogger(__name__)
 _CONNECT_S = 15.0

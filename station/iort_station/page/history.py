@@ -1,12 +1,15 @@
-"""Answers to the live page about a car's past: its runs, and the samples of a range."""
+"""A car's past for the live page: its runs, the samples of a range, and their download as a file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.catalog.streams import OWN_STREAMS
@@ -16,11 +19,14 @@ from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import inventory
-from iort_station.data.conditions import derive
+from iort_station.data import Result, Selection, bags, export, inventory, tabular
+from iort_station.data.bags import Recording, Write
 from iort_station.data.runs import runs
+from iort_station.data.selection import derive
 from iort_station.errors import StationError
-from iort_station.page.answers.parameters import text, whole
+from iort_station.page.requests import text, whole
+from iort_station.page.server import Download
+from iort_station.times import iso_s
 
 # No chart is wider, in points.
 MAX_ROWS = 5_000
@@ -153,3 +159,90 @@ def _last_known(column: Column, starts: Any) -> Any:
     ranked = np.where(known, np.arange(n), -1)
     last = np.maximum.reduceat(ranked, starts)
     return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
+
+
+MOST_BYTES = 1_000_000_000
+
+
+def downloads(cloud: Cloud) -> dict[str, Download]:
+    """Every download, by the name that is requested: the samples of ``robot`` and ``stream`` from ``from_us``
+    to ``to_us``, as recorded."""
+    return {
+        "history.csv": partial(_table, cloud, _csv, ".csv"),
+        "history.parquet": partial(_table, cloud, _parquet, ".parquet"),
+        "history.mcap": partial(_mcap, cloud),
+    }
+
+
+def _table(
+    cloud: Cloud, write: Callable[[Result, Path], None], suffix: str, asked: Mapping[str, str], folder: Path
+) -> Path:
+    selection = _selection(asked)
+    found = data.query(
+        cloud,
+        selection.robot,
+        selection.stream,
+        selection.start_us,
+        selection.end_us,
+        most=MOST_VALUES,
+    )
+    if not len(found):
+        raise StationError("no samples in this range")
+    path = folder / _name(selection, suffix, found.refused)
+    write(found, path)
+    return path
+
+
+def _csv(found: Result, path: Path) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        tabular.to_csv(found, file)
+
+
+def _parquet(found: Result, path: Path) -> None:
+    with path.open("wb") as file:
+        tabular.to_parquet(found, file)
+
+
+def _mcap(cloud: Cloud, asked: Mapping[str, str], folder: Path) -> Path:
+    selection = _selection(asked)
+    path, refused = folder / "export.mcap", RefusedItems()
+    with bags.mcap(path) as file:
+        if not export.write(cloud, selection, _Bounded(file), refused=refused):
+            raise StationError("no samples in this range")
+    return path.rename(folder / _name(selection, ".mcap", refused.count))
+
+
+class _Bounded:
+    """A recording that refuses more than `MOST_BYTES`."""
+
+    def __init__(self, file: Recording) -> None:
+        self._file, self._left = file, MOST_BYTES
+        self.ros2 = file.ros2
+
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str, *, ros2: bool = False) -> Write:
+        write = self._file.topic(topic, kind, definition, md5sum, ros2=ros2)
+
+        def bounded(t_ns: int, message: bytes) -> None:
+            self._left -= len(message)
+            if self._left < 0:
+                raise StationError(
+                    f"the range has over {MOST_BYTES:,} bytes: choose a shorter one, or run `iort export`"
+                )
+            write(t_ns, message)
+
+        return bounded
+
+
+def _selection(asked: Mapping[str, str]) -> Selection:
+    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    return data.select(text(asked, "robot"), text(asked, "stream"), start_us, end_us)
+
+
+def _name(selection: Selection, suffix: str, refused: int) -> str:
+    """car7-vesc-20260504T100000Z.csv, or ...Z-2-left-out.csv, which says so wherever it goes.
+
+    Every file system takes these names.
+    """
+    start = iso_s(selection.start_us or 0).replace("-", "").replace(":", "")
+    left_out = f"-{refused}-left-out" if refused else ""
+    return f"{selection.robot}-{selection.stream}-{start}{left_out}{suffix}"

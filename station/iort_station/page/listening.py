@@ -19,7 +19,8 @@ from iort_contract.topics import LIVE, check_robot, parse_topic
 from iort_station.cloud import Cloud
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page.live.heard import Heard, OnUpdate, heard_of
+from iort_station.page.live import Heard, OnUpdate, heard_of
+from iort_station.page.page import load_keys
 
 
 class Listening(Protocol):
@@ -51,15 +52,14 @@ def listening(
     if live != PUBNUB:
         return BrokerListener(cloud, robot=robot, on_update=on_update)
     # Without PubNub nobody needs its SDK.
-    from iort_station.page import keys  # noqa: PLC0415 - as above
-    from iort_station.page.live.listener import Listener  # noqa: PLC0415 - as above
+    from iort_station.page.pubnub import Listener  # noqa: PLC0415 - as above
 
     return Listener(
         robot=robot,
         namespace=cloud.namespace,
         on_update=on_update,
         token=token,
-        **keys.load(cloud).reading(),
+        **load_keys(cloud).reading(),
     )
 
 

@@ -1,1 +1,0 @@
-"""What the analysis says of drives: findings, a car's calibration, laps."""

@@ -1,0 +1,204 @@
+"""Writes a robot's samples into a recording: messages as published, or made of samples."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from iort_analysis.archive.hours import key_of
+from iort_analysis.archive.stored import Origin, PageProgress
+from iort_analysis.samples.batches import Item, RefusedItems
+from iort_contract.dynamodb import plain, with_samples_between
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, messages_of
+from iort_contract.messages.message_type import ROS2, MessageType
+from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
+from iort_contract.ros1.message import filled
+from iort_station import data
+from iort_station.cloud import Cloud
+from iort_station.data import inventory, ros_messages
+from iort_station.data.bags import Recording, Write
+from iort_station.data.recorded import Recorded
+from iort_station.data.selection import Selection
+from iort_station.fleet import files
+
+# Gives the content of an uploaded file by its key; None if the file is missing.
+Content = Callable[[str], "bytes | None"]
+
+
+class Published(NamedTuple):
+    """A message: the sample's time, the id of its type, and its bytes."""
+
+    t_us: int
+    type_id: str
+    raw: bytes
+
+
+class Export:
+    """Reads a selection's messages. ``types`` are those that the robot has declared, by id.
+
+    While it reads, ``types`` grows by the types that only batches name. ``others`` counts samples that are
+    not messages; ``empty`` counts messages that have an empty array instead of a missing file.
+    """
+
+    def __init__(
+        self,
+        cloud: Cloud,
+        selection: Selection,
+        types: Mapping[str, MessageType],
+        content: Content,
+        origin: Origin | None = None,
+    ) -> None:
+        self.types = dict(types)
+        self.others = self.empty = 0
+        self._recorded = Recorded(cloud, selection.robot, selection.stream, origin=origin)
+        self.refused = self._recorded.refused
+        self._selection, self._content = selection, content
+        self._layouts = {name: kind.layout for name, kind in types.items()}
+
+    def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
+        """The messages, in order of their batches' times."""
+        keys = with_samples_between(self._selection.start_us, self._selection.end_us)
+        for items in self._recorded.items(keys, progress=progress):
+            for item in items:
+                yield from self._of(item)
+
+    def _of(self, item: Item) -> Sequence[Published]:
+        try:
+            batch, ros_messages = messages_of(plain(item), self._layouts)
+        except ContractError as error:
+            self.refused.add(error, key_of(item))
+            return ()
+        inside = [i for i, t_us in enumerate(batch.times_us) if self._selection.holds_time(t_us)]
+        if ros_messages is None:
+            self.others += len(inside)
+            return ()
+        if ros_messages.type_id not in self.types and not ros_messages.layout:
+            self.refused.add(ContractError(f"the type {ros_messages.type_id} is not declared"), batch.id)
+            return ()
+        if ros_messages.type_id not in self.types:
+            kind, _, definition = ros_messages.layout.partition("\n")
+            stream = self._selection.stream
+            self.types[ros_messages.type_id] = MessageType(stream, f"/{stream}", kind, "", definition)
+        name, raws = ros_messages.type_id, ros_messages.raw
+        try:
+            return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
+        except ContractError as error:
+            self.refused.add(error, batch.id)
+            return ()
+
+    def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
+        """The message with its files' contents: the content that was cut out last comes back first."""
+        places = [name for name in batch.columns if name.endswith(f".{ATTACHMENT_AT}")]
+        for place in reversed(places):
+            at, field = batch.columns[place][i], place[: -len(ATTACHMENT_AT) - 1]
+            # A message may itself have a field of that name.
+            if type(at) is not int or not all(
+                f"{field}.{part}" in batch.columns for part in ATTACHMENT_FIELDS
+            ):
+                continue
+            key, sha256 = (batch.columns[f"{field}.{part}"][i] for part in ("key", "sha256"))
+            content = self._content(key) if isinstance(key, str) else None
+            if content is None or hashlib.sha256(content).hexdigest() != sha256:
+                # The places of the contents before it are no longer known.
+                self.empty += 1
+                break
+            raw = filled(raw, content, at)
+        return raw
+
+
+Say = Callable[[str], None]
+
+
+def write(
+    cloud: Cloud,
+    selection: Selection,
+    file: Recording,
+    *,
+    origin: Origin | None = None,
+    refused: RefusedItems | None = None,
+    say: Say = lambda _line: None,
+    progress: PageProgress = lambda _more, _last_us: None,
+) -> int:
+    """Write the messages of a selection and return their number; ``say`` takes lines about the result,
+    ``origin`` grows by what comes from the archive, and ``refused`` counts what cannot be exported.
+
+    ROS messages are written as they were published, and those of ROS 2 in its form if ``file`` can hold it.
+    Other samples become messages of the type that their source gave, or of their fields.
+    """
+    robot, stream = selection.robot, selection.stream
+    known = {name: kind for name, (_, kind) in ros_messages.types(cloud, robot, stream).items()}
+    export = Export(cloud, selection, known, lambda key: files.content(cloud, key), origin)
+    counts: dict[str, int] = {}
+    writers: dict[str, Write] = {}
+    for t_us, name, raw in export.messages(progress):
+        if name not in writers:
+            kind = export.types[name]
+            ros2 = kind.converted_from == ROS2
+            writers[name] = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum, ros2=ros2)
+        writers[name](t_us * 1000, raw)
+        counts[name] = counts.get(name, 0) + 1
+    for name, count in counts.items():
+        kind = export.types[name]
+        form = "as they were published"
+        if kind.converted_from == ROS2:
+            form = "of ROS 2, converted to ROS 1 when they were recorded"
+            form += " and back for this file" if file.ros2 else ""
+        say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, {form}")
+        if name not in known:
+            say("  its definition is not stored, so topic, comments and constants are not the publisher's")
+    if refused is not None:
+        refused.count += export.refused.count
+    if export.refused.count:
+        say(f"{export.refused.count:,} stored items cannot be exported; the first: {export.refused.reason}")
+    if export.empty:
+        say(f"{export.empty} messages have an empty array: their content was not kept, or is not uploaded")
+    made = _make(cloud, selection, file, known, say) if export.others else 0
+    if not counts and not made and not export.refused.count:
+        inventory.check_there(cloud, robot, stream)
+        say(f"{robot} {stream}: no samples in this range")
+    return sum(counts.values()) + made
+
+
+def _make(
+    cloud: Cloud, selection: Selection, file: Recording, known: Mapping[str, MessageType], say: Say
+) -> int:
+    """Write messages made of the samples that are not ROS messages, and return their number."""
+    robot, stream = selection.robot, selection.stream
+    blocks = data.samples(cloud, selection, refused=RefusedItems(), messages=False)
+    # If topics share a stream, nobody can tell which one a selection of fields belongs to.
+    shared = len({kind.topic for kind in known.values()}) > 1
+    kind = None if shared else next(iter(reversed(list(known.values()))), None)
+    makers: dict[tuple[tuple[str, str], ...], tuple[ros_messages.Maker, Write]] = {}
+    numbers, written = itertools.count(), 0
+    for block in blocks:
+        # While a robot drives, fields come and go, and the kind of a field's values may change.
+        shape = tuple(sorted((name, column.dtype.kind) for name, column in block.columns.items()))
+        if shape not in makers:
+            made = kind or ros_messages.made_of(stream, block.columns)
+            maker = ros_messages.Maker(made, list(block.columns), own=kind is None, numbers=numbers)
+            topic = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
+            makers[shape] = maker, topic
+        maker, write_one = makers[shape]
+        for t_ns, message in maker.messages(block):
+            write_one(t_ns, message)
+            written += 1
+    if not makers:
+        return 0
+    made = maker.kind
+    say(f"{robot} {stream}: {written:,} messages of {made.kind} on {made.topic}, made of samples")
+    if shared:
+        say(f"several topics of {robot} share {stream}, so the type is made of the selected fields")
+    elif kind is None:
+        say(f"{robot} has not sent the type of {stream}, so the type is made of its fields")
+    if len(makers) > 1 and kind is None:
+        say(f"its fields changed, so there are {len(makers)} types of that name")
+    lacking = {name for maker, _ in makers.values() for name in maker.lacking}
+    foreign = {name for maker, _ in makers.values() for name in maker.foreign}
+    if lacking:
+        say(f"missing in some or all samples, so zero or empty: {', '.join(sorted(lacking))}")
+    if foreign:
+        say(f"not in the type, so left out: {', '.join(sorted(foreign))}")
+    return written

@@ -1,1 +1,0 @@
-"""What an operator makes a robot do: commands, driving, the emergency stop, settings by the shadow."""

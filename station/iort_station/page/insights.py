@@ -1,0 +1,275 @@
+"""What is known of drives, for the live page: findings, analysed drives, laps, and people's notes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import islice
+
+import numpy as np
+
+from iort_analysis.errors import AnalysisError
+from iort_analysis.mining.laps.compare import compare
+from iort_analysis.results import Mined
+from iort_analysis.samples.blocks import Column
+from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS
+from iort_contract.catalog.analysis.parameters import GROUPS, LAPS_TABLE, PLACES_TABLE
+from iort_contract.messages.analysis.findings import Estimate, Finding
+from iort_contract.messages.analysis.insights import (
+    AnalysisAnswer,
+    AnalysisStarted,
+    DeltaAnswer,
+    DriveEntry,
+    EstimateEntry,
+    FindingEntry,
+    InsightsAnswer,
+    LapsAnswer,
+    NotesAnswer,
+)
+from iort_contract.messages.analysis.run import AnalysedDrive, AnalysisRequest
+from iort_contract.messages.page import Answer
+from iort_contract.topics import check_robot
+from iort_station.cloud import Cloud
+from iort_station.data import findings as stored
+from iort_station.data.runs import laps_within
+from iort_station.errors import StationError
+from iort_station.fleet import registry
+from iort_station.operations import analysis
+from iort_station.operations.monitoring.alarms import user
+from iort_station.page.requests import text, whole
+
+# What is shown of a robot, and of each one of the fleet.
+_DRIVES, _FINDINGS = 60, 60
+_FLEET_DRIVES, _FLEET_FINDINGS = 3, 10
+_READERS = 8
+# The page asks for days; a year is more than it offers.
+_LONGEST_S = 366 * 86_400
+
+
+def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
+    """The newest findings and drives of ``robot``; without one, of all robots."""
+    robots = [check_robot(asked["robot"])] if asked.get("robot") else sorted(registry.presence(cloud))
+    drives, findings = (_DRIVES, _FINDINGS) if asked.get("robot") else (_FLEET_DRIVES, _FLEET_FINDINGS)
+    table = stored.findings_table(cloud)
+
+    def of(robot: str) -> tuple[list[Finding], list[AnalysedDrive]]:
+        return list(islice(table.findings(robot), findings)), list(table.drives(robot, most=drives))
+
+    with ThreadPoolExecutor(_READERS) as pool:
+        found = list(pool.map(of, robots))
+    told = [finding for some, _ in found for finding in some]
+    return {
+        "findings": [_finding(finding) for finding in _newest(told)],
+        "drives": sorted(
+            [*_failed(told), *(_drive(drive) for _, some in found for drive in some)],
+            key=lambda drive: -drive["from_us"],
+        ),
+        "groups": {
+            group: {p.name: {"unit": p.unit, "meaning": p.meaning, "worse": p.worse} for p in parameters}
+            for group, parameters in GROUPS.items()
+        },
+    }
+
+
+def analyse(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisStarted:
+    """Start an analysis of the drives of the last ``last_s``: of ``robot``, or of all robots without one."""
+    last_us = whole(asked, "last_s", 1, _LONGEST_S) * 1_000_000
+    robots = (check_robot(asked["robot"]),) if asked.get("robot") else ()
+    now_us = time.time_ns() // 1000
+    run = analysis.start(cloud, AnalysisRequest(robots, now_us - last_us, now_us, again=True))
+    return {"run": run.rpartition(":")[2]}
+
+
+def progress(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisAnswer:
+    """How far the ``run`` of an analysis is; raises `StationError` if it has failed."""
+    found = analysis.look(cloud, analysis.named(cloud, text(asked, "run")))
+    return {"running": found.state == analysis.RUNNING, "drives": found.drives, "done": found.done}
+
+
+def estimate(of: Estimate) -> EstimateEntry:
+    """An estimate as the page has it."""
+    return {"value": of.value, "low": of.low, "high": of.high, "unit": of.unit}
+
+
+def _newest(findings: Iterable[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda finding: -finding.from_us)
+
+
+def _finding(finding: Finding) -> FindingEntry:
+    kind = KINDS.get(finding.kind)
+    return {
+        "id": finding.id,
+        "robot": finding.drive.robot,
+        "start_us": finding.drive.start_us,
+        "from_us": finding.from_us,
+        "to_us": finding.to_us,
+        "kind": finding.kind,
+        "severity": "info" if kind is None else kind.severity,
+        # A later version may have had other kinds.
+        "meaning": finding.kind.replace("_", " ") if kind is None else kind.meaning,
+        "action": "" if kind is None else kind.action,
+        "subject": finding.subject,
+        "stream": finding.stream,
+        "fields": list(finding.fields),
+        "text": finding.text,
+        "effect": None if finding.effect is None else estimate(finding.effect),
+        "baseline": None if finding.baseline is None else estimate(finding.baseline),
+        "q": finding.q,
+    }
+
+
+def _drive(drive: AnalysedDrive) -> DriveEntry:
+    return {
+        "robot": drive.drive.robot,
+        "from_us": drive.drive.start_us,
+        "to_us": drive.end_us + 1,
+        "samples": drive.samples,
+        "failed": "",
+        "repairs": dict(drive.repairs),
+        "estimates": {name: estimate(one) for name, one in drive.estimates.items()},
+        "missing": dict(drive.missing),
+    }
+
+
+def _failed(findings: Iterable[Finding]) -> list[DriveEntry]:
+    """The drives that could not be analysed, which are findings."""
+    return [
+        {
+            "robot": finding.drive.robot,
+            "from_us": finding.drive.start_us,
+            "to_us": max(finding.to_us, finding.drive.start_us + 1),
+            "samples": 0,
+            "failed": finding.text,
+            "repairs": {},
+            "estimates": {},
+            "missing": {},
+        }
+        for finding in findings
+        if finding.kind == ANALYSIS_FAILED
+    ]
+
+
+# An hour of a VESC at 100 Hz and of its pose.
+_MOST_VALUES = 10_000_000
+# A viewer compares several laps of a drive, whose samples are read once.
+_KEPT_LAPS = 8
+
+
+def laps_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """The answers about laps, by their names."""
+
+    @lru_cache(_KEPT_LAPS)
+    def found(robot: str, start_us: int, end_us: int) -> Mined:
+        return laps_within(cloud, robot, start_us, end_us, most=_MOST_VALUES)
+
+    def of(asked: Mapping[str, str]) -> Mined:
+        start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+        return found(check_robot(text(asked, "robot")), start_us, end_us)
+
+    return {
+        "laps": lambda asked: _laps(of(asked)),
+        "delta": lambda asked: _delta(
+            of(asked), whole(asked, "one", 1, 10**6), whole(asked, "other", 1, 10**6)
+        ),
+    }
+
+
+def _laps(mined: Mined) -> LapsAnswer:
+    table = mined.tables.get(LAPS_TABLE)
+    estimates = {name: estimate(one) for name, one in mined.estimates.items()}
+    if table is None:
+        reason = next(iter(mined.missing.values()), "no laps")
+        return {"laps": [], "method": "", "confidence": 0.0, "reason": reason, "estimates": estimates}
+    numbers = {name: _known(column) for name, column in table.items() if column.dtype.kind == "f"}
+    return {
+        "laps": [
+            {
+                "lap": int(table["lap"][i]),
+                "from_us": int(start_us),
+                "to_us": int(start_us) + round(float(table["time_s"][i]) * 1e6),
+                "time_s": float(table["time_s"][i]),
+                "distance_m": numbers["distance_m"][i],
+                "energy_wh": numbers["energy_wh"][i],
+                "energy_wh_per_km": numbers["energy_wh_per_km"][i],
+                "mean_speed_mps": numbers["mean_speed_mps"][i],
+                "top_speed_mps": numbers["top_speed_mps"][i],
+                "complete": bool(table["complete"][i]),
+                "best": bool(table["best"][i]),
+            }
+            for i, start_us in enumerate(table["start_us"])
+        ],
+        "method": str(table["method"][0]),
+        "confidence": float(table["confidence"][0]),
+        "reason": "",
+        "estimates": estimates,
+    }
+
+
+def _delta(mined: Mined, one: int, other: int) -> DeltaAnswer:
+    if PLACES_TABLE not in mined.tables:
+        raise StationError(next(iter(mined.missing.values()), "no laps"))
+    try:
+        found = compare(mined.tables[PLACES_TABLE], one, other)
+    except AnalysisError as error:
+        raise StationError(str(error)) from error
+    places = found["place_m"]
+    in_metres = bool(np.isfinite(places).all())
+    return {
+        "places": (places if in_metres else np.linspace(0, 100, len(places))).tolist(),
+        "unit": "m" if in_metres else "%",
+        "delta_s": found["delta_s"].tolist(),
+        "one_mps": _known(found["one_mps"]),
+        "other_mps": _known(found["other_mps"]),
+    }
+
+
+def _known(column: Column) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in column]
+
+
+_NOTES = 200
+
+
+def notes_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """The answer ``notes``."""
+    return {"notes": lambda asked: notes(cloud, asked)}
+
+
+def notes_actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """What writes and deletes notes, by its name."""
+    return {
+        "note": lambda asked: write_note(cloud, asked),
+        "delete_note": lambda asked: remove_note(cloud, asked),
+    }
+
+
+def notes(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+    """The newest notes about ``robot``, or about the fleet; those from ``from_us`` to ``to_us``, if given."""
+    robot = check_robot(asked["robot"]) if asked.get("robot") else None
+    start_us, end_us = (
+        whole(asked, name, 0, 2**53) if name in asked else None for name in ("from_us", "to_us")
+    )
+    found = stored.notes(cloud, robot, start_us, end_us, most=_NOTES)
+    return {
+        "notes": [
+            {"id": one.id, "robot": one.robot, "t_us": one.t_us, "text": one.text, "by": one.by}
+            for one in found
+        ]
+    }
+
+
+def write_note(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+    """Write a note with ``text`` about ``robot`` at ``t_us``, or about now."""
+    robot = text(asked, "robot")
+    t_us = whole(asked, "t_us", 0, 2**53) if "t_us" in asked else None
+    stored.write_note(cloud, robot, text(asked, "text"), by=user(), t_us=t_us)
+    return notes(cloud, {"robot": robot})
+
+
+def remove_note(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+    """Delete the note ``id`` of ``robot``."""
+    robot = text(asked, "robot")
+    stored.remove_note(cloud, robot, text(asked, "id"))
+    return notes(cloud, {"robot": robot})
