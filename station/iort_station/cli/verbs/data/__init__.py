@@ -1,1 +1,1 @@
-"""Commands that read recorded samples. They use `iort_station.data` and `iort_station.recordings`."""
+"""Commands that read recorded samples. They use `iort_station.data`."""
