@@ -15,13 +15,12 @@ except ModuleNotFoundError as missing:
     sys.exit(f"app.py: no module {missing.name} for {sys.executable}: `make layer` sets up .venv/bin/python")
 
 from stacks.account import Account
+from stacks.acknowledged import Acknowledged, acknowledge
 from stacks.analysis import Analysis
 from stacks.archive import Archive
-from stacks.checks.acknowledged import Acknowledged, acknowledge
-from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.fleet import Fleet
-from stacks.ingest import Ingest
-from stacks.monitoring.stack import Monitoring
+from stacks.ingest import Ingest, refuse_what_the_embedded_cloud_drops
+from stacks.monitoring import Monitoring
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings, SettingsError

@@ -15,10 +15,9 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import botocore.session
 from botocore.config import Config
 
-from functions.shared.environment import variables
+from functions.shared.clients import connect, variables
 from functions.shared.metrics import emit
 from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.limits import ContractError
@@ -38,7 +37,6 @@ from iort_contract.topics import check_robot
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
-    from types_boto3_iot import IoTClient
 
 _log = logging.getLogger(__name__)
 
@@ -161,15 +159,13 @@ def _text(values: Mapping[str, Any], name: str) -> str:
 
 @cache
 def _dynamodb() -> DynamoDBClient:
-    # botocore alone: boto3 adds S3 transfers, a fifth of the time until the first answer.
-    client = botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
-    return cast("DynamoDBClient", client)
+    return connect("dynamodb", config=_CONFIG)
 
 
 def _status(certificate: str) -> str | None:
     """A certificate's status at AWS IoT; None if it was deleted."""
     # Its model is large and rarely needed.
-    iot = cast("IoTClient", botocore.session.get_session().create_client("iot", config=_CONFIG))
+    iot = connect("iot", config=_CONFIG)
     try:
         answer = iot.describe_certificate(certificateId=certificate)
     except iot.exceptions.ResourceNotFoundException:

@@ -14,8 +14,8 @@ from datetime import datetime, timezone
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from functions.shared import clients, mails
-from functions.shared.environment import variables
+from functions.shared import clients
+from functions.shared.clients import variables
 from functions.shared.metrics import emit
 from iort_contract.catalog.environments import AlertEnvironment
 from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
@@ -133,7 +133,7 @@ def _notices() -> Notices:
 
 
 def _notify(subject: str, text: str) -> None:
-    mails.send(variables(AlertEnvironment).alarm_topic, subject, text)
+    clients.send(variables(AlertEnvironment).alarm_topic, subject, text)
 
 
 def handler(event: dict[str, Any], _context: object) -> None:

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from functions.shared import clients
-from functions.shared.analysis import recordings
-from functions.shared.analysis.kept import Kept
-from functions.shared.analysis.recordings import Recordings
-from functions.shared.environment import variables
+from functions.shared import clients, recordings
+from functions.shared.analysis import Kept
+from functions.shared.clients import variables
+from functions.shared.recordings import Recordings
 from iort_analysis.archive.tables import write_table
 from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse

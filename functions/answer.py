@@ -1,4 +1,4 @@
-"""Answer: answers the questions of robots, or says why not. functions/shared/questions has the answers."""
+"""Answer: answers the questions of robots, or says why not. `functions.shared.questions` has the answers."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from functions.shared import clients
-from functions.shared.dead_letter import DeadLetterQueue, refused_event
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from functions.shared.metrics import emit
-from functions.shared.questions.bodies import Bodies, check_size
-from functions.shared.questions.work import RefusedError, Work, work_of
-from functions.shared.quota import HOUR, Quota
+from functions.shared.questions import WORK, Bodies, RefusedError, Work, check_size
+from functions.shared.queues import DeadLetterQueue, refused_event
+from functions.shared.quotas import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
 from iort_contract.limits import ContractError
@@ -47,7 +46,7 @@ class Desk(NamedTuple):
     """What an answer takes: the answers themselves, the robots' quotas, the bucket, the way to the robot, and
     the queue before the quarantine, which says if it took a text."""
 
-    work_of: Callable[[Question], Work]
+    work: Mapping[str, Work]
     quota_of: Callable[[Question], Quota]
     bodies: Bodies
     reply: Callable[[Topic, Answer], None]
@@ -84,7 +83,7 @@ def serve(event: Mapping[str, Any], function_arn: str, desk: Desk, now_s: float)
 def operators(event: Mapping[str, Any]) -> dict[str, Any]:
     """Answer an operator's ``robot``, ``question`` and ``body``, without quota or deadline."""
     try:
-        return {"body": work_of(_known(event["question"]))(check_robot(event["robot"]), event["body"])}
+        return {"body": WORK[_known(event["question"]).name](check_robot(event["robot"]), event["body"])}
     except (ContractError, RefusedError) as error:
         found = error.refusal if isinstance(error, RefusedError) else Refusal(INVALID, str(error))
         return {"refused": found.reason, "text": found.text}
@@ -109,7 +108,7 @@ def _answered(
         raise RefusedError(OVER_QUOTA, f"{question.per_hour} an hour, and only of registered robots")
     if isinstance(body, Content):
         body = desk.bodies.read(topic.robot, question, body)
-    found = desk.work_of(question)(topic.robot, body)
+    found = desk.work[question.name](topic.robot, body)
     text, most = to_json(found), question.max_answer_bytes
     if len(text) > most:
         raise RefusedError(TOO_LARGE, f"the answer must have at most {most} bytes, got {len(text)}")
@@ -154,6 +153,6 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, Any] | None:
     given = variables(AnswerEnvironment)
     queue = DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue)
     bodies = Bodies(clients.s3(), given.files_bucket, clients.s3_for_robots())
-    desk = Desk(work_of, _quota_of, bodies, _reply, queue.keep)
+    desk = Desk(WORK, _quota_of, bodies, _reply, queue.keep)
     serve(event, context.invoked_function_arn, desk, time.time())
     return None

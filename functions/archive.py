@@ -1,7 +1,8 @@
 """Archive: moves finished hours of every stream from the telemetry table to Parquet in the files' bucket.
 
 The schedule says every hour what is due, and once a day that what has lost its mark is to be found; the
-operator says `iort archive run`. What is to be done becomes tasks in the function's own queue.
+operator says `iort archive run`. What is to be done becomes tasks in the function's own queue. Nothing
+expires before it is in the archive: the expiry of late items is put off.
 """
 
 from __future__ import annotations
@@ -9,13 +10,219 @@ from __future__ import annotations
 import json
 import logging
 import time
-from typing import Any
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
 
-from functions.shared.archive.archive import archive
-from functions.shared.archive.expiry import put_off
-from functions.shared.archive.planning import plan_due, plan_sweeps, sweep
-from iort_contract.archive import ALL, ARCHIVE, DUE, DUE_MS, HOUR, JOIN, PUT_OFF, SWEEP, TASK, Pending
-from iort_contract.tables import TOPIC
+from functions.shared.archive import Archive, archive
+from functions.shared.metrics import emit
+from functions.shared.queues import send_all
+from iort_contract.archive import (
+    ALL,
+    ARCHIVE,
+    DUE,
+    DUE_MS,
+    FIRST_DUE_MS,
+    HOUR,
+    HOUR_REST_MS,
+    HOUR_US,
+    JOIN,
+    PUT_OFF,
+    SAFE_UNTIL_S,
+    SWEEP,
+    TASK,
+    Hour,
+    Pending,
+    hour_of,
+    hours_between,
+    parse_hour,
+    stored_hours,
+)
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.dynamodb import plain, starting_between, whole
+from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, ROBOT, STREAMS, TOPIC
+from iort_contract.topics import RECORD, build_topic, parse_topic
+
+_DAY_S = 86_400
+PUT_OFF_S = 30 * _DAY_S
+
+
+def margin_s(retention_s: int) -> int:
+    """An hour that is not archived this long before its items expire has their expiry put off."""
+    return min(retention_s // 10, 7 * _DAY_S)
+
+
+def put_off(archive: Archive, pending: Pending, now_ms: int) -> int:
+    """Put off the expiry of an hour's items that expire soon; returns their number."""
+    hour, now_s = parse_hour(pending.period), now_ms // 1000
+    margin = margin_s(archive.given.retention_s)
+    safe_s, count = now_s + PUT_OFF_S, 0
+    keys = starting_between(hour.start_us, hour.end_us - 1)
+    for page in archive.telemetry.pages(pending.topic, keys, attributes=(TOPIC, BATCH, EXPIRES_S)):
+        for item in page.items:
+            expires_s = whole(item, EXPIRES_S)
+            if expires_s is None:
+                continue
+            if expires_s > now_s + margin:
+                safe_s = min(safe_s, expires_s)
+                continue
+            # One that has gone meanwhile must not come back as a row of an expiry alone.
+            with suppress(archive.client.exceptions.ConditionalCheckFailedException):
+                archive.client.update_item(
+                    TableName=archive.telemetry.name,
+                    Key={name: item[name] for name in (TOPIC, BATCH)},
+                    UpdateExpression="SET #expires = :expires, #put_off = :expires",
+                    ConditionExpression="#expires = :before",
+                    ExpressionAttributeNames={"#expires": EXPIRES_S, "#put_off": PUT_OFF_TO_S},
+                    ExpressionAttributeValues={
+                        ":expires": {"N": str(now_s + PUT_OFF_S)},
+                        ":before": item[EXPIRES_S],
+                    },
+                )
+                count += 1
+    archive.marks.keep(pending, **{SAFE_UNTIL_S: safe_s})
+    emit("archive", ExpiriesPutOff=count)
+    return count
+
+
+# A mark that is due for longer than this waits for something to be mended.
+OVERDUE_MS = 3 * 3_600_000
+# Batches that keep coming delay their hour by no more than this.
+_DELAYED_MS = 3_600_000
+# Hours and days of a robot that an hourly plan queues. A car with 200 streams has as many an hour; what is
+# beyond keeps its mark for the next plan, and its expiry is put off like that of any late hour.
+MOST_OF_A_ROBOT = 250
+# What expires within two nights, a sweep must find.
+_SOON_S = 2 * 86_400
+# A night's sweep counts the hours that begin to expire soon within a day, and two hours more.
+_COUNTED_S = 26 * 3600
+
+
+class QueueError(Exception):
+    """The queue did not take all tasks; the next run sends them again."""
+
+
+def plan_due(archive: Archive, now_ms: int) -> dict[str, int]:
+    """Queue every hour and day that is due, and every expiry that must be put off."""
+    tasks: list[dict[str, Any]] = []
+    overdue, waiting, queued = 0, 0, Counter[str]()
+    for pending, row in archive.marks.every():
+        due_ms = int(row[DUE_MS]["N"])
+        first_ms = int(row[FIRST_DUE_MS if FIRST_DUE_MS in row else DUE_MS]["N"])
+        if due_ms > now_ms and first_ms > now_ms - _DELAYED_MS:
+            continue
+        is_late = first_ms < now_ms - OVERDUE_MS
+        overdue += is_late
+        safe_s = int(row[SAFE_UNTIL_S]["N"]) if SAFE_UNTIL_S in row else 0
+        if is_late and not pending.is_day and safe_s <= now_ms // 1000 + margin_s(archive.given.retention_s):
+            tasks.append(_task(PUT_OFF, pending))
+        robot = parse_topic(pending.topic).robot
+        if queued[robot] == MOST_OF_A_ROBOT:
+            waiting += 1
+            continue
+        queued[robot] += 1
+        tasks.append({**_task(JOIN if pending.is_day else ARCHIVE, pending), DUE_MS: due_ms})
+    _send(archive, tasks)
+    emit("archive", TasksOverdue=overdue)
+    return {"tasks": len(tasks), "overdue": overdue, "waiting": waiting}
+
+
+def plan_sweeps(archive: Archive) -> dict[str, int]:
+    """Queue a sweep of every stream in the registry."""
+    tasks = [{TASK: SWEEP, TOPIC: topic} for topic in _topics(archive)]
+    _send(archive, tasks)
+    return {"tasks": len(tasks)}
+
+
+def _topics(archive: Archive) -> Iterator[str]:
+    pages = archive.client.get_paginator("scan").paginate(
+        TableName=archive.given.robots_table,
+        ProjectionExpression="#robot, #streams",
+        ExpressionAttributeNames={"#robot": ROBOT, "#streams": STREAMS},
+    )
+    for page in pages:
+        for item in page["Items"]:
+            row = plain(item)
+            for stream in sorted({VESC_STREAM, *OWN_STREAMS, *row.get(STREAMS, ())}):
+                yield build_topic(RECORD, row[ROBOT], stream, archive.given.namespace)
+
+
+def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str, int]:
+    """Queue the hours of a stream that are over and not archived: those that expire soon, which have lost
+    their mark, or ``every`` one, also with batches that came late.
+
+    An archived hour that begins to expire soon, also one of a clock that was wrong, is counted once more: a
+    late batch may have lost its mark.
+    """
+    retention_s = archive.given.retention_s
+    soon_s = min(retention_s, max(2 * margin_s(retention_s), _SOON_S))
+    until_us = (now_ms - HOUR_REST_MS) * 1000
+    if not every:
+        until_us -= (retention_s - soon_s) * 1_000_000
+    # The hours of a clock that is ahead are over when their items have long expired.
+    ahead_us = now_ms * 1000 + HOUR_US
+    stored = [
+        *stored_hours(archive.telemetry, topic, until_us),
+        *stored_hours(archive.telemetry, topic, None, from_us=ahead_us),
+    ]
+    archived = _archived(archive, topic, min([*stored, hour_of(until_us)]))
+    marks = archive.marks.every() if every else ()
+    marked = {pending.period for pending, _ in marks if pending.topic == topic}
+    found = [Pending(topic, str(hour)) for hour in stored if str(hour) in marked or str(hour) not in archived]
+    if not every:
+        soon_s += now_ms // 1000
+        found += [
+            Pending(topic, hour)
+            for hour, row in archived.items()
+            if soon_s - _COUNTED_S < row.first_expires_s <= soon_s
+            and _count(archive, topic, parse_hour(hour)) > row.items
+        ]
+    for pending in found:
+        if not every:
+            archive.marks.add(pending, 0)
+    tasks = [_task(ARCHIVE, pending) for pending in found]
+    _send(archive, tasks)
+    return {"tasks": len(tasks)}
+
+
+class _Archived(NamedTuple):
+    """What a row of the manifest says: the number of items, and when the first of them expires."""
+
+    items: int
+    first_expires_s: int
+
+
+def _archived(archive: Archive, topic: str, first: Hour) -> dict[str, _Archived]:
+    """The archived hours since the first one."""
+    attributes = (HOUR, "batches", "refused", "first_expires_s")
+    pages = archive.manifest.pages(topic, hours_between(first, None), attributes=attributes)
+    rows = (plain(item) for page in pages for item in page.items)
+    return {
+        row[HOUR]: _Archived(int(row["batches"] + row["refused"]), int(row["first_expires_s"]))
+        for row in rows
+    }
+
+
+def _count(archive: Archive, topic: str, hour: Hour) -> int:
+    """The number of items in the table."""
+    keys = starting_between(hour.start_us, hour.end_us - 1)
+    return sum(len(page.items) for page in archive.telemetry.pages(topic, keys, attributes=(BATCH,)))
+
+
+def _task(kind: str, pending: Pending) -> dict[str, Any]:
+    return {TASK: kind, TOPIC: pending.topic, HOUR: pending.period}
+
+
+def _send(archive: Archive, tasks: Iterable[Mapping[str, Any]]) -> None:
+    # AWS recognises a robot with many tasks by its group, and serves the others first: "SQS fair queues".
+    messages = [
+        {"MessageBody": json.dumps(task), "MessageGroupId": parse_topic(task[TOPIC]).robot} for task in tasks
+    ]
+    if left := send_all(archive.queue, archive.given.archive_queue, messages):
+        raise QueueError(f"{len(left)} of {len(messages)} tasks are not queued")
+
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -52,8 +259,7 @@ def perform(task: dict[str, Any], now_ms: int) -> dict[str, int]:
 
 def _write(task: dict[str, Any], now_ms: int) -> dict[str, int]:
     # Only here is pyarrow needed: expiries are put off even where it fails to load.
-    from functions.shared.archive.days import join_day  # noqa: PLC0415 - see above
-    from functions.shared.archive.hours import archive_hour  # noqa: PLC0415 - see above
+    from functions.shared.archive_writer import archive_hour, join_day  # noqa: PLC0415 - see above
 
     pending = Pending(task[TOPIC], task[HOUR])
     if DUE_MS in task and archive().marks.due_ms(pending) is None:

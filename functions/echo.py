@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.dead_letter import DeadLetterQueue, refused_event
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from functions.shared.metrics import emit
+from functions.shared.queues import DeadLetterQueue, refused_event
 from iort_contract.catalog.environments import EchoEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError

@@ -11,9 +11,8 @@ from itertools import chain
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.analysis.failures import failed_plans, failure, waits
-from functions.shared.analysis.kept import Kept
-from functions.shared.environment import variables
+from functions.shared.analysis import Kept, failed_plans, failure, waits
+from functions.shared.clients import variables
 from iort_analysis.drives.finding import LONGEST_US
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.results import DriveResult, Measured, decode_result

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from functions.shared.summary.processing import processed, stored_tables
-from functions.shared.summary.share import waiting
+from functions.shared.share import waiting
+from functions.shared.summary import processed, stored_tables
 from functions.shared.tables import Tables
 from iort_contract.tables import BATCH, TOPIC
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.dead_letter import DeadLetterQueue, refused_event
-from functions.shared.delay_estimator import DelayEstimator
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from functions.shared.metrics import Gathered, emit
 from functions.shared.pubnub_client import NotConfiguredError, PublishError, StoredPublisher
-from functions.shared.rate_limiter import RateLimiter
+from functions.shared.queues import DeadLetterQueue, refused_event
+from functions.shared.quotas import RateLimiter
 from iort_contract.catalog.environments import LiveEnvironment
 from iort_contract.catalog.vesc import absent
 from iort_contract.cloud import channel
@@ -24,6 +24,49 @@ from iort_contract.messages.event import event_message
 from iort_contract.messages.live import LiveSample, decode_live, live_update
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import parse_topic
+
+_ROBOTS = 1000
+_WINDOW_MS = 15_000
+
+
+@dataclass
+class _Run:
+    """The fastest message of the current window and of the previous one."""
+
+    boot: str
+    began_ms: int
+    fastest_us: int
+    fastest_before_us: int
+
+
+class DelayEstimator:
+    """Compares each message with the fastest of its run in the last 15 to 30 s.
+
+    Both contain the difference between the car's clock and the cloud's, so it cancels out. It misses a delay
+    that all messages of half a minute share, and that of the first message of a run or of a new environment.
+    It serves the cars that do not know their clock offset (`iort_contract.LiveSample`). After a car's clock
+    is set back, its messages look late until the window has passed. Each environment keeps one, for the
+    thousand robots that sent last, and the latest run of each: robots know each other's run names, and must
+    not act for another.
+    """
+
+    def __init__(self) -> None:
+        self._runs: OrderedDict[str, _Run] = OrderedDict()
+
+    def excess_us(self, robot: str, boot: str, sent_us: int, received_ms: int) -> int:
+        """Note a message of a robot's run; return its delay above the fastest, in microseconds."""
+        leg_us = received_ms * 1000 - sent_us
+        run = self._runs.pop(robot, None)
+        if run is None or run.boot != boot:
+            run = _Run(boot, received_ms, leg_us, leg_us)
+        self._runs[robot] = run
+        if len(self._runs) > _ROBOTS:
+            self._runs.popitem(last=False)
+        if received_ms - run.began_ms >= _WINDOW_MS:
+            run.began_ms, run.fastest_before_us, run.fastest_us = received_ms, run.fastest_us, leg_us
+        run.fastest_us = min(run.fastest_us, leg_us)
+        return leg_us - min(run.fastest_us, run.fastest_before_us)
+
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)

@@ -18,12 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from functions.shared import clients
-from functions.shared.analysis import recordings
-from functions.shared.analysis.failures import NOT_COMPARED, failed_plans
-from functions.shared.analysis.kept import Kept
-from functions.shared.analysis.recordings import Recordings
-from functions.shared.environment import variables
+from functions.shared import clients, recordings
+from functions.shared.analysis import NOT_COMPARED, Kept, failed_plans
+from functions.shared.clients import variables
+from functions.shared.recordings import Recordings
 from iort_analysis.drives.finding import STAND_US, Found, Heard, find
 from iort_analysis.drives.motion import Motion, motion_among
 from iort_analysis.samples.batches import Item, RefusedItems, blocks

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from functions.shared.metrics import emit
 from iort_contract import tables
 from iort_contract.catalog.environments import RegistryEnvironment

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from functions.shared import clients, mails
-from functions.shared.analysis.failures import failure
-from functions.shared.analysis.kept import Kept
-from functions.shared.environment import variables
+from functions.shared import clients
+from functions.shared.analysis import Kept, failure
+from functions.shared.clients import variables
 from iort_contract.catalog.analysis.kinds import KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.cloud import drive_prefix, findings_key
@@ -73,7 +72,7 @@ def mail(finding: Finding, page_url: str) -> tuple[str, str]:
 
 
 def _notify(subject: str, text: str) -> None:
-    mails.send(variables(PresentEnvironment).alarm_topic, subject, text)
+    clients.send(variables(PresentEnvironment).alarm_topic, subject, text)
 
 
 def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:

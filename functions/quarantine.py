@@ -17,13 +17,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import boto3
 from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared import clients
-from functions.shared.environment import variables
+from functions.shared.clients import connect, variables
 from functions.shared.metrics import emit
-from functions.shared.summary.share import waiting
+from functions.shared.share import waiting
 from iort_contract import tables
 from iort_contract.archive import HOUR, TASK
 from iort_contract.catalog.environments import QuarantineEnvironment
@@ -269,4 +268,4 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the rejected queue's mapping."""
     given = variables(QuarantineEnvironment)
     store = Store(clients.dynamodb(), table=given.quarantine_table, retention_s=given.retention_s)
-    return process(event, store, lambda info: Stream(boto3.client("dynamodbstreams")).records(info))
+    return process(event, store, lambda info: Stream(connect("dynamodbstreams")).records(info))

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any
 
 from functions.shared import clients
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from functions.shared.tables import Tables
 from iort_contract import expression
 from iort_contract.catalog.derived import DERIVED, derive

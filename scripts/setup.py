@@ -98,7 +98,7 @@ def steps(*, layer: bool, checkov: bool, docs: bool, oldest: str | None) -> Iter
     locked = "package-lock.json"
     yield Step("node", "CDK and page packages", (locked,), (".venv/bin/npm ci --no-progress",))
     yield Step("page", "live page", ("station/web/**/*", locked), (".venv/bin/npm run build",))
-    made_of = ("requirements/layer.txt", "scripts/layer.py", "stacks/parts/target.py")
+    made_of = ("requirements/layer.txt", "scripts/layer.py", "stacks/__init__.py")
     local = (".venv/bin/python -m scripts.layer local",)
     yield Step("layer-local", "Lambda layer, this machine", made_of, local)
     if layer:

@@ -10,8 +10,8 @@ from aws_cdk import App, ArnFormat
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 
-from stacks.parts import iot_core
-from stacks.parts.base import PlatformStack
+from stacks import parts
+from stacks.parts import PlatformStack
 from stacks.settings import Settings
 
 # The "Audit checks" of certificates, policies, clients and Cognito's identities. The others concern role
@@ -65,7 +65,7 @@ class Account(PlatformStack):
             self._log(settings.iot_log_level)
 
     def _audit(self) -> None:
-        role = iot_core.role(self, "AuditRole")
+        role = parts.iot_role(self, "AuditRole")
         role.add_to_policy(iam.PolicyStatement(actions=[*_AUDIT_READS], resources=["*"]))
         on = iot.CfnAccountAuditConfiguration.AuditCheckConfigurationProperty(enabled=True)
         audit = iot.CfnAccountAuditConfiguration(
@@ -87,7 +87,7 @@ class Account(PlatformStack):
         daily.node.add_dependency(audit)
 
     def _log(self, level: str) -> None:
-        role = iot_core.role(self, "LogRole")
+        role = parts.iot_role(self, "LogRole")
         streams = self.format_arn(
             service="logs",
             resource="log-group",

@@ -24,11 +24,9 @@ from iort_contract.catalog.environments import (
     PresentEnvironment,
 )
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
-from stacks.parts.base import PlatformStack
-from stacks.parts.function import allow, function
-from stacks.parts.layers import arrays
-from stacks.parts.states import LONGEST_S, states
+from stacks.parts import PlatformStack, allow, arrays, function
 from stacks.settings import Settings
+from stacks.states import LONGEST_S, states
 from stacks.storage import Storage
 
 # Lambda gives a whole core at 1769 MB, and these functions compute. A robot-hour takes two seconds.

@@ -8,11 +8,8 @@ from aws_cdk import aws_lambda as lambda_
 from iort_contract.archive import ARCHIVE_PREFIX, DUE, SWEEP, TASK
 from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, TOPIC
-from stacks.parts import layers
-from stacks.parts.base import PlatformStack
-from stacks.parts.function import allow, function
-from stacks.parts.queue import queue
-from stacks.parts.schedule import schedules
+from stacks import parts
+from stacks.parts import PlatformStack, allow, function, queue, schedules
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -42,7 +39,7 @@ class Archive(PlatformStack):
             memory_mb=_MEMORY_MB,
             timeout_s=_TIMEOUT_S,
             scratch_mb=_SCRATCH_MB,
-            layers=layers.arrays(self),
+            layers=parts.arrays(self),
             arrays=True,
         )
         storage.telemetry.grant(archive, "dynamodb:Query")

@@ -3,27 +3,210 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
-from aws_cdk import App, CfnOutput, Duration
+from aws_cdk import App, CfnOutput, Duration, Stack
+from aws_cdk import aws_cognito as cognito
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 
 from iort_contract.catalog.environments import RegistryEnvironment
-from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.tables import PRESENCE
-from stacks.parts import iot_core, viewers
-from stacks.parts.base import PlatformStack
-from stacks.parts.documents import claim_policy, provisioning_template, robot_policy
-from stacks.parts.function import allow, function, invoked_by_rule
+from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
+from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix, fleet_name
+from iort_contract.tables import PRESENCE, ROBOT_PARAMETER, SERIAL_PARAMETER
+from iort_contract.topics import ASK, CMD, FLEET, LIVE, RECORD, SHADOW, VIEW, rule_name
+from stacks import parts
+from stacks.parts import PlatformStack, allow, function, invoked_by_rule
 from stacks.quarantine import Quarantine
-from stacks.settings import Settings
+from stacks.settings import ALL_ROBOTS, Settings
 from stacks.storage import Storage
+
+_COGNITO = "cognito-identity.amazonaws.com"
+
+
+def viewer(stack: PlatformStack) -> None:
+    """The role of a viewer, who sees every car and may ask it for its live messages (`VIEW`)."""
+    _person(stack, VIEWER, publishes=[VIEW])
+
+
+def driver(stack: PlatformStack) -> None:
+    """The role of a driver: a viewer who may also send commands."""
+    _person(stack, DRIVER, publishes=[VIEW, CMD])
+
+
+def public_identity(stack: PlatformStack) -> None:
+    """The identity of the page on the web: anybody gets one, without a password, and it only listens.
+
+    For an unauthenticated identity AWS IoT asks the IAM role alone, and no IoT policy ("Authorization with
+    Amazon Cognito identities"). It may publish nothing, so it cannot wake a car. It does not hear the agent's
+    log, nor who drives.
+    """
+    pool = cognito.CfnIdentityPool(
+        stack,
+        "PublicPool",
+        allow_unauthenticated_identities=True,
+        # The basic flow would hand out a token with which anybody chooses the session's name and length.
+        allow_classic_flow=False,
+    )
+    principal = iam.WebIdentityPrincipal(
+        _COGNITO,
+        {
+            "StringEquals": {f"{_COGNITO}:aud": pool.ref},
+            "ForAnyValue:StringLike": {f"{_COGNITO}:amr": "unauthenticated"},
+        },
+    )
+    role = iam.Role(stack, "PublicRole", assumed_by=principal)
+    _listens(stack, role, VIEWER, robots=stack.settings.site_robots)
+    withheld = [f"{LIVE}/{stack.settings.namespace}/*/{stream}" for stream in (LOG_STREAM, DRIVE_STREAM)]
+    # Its subscriptions name no stream, so what counts is the refusal of each message.
+    _rule(stack, role, "Receive", "topic", withheld, allow=False)
+    _rule(stack, role, "Subscribe", "topicfilter", withheld, allow=False)
+    cognito.CfnIdentityPoolRoleAttachment(
+        stack, "PublicRoles", identity_pool_id=pool.ref, roles={"unauthenticated": role.role_arn}
+    )
+    CfnOutput(stack, "PublicPoolId", value=pool.ref)
+    CfnOutput(stack, "PublicRobots", value=",".join(stack.settings.site_robots))
+
+
+def _person(stack: PlatformStack, name: str, *, publishes: list[str]) -> None:
+    """A role that people and programs of this account may assume, if their own policy says so."""
+    role = iam.Role(stack, name.capitalize(), assumed_by=iam.AccountRootPrincipal())
+    _listens(stack, role, name, robots=ALL_ROBOTS)
+    topics = [f"{lane}/{stack.settings.namespace}/*" for lane in publishes]
+    _rule(stack, role, "Publish", "topic", topics)
+    CfnOutput(stack, f"{name.capitalize()}Role", value=role.role_arn)
+
+
+def _listens(stack: PlatformStack, role: iam.Role, client: str, *, robots: list[str]) -> None:
+    namespace = stack.settings.namespace
+    named = [f"{LIVE}/{namespace}/{robot}/*" for robot in robots]
+    heard = [f"{LIVE}/{namespace}/*"] if robots == ALL_ROBOTS else named
+    _rule(stack, role, "Connect", "client", [f"{client_prefix(client, namespace)}*"])
+    _rule(stack, role, "Subscribe", "topicfilter", heard)
+    _rule(stack, role, "Receive", "topic", heard)
+
+
+def _rule(
+    stack: Stack, role: iam.Role, action: str, kind: str, names: list[str], *, allow: bool = True
+) -> None:
+    arns = [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
+    effect = iam.Effect.ALLOW if allow else iam.Effect.DENY
+    role.add_to_policy(iam.PolicyStatement(effect=effect, actions=[f"iot:{action}"], resources=arns))
+
+
+# A robot's name is its thing name and its client id; the certificate is attached to the thing.
+_ME = "${iot:Connection.Thing.ThingName}"
+# The policy has no room for each topic by itself, so patterns cover several. In a policy ? is any one
+# character, and * any number of them ("Using wildcard characters in MQTT and AWS IoT Core policies").
+# A robot subscribes to its pongs, and to its own ping on the path broker.
+_PING_OR_PONG = "p?ng"
+# Of its own lanes this also allows view: a robot can wake nobody but itself.
+_LIVE_OR_PING = "?i??"
+# No other lane has a w there.
+_ANSWER_OR_VIEW = "???w*"
+
+
+def provisioning_template(namespace: str) -> dict[str, Any]:
+    """The template's body. An existing thing keeps its attributes, and another serial number is refused, so
+    that two robots cannot share a name."""
+    name = fleet_name(namespace)
+    return {
+        "Parameters": {ROBOT_PARAMETER: {"Type": "String"}, SERIAL_PARAMETER: {"Type": "String"}},
+        "Resources": {
+            "certificate": {
+                "Type": "AWS::IoT::Certificate",
+                "Properties": {"CertificateId": {"Ref": "AWS::IoT::Certificate::Id"}, "Status": "Active"},
+            },
+            "policy": {"Type": "AWS::IoT::Policy", "Properties": {"PolicyName": name}},
+            "thing": {
+                "Type": "AWS::IoT::Thing",
+                "Properties": {
+                    "ThingName": {"Ref": ROBOT_PARAMETER},
+                    "ThingTypeName": name,
+                    "ThingGroups": [name],
+                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": SERIAL_PARAMETER}},
+                },
+                "OverrideSettings": {
+                    "AttributePayload": "FAIL",
+                    "ThingTypeName": "FAIL",
+                    "ThingGroups": "DO_NOTHING",
+                },
+            },
+        },
+    }
+
+
+def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a lasting claim: it allows provisioning with this fleet's template only."""
+    asked = (
+        "$aws/certificates/create-from-csr/json",
+        f"$aws/provisioning-templates/{fleet_name(namespace)}/provision/json",
+    )
+    answered = [f"{topic}/{answer}" for topic in asked for answer in ("accepted", "rejected")]
+    client = f"{claim_name(namespace)}-*"
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            _allow("iot:Connect", _arns(stack, "client", client)),
+            _allow("iot:Publish", _arns(stack, "topic", *asked)),
+            _allow("iot:Subscribe", _arns(stack, "topicfilter", *answered)),
+            _allow("iot:Receive", _arns(stack, "topic", *answered)),
+        ],
+    }
+
+
+def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a robot: its own topics and shadow, and other robots' messages to the fleet.
+
+    AWS allows 2048 characters without white space; a test checks that with the longest names. What a robot
+    receives it has subscribed to, so the lanes stand in the statement for subscriptions alone.
+    """
+    mine = f"{namespace}/{_ME}"
+    shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
+    publish = (
+        # Basic Ingest has the rule in the topic; only these rules are allowed.
+        f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
+        f"$aws/rules/{rule_name('live', namespace)}/{LIVE}/{mine}/*",
+        f"{_LIVE_OR_PING}/{mine}/*",
+        f"{FLEET}/{mine}/*",
+        f"{ASK}/{mine}/*",
+    )
+    # What every robot hears.
+    heard_by_all = (f"{FLEET}/{namespace}/*",)
+    subscribe = (
+        f"{CMD}/{mine}/*",
+        f"{_PING_OR_PONG}/{mine}/*",
+        f"{_ANSWER_OR_VIEW}/{mine}/*",
+        *heard_by_all,
+        f"{shadow}/*",
+    )
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            {
+                **_allow("iot:Connect", _arns(stack, "client", _ME)),
+                "Condition": {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}},
+            },
+            _allow("iot:Publish", _arns(stack, "topic", *publish)),
+            _allow(["iot:Publish", "iot:Receive"], _arns(stack, "topic", f"{shadow}/*")),
+            _allow("iot:Subscribe", _arns(stack, "topicfilter", *subscribe)),
+            _allow("iot:Receive", _arns(stack, "topic", f"*/{mine}/*", *heard_by_all)),
+        ],
+    }
+
+
+def _allow(action: str | list[str], resources: list[str]) -> dict[str, Any]:
+    return {"Effect": "Allow", "Action": action, "Resource": resources}
+
+
+def _arns(stack: Stack, kind: str, *names: str) -> list[str]:
+    return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
 
 
 class Fleet(PlatformStack):
     """The resources to register robots. One policy serves all robots: its variables restrict each certificate
-    to the topics of its thing. Viewers and drivers have roles (`stacks.parts.viewers`).
+    to the topics of its thing. Viewers and drivers have roles (`stacks.fleet`).
 
     The function Admit decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
     """
@@ -68,15 +251,15 @@ class Fleet(PlatformStack):
             template_body=json.dumps(provisioning_template(namespace)),
         )
         template_arn = self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name)
-        asking = iot_core.may_call(self, "AdmitPermission", admit, source_arn=template_arn)
+        asking = parts.may_call(self, "AdmitPermission", admit, source_arn=template_arn)
         # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
-        viewers.viewer(self)
+        viewer(self)
         if settings.drivers:
-            viewers.driver(self)
+            driver(self)
         if settings.public:
-            viewers.public_identity(self)
+            public_identity(self)
         CfnOutput(self, "LiveTransport", value=settings.live_transport)
 
     def _admit(self, storage: Storage) -> lambda_.Function:
@@ -102,7 +285,7 @@ class Fleet(PlatformStack):
         AWS does not document the actions that it needs. Its managed policy AWSIoTThingsRegistration has them,
         on every resource; this role has the same actions, without those that this template never uses.
         """
-        role = iot_core.role(self, "ProvisioningRole")
+        role = parts.iot_role(self, "ProvisioningRole")
 
         def allow(actions: list[str], *resources: tuple[str, str]) -> None:
             arns = [self.format_arn(service="iot", resource=r, resource_name=n) for r, n in resources]

@@ -41,10 +41,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
-from stacks.parts.base import PlatformStack
-from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
-from stacks.parts.layers import arrays
-from stacks.parts.queue import queue
+from stacks.parts import RUNTIME, PlatformStack, allow, arrays, function, invoked_by_rule, queue
 from stacks.quarantine import Quarantine
 from stacks.settings import LEAST_OF_A_QUEUE, Settings
 from stacks.storage import Storage

@@ -12,9 +12,7 @@ from aws_cdk import App
 from aws_cdk import aws_lambda as lambda_
 
 from iort_contract.catalog.environments import QuarantineEnvironment
-from stacks.parts.base import PlatformStack
-from stacks.parts.function import function
-from stacks.parts.queue import queue
+from stacks.parts import PlatformStack, function, queue
 from stacks.settings import LEAST_OF_A_QUEUE, Settings
 from stacks.storage import Storage
 

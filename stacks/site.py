@@ -14,7 +14,7 @@ from aws_cdk import aws_s3 as s3
 
 from iort_contract.cloud import PUBNUB
 from iort_contract.page import HEADERS, pubnub_address, security_policy
-from stacks.parts.base import PlatformStack
+from stacks.parts import PlatformStack
 from stacks.settings import Settings
 
 _HSTS = Duration.days(365)

@@ -11,8 +11,7 @@ from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
-from stacks.parts.base import PlatformStack
-from stacks.parts.encryption import Encryption
+from stacks.parts import Encryption, PlatformStack
 from stacks.settings import Settings
 
 # Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from iort_contract.catalog.environments import Environment
 from iort_contract.catalog.metrics import (
     METRIC_DEPLOYMENT,

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import quote
 
-import boto3
 import urllib3
 from botocore.exceptions import BotoCoreError, ClientError
 from pubnub.enums import PNStatusCategory
@@ -19,6 +18,7 @@ from pubnub.pubnub import PubNub
 from pubnub.request_handlers.base import BaseRequestHandler
 from pubnub.structures import Envelope, PlatformOptions, RequestOptions
 
+from functions.shared.clients import connect
 from iort_contract.limits import MAX_PUBNUB_BYTES
 
 _log = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ class PubNubPublisher:
 
         Raises `NotConfiguredError` if there are none, and `PublishError` if they cannot be read.
         """
-        ssm = boto3.client("ssm")
+        ssm = connect("ssm")
         try:
             answer = ssm.get_parameter(Name=name, WithDecryption=True)
         except ssm.exceptions.ParameterNotFound as error:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_contract.tables import BATCH, ITEM_BASE64, REASON, TOPIC
+
 if TYPE_CHECKING:
     from types_boto3_sqs import SQSClient
+
 
 _log = logging.getLogger(__name__)
 # SendMessageBatch: at most ten messages, of 256 KiB together.
@@ -45,3 +50,69 @@ def _calls(messages: Sequence[Mapping[str, Any]]) -> Iterator[list[int]]:
         size += bytes_
     if places:
         yield places
+
+
+# The limit of a single message.
+_MOST_BYTES = 1024 * 1024
+
+
+class Refused(NamedTuple):
+    """A stream record that cannot be decoded: its sequence number, the reason, and the item as DynamoDB
+    JSON."""
+
+    number: str
+    reason: str
+    image: Mapping[str, Any]
+
+
+class DeadLetterQueue:
+    """Sends refused messages to the quarantine's queue."""
+
+    def __init__(self, client: SQSClient, queue_url: str) -> None:
+        self._client, self._queue_url = client, queue_url
+
+    def refuse(self, refused: Sequence[Refused]) -> list[Refused]:
+        """Send each record; return those that the queue did not take."""
+        messages = [{"MessageBody": message(one)} for one in refused]
+        return [refused[place] for place in sorted(send_all(self._client, self._queue_url, messages))]
+
+    def keep(self, body: str) -> bool:
+        """Send one body made by `message` or `refused_event`; return whether the queue took it."""
+        try:
+            self._client.send_message(QueueUrl=self._queue_url, MessageBody=body)
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("the queue did not take a refused message: %s", error)
+            return False
+        return True
+
+
+def message(refused: Refused) -> str:
+    """The queue's message. The item is in base64, since its text may hold characters that SQS refuses.
+
+    An item too large as JSON (a number of four characters on the wire may have 126 digits there) is replaced
+    by its key. A record that the queue never takes would block its shard.
+    """
+    body = _body(refused.reason, refused.image)
+    if len(body) > _MOST_BYTES:
+        key = {name: refused.image[name] for name in (TOPIC, BATCH) if name in refused.image}
+        body = _body(f"too large for the queue, see the telemetry table; {refused.reason}", key)
+    return body
+
+
+def refused_event(function_arn: str, event: Any, reason: str) -> str:
+    """The queue's message for an event that a function refused without failing.
+
+    It has the form of Lambda's record of a failed invocation ("Destination event format")."""
+    return json.dumps(
+        {
+            "requestContext": {"functionArn": function_arn, "condition": "Refused"},
+            "requestPayload": event,
+            "responsePayload": {"errorMessage": reason[:1000]},
+        }
+    )
+
+
+def _body(reason: str, item: Mapping[str, Any]) -> str:
+    text = json.dumps(item, separators=(",", ":"), ensure_ascii=False)
+    encoded = base64.b64encode(text.encode("utf-8", "surrogatepass")).decode()
+    return json.dumps({REASON: reason[:1000], ITEM_BASE64: encoded})

@@ -12,7 +12,7 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from functions.shared.archive.marks import Marks
+from functions.shared.archive import Marks
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between

@@ -29,7 +29,7 @@ from iort_contract.topics import (
     record_topic,
     rule_name,
 )
-from stacks.parts.documents import claim_policy, robot_policy
+from stacks.fleet import claim_policy, robot_policy
 from tests.messages_page import named, rows, section
 from tests.policy import allows
 

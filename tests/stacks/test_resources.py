@@ -14,10 +14,10 @@ from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.bill.model import RECORDS_A_CALL, WINDOW_S
-from stacks.checks.invariants import granted, several
-from stacks.checks.variations import EVERYTHING
+from stacks.checks import granted, several
 from stacks.settings import A_ROBOTS_MOST, Settings
 from stacks.storage import VERSIONS_DAYS
+from stacks.variations import EVERYTHING
 from tests.stacks.templates import Reader, layers, name
 from tests.stacks.updates.test_flips import identity
 

@@ -9,8 +9,7 @@ from iort_contract.catalog import environments
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
-from stacks.parts.base import PlatformStack
-from stacks.parts.function import function
+from stacks.parts import PlatformStack, function
 from stacks.settings import ROOT, Settings, SettingsError
 from tests.stacks.monitoring.test_dashboards import FUNCTIONS
 from tests.stacks.templates import layers, name

@@ -1,6 +1,6 @@
 """The questions that a robot may ask the function answer.
 
-To add one, add an entry, and ``functions/shared/questions/<name>.py`` with its answer.
+To add one, add an entry, and a function with its answer in ``functions/shared/questions.py``.
 """
 
 from __future__ import annotations

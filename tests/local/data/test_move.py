@@ -18,7 +18,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from functions.shared.bucket import Bucket, metadata
+from functions.upload import Bucket, metadata
 from iort_contract.cloud import IOT
 from iort_contract.messages.batch import BatchId
 from iort_contract.messages.requests.files import PART_BYTES, File, file_key

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from stacks.checks.acknowledged import Acknowledged, single
+from stacks.acknowledged import Acknowledged, single
 from stacks.settings import ROOT, Settings
 
 

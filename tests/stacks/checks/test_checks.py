@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from stacks.checks.invariants import EVERY_RESOURCE, broken
+from stacks.checks import EVERY_RESOURCE, broken
 from tests.stacks.checks.test_checkers import check_stacks  # noqa: F401 - a fixture
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_namespace
-from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
-from stacks.parts.states import LONGEST_S, states
 from stacks.settings import AtOnce
+from stacks.states import LONGEST_S, states
+from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
 # "CloudFormation quotas". The CDK passes every template through S3; a request may hold only 51,200 bytes.

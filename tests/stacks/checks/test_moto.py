@@ -17,7 +17,7 @@ from moto.server import ThreadedMotoServer
 
 from iort_station.cloud import Cloud, without_proxy
 from local.deployment import CommandLine
-from stacks.checks.variations import VARIATIONS
+from stacks.variations import VARIATIONS
 from tests.stacks.checks.moto_gaps import ACCOUNT, REGION, UNKNOWN, passed_over, unknown, without_gaps
 
 # Dev with the defaults, and prod with every option: its own key, mail, budget, site, robot

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from iort_contract.catalog.rules import RULES
-from stacks.checks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
+from stacks.ingest import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
 
 GOOD = {
@@ -81,7 +81,7 @@ def refused(tmp_path_factory):
     from aws_cdk import App, Stack
     from aws_cdk import aws_iot as iot
 
-    from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
+    from stacks.ingest import refuse_what_the_embedded_cloud_drops
 
     rule = iot.CfnTopicRule
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))

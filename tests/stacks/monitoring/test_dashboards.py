@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from functions.shared.summary.health import measure
+from functions.shared.summary import measure
 from iort_contract.catalog.metrics import METRIC_NAMESPACE, METRICS, metrics_of
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM

@@ -17,7 +17,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import SHADOW
-from stacks.checks.invariants import EVERY_RESOURCE, LOG_DELIVERY
+from stacks.checks import EVERY_RESOURCE, LOG_DELIVERY
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 STATES = "arn:${AWS::Partition}:states:${AWS::Region}:${AWS::AccountId}"

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from stacks.checks.grants import BEYOND, meet, unfit
-from stacks.checks.variations import VARIATIONS
+from stacks.checks import BEYOND, meet, unfit
+from stacks.variations import VARIATIONS
 from tests.stacks.checks.test_checkers import check_stacks  # noqa: F401 - a fixture
 
 IOT = "arn:aws:iot:eu-west-1:123456789012"

@@ -8,10 +8,10 @@ import re
 
 from functions.alert import Notices, causes
 from functions.presence import change
-from functions.shared.quota import DAY, Quota
+from functions.shared.quotas import DAY, Quota
 from iort_contract.tables import ADMISSION, FILES_BYTES, FILES_DAY
-from stacks.checks.invariants import EVERY_RESOURCE
-from stacks.parts.documents import provisioning_template
+from stacks.checks import EVERY_RESOURCE
+from stacks.fleet import provisioning_template
 from tests.stacks.permissions.roles import (
     CERTIFICATES,
     CHANGES,

@@ -10,8 +10,8 @@ from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import check_namespace
-from stacks.parts.documents import claim_policy
-from stacks.parts.documents import robot_policy as robots_policy
+from stacks.fleet import claim_policy
+from stacks.fleet import robot_policy as robots_policy
 from tests.stacks.permissions.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from stacks.checks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
 from stacks.settings import CONTEXT_KEYS
+from stacks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
 from tests.stacks.cloudformation import create_only, identity, is_replaced
 
 Templates = dict[str, dict[str, Any]]

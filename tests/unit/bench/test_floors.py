@@ -9,7 +9,7 @@ import pytest
 from bench.floors.functions import live as live_floor
 from bench.floors.functions import summarize as summarize_floor
 from bench.load.simulated import RATE_HZ, simulated_drive
-from functions.shared.summary.processing import process
+from functions.shared.summary import process
 from iort_contract.codec.columns import DICTIONARY
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from scripts.layer import LAMBDA, LAYERS, LOCAL, ROOT, Layer, build, trim
-from stacks.parts.code import FOLDERS
+from stacks.parts import FOLDERS
 
 # The second word of an unchecked-hash .pyc: PEP 552.
 UNCHECKED_HASH = 0b01

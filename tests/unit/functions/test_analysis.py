@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from functions import analyse, evaluate, plan, present
-from functions.shared.analysis import recordings
-from functions.shared.analysis.kept import Kept
+from functions.shared import recordings
+from functions.shared.analysis import Kept
 from iort_analysis.archive.tables import read_table
 from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result

@@ -13,9 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions import live
-from functions.live import REFUSALS, Lane, RefusedError, age_ms
+from functions.live import REFUSALS, DelayEstimator, Lane, RefusedError, age_ms
 from functions.quarantine import entries
-from functions.shared.delay_estimator import DelayEstimator
 from functions.shared.pubnub_client import PublishError, PubNubPublisher, StoredPublisher
 from iort_contract.catalog.environments import LiveEnvironment
 from iort_contract.catalog.metrics import metrics_of

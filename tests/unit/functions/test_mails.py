@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from functions.shared.mails import SUBJECT_CHARACTERS, subject_line
+from functions.shared.clients import SUBJECT_CHARACTERS, subject_line
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import itertools
 import json
 from decimal import Decimal
 
-import boto3
 import pytest
+from botocore.exceptions import ClientError
 
 from functions import presence
 from iort_contract.catalog.metrics import metrics_of
@@ -182,7 +182,7 @@ def _changes_nothing(table, event, capsys):
 
 def test_an_error_of_dynamodb_is_raised_so_that_lambda_retries(table, monkeypatch):
     monkeypatch.setenv("ROBOTS_TABLE", "gone")
-    with pytest.raises(boto3.client("dynamodb").exceptions.ResourceNotFoundException):
+    with pytest.raises(ClientError, match="ResourceNotFoundException"):
         presence.handler(connected(), None)
 
 

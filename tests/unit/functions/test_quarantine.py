@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.quarantine import Entry, Store, Stream, entries, process
-from functions.shared.dead_letter import DeadLetterQueue, Refused, message
+from functions.shared.queues import DeadLetterQueue, Refused, message
 from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
 from tests.fakes import QUARANTINE, TOPIC_OF_CAR

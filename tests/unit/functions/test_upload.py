@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from functions import upload
 from functions.quarantine import entries
-from functions.shared.bucket import Bucket
-from functions.shared.quota import DAY, Quota
+from functions.shared.quotas import DAY, Quota
+from functions.upload import Bucket
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
 from iort_contract.messages.event import rule_event

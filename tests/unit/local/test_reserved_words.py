@@ -70,7 +70,7 @@ def test_the_projects_expressions_are_found():
     assert {where.split(":")[0] for where, _ in FOUND} >= {
         "functions/admit.py",
         "functions/alert.py",
-        "functions/shared/quota.py",
+        "functions/shared/quotas.py",
         "functions/presence.py",
         "functions/quarantine.py",
         "functions/shared/tables.py",

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.shared import tables as tables_module
-from functions.shared.summary.processing import process
+from functions.shared.summary import process
 from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
 from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard, Stream

@@ -13,8 +13,8 @@ import pytest
 from functions.analyse import analysed
 from functions.plan import planned
 from functions.query import answer
-from functions.shared.analysis.recordings import Recordings
-from functions.shared.summary.processing import recompute
+from functions.shared.recordings import Recordings
+from functions.shared.summary import recompute
 from iort_analysis.archive.hours import Stores
 from iort_analysis.samples.batches import RefusedItems
 from iort_contract.archive import ArchiveTable

@@ -31,7 +31,7 @@ from verify.tools.uploading import trust
 _IOT = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _COGNITO = "https://docs.aws.amazon.com/cognito/latest/developerguide"
 _ASSUMED = f"{_IOT}/iam-users-groups-roles.html and {_IOT}/protocols.html"
-_RELIED = ("stacks/parts/viewers.py", "station/iort_station/fleet/roles.py")
+_RELIED = ("stacks/fleet.py", "station/iort_station/fleet/roles.py")
 _HEARD, _SENT = "GRANTED_QOS_1", "SUCCESS"
 
 Connect = Callable[[], Person]
@@ -157,7 +157,7 @@ def signed_address(target: Target) -> Seen:
     },
     source=f"{_IOT}/cog-iot-policies.html and {_COGNITO}/iam-roles.html",
     phase=CHANGED,
-    relied_on_by=("stacks/parts/viewers.py", "station/web/src/link/socket_address.ts"),
+    relied_on_by=("stacks/fleet.py", "station/web/src/link/socket_address.ts"),
 )
 def everybody(target: Target) -> Seen:
     """Amazon Cognito gives anybody an identity and credentials without a signature. With these a signed

@@ -119,7 +119,7 @@ def claim_for_minutes(target: Target) -> Seen:
     relied_on_by=(
         "station/iort_station/fleet/identity.py",
         "functions/admit.py",
-        "stacks/parts/documents.py",
+        "stacks/fleet.py",
     ),
 )
 def claim_that_lasts(target: Target) -> Seen:

@@ -40,7 +40,7 @@ def session_taken_over(target: Target) -> Seen:
     "broker.another_client_id",
     expected={"neighbours": True, "one_that_nobody_has": True},
     source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
-    relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/failures.py"),
+    relied_on_by=("stacks/fleet.py", "device/iort_agent/mqtt/failures.py"),
 )
 def another_client_id(target: Target) -> Seen:
     """A robot's certificate can connect only with the robot's own name as client id."""
@@ -57,7 +57,7 @@ def another_client_id(target: Target) -> Seen:
     "broker.foreign_topic",
     expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
     source=_MQTT,
-    relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/dispatch.py"),
+    relied_on_by=("stacks/fleet.py", "device/iort_agent/mqtt/dispatch.py"),
 )
 def foreign_topic(target: Target) -> Seen:
     """A robot's message to its neighbour's commands does not reach the neighbour. AWS has two answers, a

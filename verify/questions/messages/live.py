@@ -117,7 +117,7 @@ def to_subscriber(target: Target) -> Seen:
 @question(
     "live.lease",
     expected={"subscribed": "GRANTED_QOS_1", "heard": True, "to_another": "NOT_AUTHORIZED"},
-    relied_on_by=("device/iort_agent/lanes/viewers.py", "stacks/parts/documents.py"),
+    relied_on_by=("device/iort_agent/lanes/viewers.py", "stacks/fleet.py"),
 )
 def lease(target: Target) -> Seen:
     """A viewer's lease, published by the operator's HTTP request, reaches the robot, whose policy allows its

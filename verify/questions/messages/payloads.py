@@ -50,7 +50,7 @@ def live_no_json(target: Target) -> Seen:
 @question(
     "payloads.record_no_json",
     expected={"stored": 0, "refused_by": ["rule"]},
-    relied_on_by=("stacks/ingest.py", "stacks/monitoring/alarms.py"),
+    relied_on_by=("stacks/ingest.py", "stacks/monitoring.py"),
 )
 def record_no_json(target: Target) -> Seen:
     """The rule record stores nothing from a payload that is not JSON, or from a batch without a key. The

@@ -77,7 +77,7 @@ def as_catalogued(target: Target) -> Seen:
         "types": dict(sorted(_TYPES.items())),
     },
     source=f"{_SQL} and {_DYNAMODB_V2}",
-    relied_on_by=(_RULES, "functions/shared/summary/stored.py"),
+    relied_on_by=(_RULES, "functions/shared/seconds.py"),
 )
 def record_spoofed(target: Target) -> Seen:
     """The rule record stores the keys of a batch and the cloud's three, each by name. A key of the message

@@ -26,7 +26,7 @@ _ALARM = "ALARM"
 _FAULT = 5
 # With every character that a tag's value may have, beside letters and digits.
 _BY = "verify +-=._:/@"
-# The alarms that use Metrics Insights: stacks/monitoring/alarms.py.
+# The alarms that use Metrics Insights: stacks/monitoring.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
 
 
@@ -56,7 +56,7 @@ _NOTIFIED = {
     "alarms.set_state",
     expected=_NOTIFIED,
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
-    relied_on_by=("stacks/monitoring/alarms.py", "stacks/processing.py"),
+    relied_on_by=("stacks/monitoring.py", "stacks/processing.py"),
 )
 def set_state(target: Target) -> Seen:
     """An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with
@@ -126,7 +126,7 @@ set_state_with_key = replace(
     ),
     expected={**_NOTIFIED, "topic_has_key": True},
     source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
-    relied_on_by=("stacks/parts/encryption.py",),
+    relied_on_by=("stacks/parts.py",),
     phase=CHANGED,
     not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
 )
@@ -141,7 +141,7 @@ set_state_with_key = replace(
         "messages": [],
     },
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
-    relied_on_by=("stacks/monitoring/alarms.py", "stacks/monitoring/metrics.py"),
+    relied_on_by=("stacks/monitoring.py", "stacks/monitoring.py"),
     not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
 )
 def metrics_insights(target: Target) -> Seen:

@@ -21,7 +21,7 @@ from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/step-functions/latest/dg"
 _API = "https://docs.aws.amazon.com/step-functions/latest/apireference"
-_STATES = "stacks/parts/states.py"
+_STATES = "stacks/states.py"
 _SAMPLES = 30
 _DAY_US = 86_400_000_000
 
@@ -128,7 +128,7 @@ def one_drive(target: Target) -> Seen:
     "analysis.failing_drive",
     expected={"state": SUCCEEDED, "failed": 1, "next": SUCCEEDED, "failed_then": 0, "samples": [_SAMPLES]},
     source=f"{_GUIDE}/concepts-error-handling.html",
-    relied_on_by=(_STATES, "functions/present.py", "functions/shared/analysis/failures.py"),
+    relied_on_by=(_STATES, "functions/present.py", "functions/shared/analysis.py"),
 )
 def failing_drive(target: Target) -> Seen:
     """A drive whose function raises at each attempt becomes a finding, and the run ends well. The next run

@@ -75,7 +75,7 @@ def handler(event, context):
         "time_is_limited": True,
         "arn_is_a_functions": True,
     },
-    relied_on_by=("functions/shared/bucket.py", "stacks/parts/function.py", "functions/live.py"),
+    relied_on_by=("functions/upload.py", "stacks/parts.py", "functions/live.py"),
 )
 def runtime(target: Target) -> Seen:
     """boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and the
@@ -105,7 +105,7 @@ def runtime(target: Target) -> Seen:
     "functions.python",
     expected={"runs_as_named": True},
     source=f"{_GUIDE}/lambda-runtimes.html",
-    relied_on_by=("stacks/parts/function.py", "scripts/setup.py"),
+    relied_on_by=("stacks/parts.py", "scripts/setup.py"),
     not_embedded="the embedded cloud runs the functions with its host's Python",
 )
 def python(target: Target) -> Seen:
@@ -134,7 +134,7 @@ def _limit(client: Any, name: str) -> None:
     "functions.ten_at_once",
     expected={"more_than_ten_at_once": False, "throttled": True, "events_run": _CALLS},
     source=f"{_GUIDE}/lambda-concurrency.html and {_GUIDE}/invocation-async-error-handling.html",
-    relied_on_by=("stacks/settings.py", "stacks/parts/states.py", "stacks/processing.py"),
+    relied_on_by=("stacks/settings.py", "stacks/states.py", "stacks/processing.py"),
 )
 def ten_at_once(target: Target) -> Seen:
     """Of twenty calls at a limit of ten executions, which is a new account's, ten run at once, and the others

@@ -18,7 +18,7 @@ _CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _METRIC, _FUNCTION = "BatchesSummarized", "summarize"
 _WITHIN_S = 170.0
-# The filter of the log widget in stacks/monitoring/dashboards.py.
+# The filter of the log widget in stacks/monitoring.py.
 _SHOWN = re.compile("WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out")
 _WARNED, _RAISED, _PRINTED = "verify warned", "verify raised", "verify printed"
 _SPEAKING = f"""
@@ -54,8 +54,8 @@ def _counted(target: Target, since: datetime) -> float:
     f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html",
     relied_on_by=(
         "functions/shared/metrics.py",
-        "stacks/parts/function.py",
-        "stacks/monitoring/alarms.py",
+        "stacks/parts.py",
+        "stacks/monitoring.py",
         "local/gaps/metrics/embedded_metrics.py",
     ),
 )
@@ -86,7 +86,7 @@ def metric(target: Target) -> Seen:
     "logs.lines",
     expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
     relied_on_by=(
-        "stacks/monitoring/dashboards.py",
+        "stacks/monitoring.py",
         "functions/shared/metrics.py",
         "station/iort_station/operations/monitoring/log_records.py",
         "local/patches/log_records.patch",

@@ -47,7 +47,7 @@ def _soon(target: Target, schedule: str) -> Iterator[dict[str, Any]]:
     "schedules.archive",
     expected={"called": True},
     source=f"{_GUIDE}/schedule-types.html and {_GUIDE}/setting-up.html",
-    relied_on_by=("stacks/parts/schedule.py", "stacks/archive.py"),
+    relied_on_by=("stacks/parts.py", "stacks/archive.py"),
 )
 def archive(target: Target) -> Seen:
     """A one-time copy of the archive's hourly schedule calls the function, by the schedule's role and with

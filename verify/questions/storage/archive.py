@@ -83,7 +83,7 @@ def _keys(target: Target, robot: str) -> list[dict[str, Any]]:
     "archive.hour_twice",
     expected={"batches": _BATCHES, "same_row": True, "written_once": True},
     source=f"{_SQS}/standard-queues-at-least-once-delivery.html",
-    relied_on_by=("functions/shared/archive/hours.py", "stacks/archive.py"),
+    relied_on_by=("functions/shared/archive_writer.py", "stacks/archive.py"),
 )
 def hour_twice(target: Target) -> Seen:
     """A task that the queue delivers twice changes nothing: the object is not written again, and the
@@ -108,7 +108,7 @@ def hour_twice(target: Target) -> Seen:
         "damaged": {},
     },
     source=f"{_S3}/conditional-writes.html",
-    relied_on_by=("functions/shared/archive/hours.py", "functions/shared/archive/archive.py"),
+    relied_on_by=("functions/shared/archive_writer.py", "functions/shared/archive.py"),
 )
 def late_batch(target: Target) -> Seen:
     """A batch that comes after its hour was archived is added: S3 replaces the object under the condition
@@ -159,7 +159,7 @@ def read_back(target: Target) -> Seen:
     "archive.pyarrow_arm64",
     expected={"architectures": ["arm64"], "written_by_pyarrow": True},
     source=f"{_LAMBDA}/foundation-arch.html",
-    relied_on_by=("stacks/parts/layers.py", "scripts/setup.py", "analysis/iort_analysis/archive/writing.py"),
+    relied_on_by=("stacks/parts.py", "scripts/setup.py", "analysis/iort_analysis/archive/writing.py"),
     not_embedded="the embedded cloud runs the functions with its host's processor and packages",
 )
 def pyarrow_arm64(target: Target) -> Seen:

@@ -74,7 +74,7 @@ def _refused(target: Target, name: str) -> bool:
     "dynamodb.failed_condition",
     expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
     source=f"{_API}/API_UpdateItem.html",
-    relied_on_by=("functions/admit.py", "functions/shared/quota.py", "functions/alert.py"),
+    relied_on_by=("functions/admit.py", "functions/shared/quotas.py", "functions/alert.py"),
 )
 def failed_condition(target: Target) -> Seen:
     """A failed condition is an error with the current row, if the request asks for it."""

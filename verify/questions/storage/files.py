@@ -51,7 +51,7 @@ def _file(content: bytes, name: str) -> File:
     },
     source=f"{_GUIDE}/using-presigned-url.html, {_GUIDE}/conditional-requests.html and "
     "https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch",
-    relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/upload.py"),
+    relied_on_by=("functions/upload.py", "functions/upload.py", "device/iort_agent/files/upload.py"),
 )
 def in_one(target: Target) -> Seen:
     """A signed address accepts this content, of this length, under this key, once. Other bytes are refused
@@ -90,7 +90,7 @@ def in_one(target: Target) -> Seen:
         "metadata": True,
     },
     source=f"{_API}/API_CompletedPart.html and {_GUIDE}/checking-object-integrity.html",
-    relied_on_by=("functions/shared/bucket.py", "functions/upload.py"),
+    relied_on_by=("functions/upload.py", "functions/upload.py"),
 )
 def in_parts(target: Target) -> Seen:
     """A part is accepted with its SHA-256 alone; the list of parts has the SHA-256 of each, so the function

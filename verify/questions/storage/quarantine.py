@@ -30,7 +30,7 @@ def _summarized(target: Target, robot: str) -> int:
         "reason": "samples must be base64 of zlib",
         "seen": 1,
     },
-    relied_on_by=("functions/summarize.py", "functions/shared/dead_letter.py", "functions/quarantine.py"),
+    relied_on_by=("functions/summarize.py", "functions/shared/queues.py", "functions/quarantine.py"),
 )
 def refused_batch(target: Target) -> Seen:
     """A batch that Lambda 2 cannot decode goes through the queue into the quarantine's table, with its

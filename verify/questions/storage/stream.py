@@ -150,7 +150,7 @@ def bisected(target: Target) -> Seen:
     expected={"told": True, "stored": _EXPENSIVE, "summarised": _EXPENSIVE},
     source=f"{_GUIDE}/with-sqs.html and "
     "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-fair-queues.html",
-    relied_on_by=("functions/later.py", "functions/shared/summary/share.py", "stacks/processing.py"),
+    relied_on_by=("functions/later.py", "functions/shared/share.py", "stacks/processing.py"),
 )
 def put_off(target: Target) -> Seen:
     """Expensive batches of a robot that is over its share of Lambda 2 wait in a queue of their own, in the

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ministack.services import iot
 
 from functions import live
-from functions.shared.summary import stored
+from functions.shared import seconds
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
 from iort_contract.messages import viewing
@@ -45,7 +45,7 @@ def test_each_limit_has_its_value_on_the_page() -> None:
     table = {name: row for row in rows(section("### Of this project")) for name in named(row[2])}
     told = {
         "MAX_LAYOUT": MAX_LAYOUT,
-        "SECOND_BATCHES": stored.SECOND_BATCHES,
+        "SECOND_BATCHES": seconds.SECOND_BATCHES,
         "REFUSALS": live.REFUSALS,
         "REFUSALS_A_SECOND": live.REFUSALS_A_SECOND,
         "upload_gb_a_day": Settings.model_fields["upload_gb_a_day"].default,

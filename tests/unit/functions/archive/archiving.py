@@ -8,7 +8,7 @@ import json
 import boto3
 
 from functions import archive as function
-from functions.shared.archive.archive import archive as archive_of_environment
+from functions.shared.archive import archive as archive_of_environment
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import join, values

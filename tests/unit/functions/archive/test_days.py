@@ -8,7 +8,7 @@ from contextlib import nullcontext
 import pytest
 
 from functions import archive as function
-from functions.shared.archive.days import WRITING_MS, BeingWrittenError
+from functions.shared.archive_writer import WRITING_MS, BeingWrittenError
 from iort_contract.archive import HOUR, JOIN, TASK, day_key, hour_key
 from iort_contract.tables import TOPIC
 from tests.fakes import TOPIC_OF_CAR
@@ -51,7 +51,7 @@ def test_a_day_becomes_one_object_and_a_late_batch_another_one(two_hours, monkey
     # Days above the limit stay as hours.
     cloud.store(6, [8, 8, 8], HOUR_1, seq=2)
     cloud.archived(HOUR_1, LATER_MS)
-    monkeypatch.setattr("functions.shared.archive.days.MOST_BYTES", 1)
+    monkeypatch.setattr("functions.shared.archive_writer.MOST_BYTES", 1)
     assert join_day(cloud) == {"joined": False}
     assert cloud.speeds(HOUR_1) == [1, 1, 1, 7, 7, 7, 8, 8, 8]
 

@@ -9,8 +9,8 @@ import pytest
 from botocore.exceptions import ClientError
 
 from functions import archive as function
-from functions.shared.archive.expiry import PUT_OFF_S, margin_s, put_off
-from functions.shared.summary.decoded import decode_records
+from functions.archive import PUT_OFF_S, margin_s, put_off
+from functions.shared.summary import decode_records
 from iort_contract.archive import ARCHIVE, DUE, HOUR, PUT_OFF, TASK
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
 from tests.fakes import TELEMETRY, TOPIC_OF_CAR, record_of

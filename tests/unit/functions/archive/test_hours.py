@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from botocore.exceptions import ClientError
 
-from functions.shared.archive import hours
+from functions.shared import archive_writer
 from iort_contract.archive import HOUR_REST_MS, content_hash, hour_key, item_hash, refused_key
 from iort_contract.tables import BATCH, EXPIRES_S
 from tests.fakes import FILES, TELEMETRY, item_of_message
@@ -108,7 +108,7 @@ def test_killed_in_the_middle_the_next_run_ends_the_work(cloud, monkeypatch, whe
 def test_of_two_runs_at_once_the_slower_one_changes_nothing(cloud, monkeypatch):
     """A run has read the table, then a batch comes, and another run is faster."""
     cloud.store(0, [1, 1, 1])
-    real, other = hours.write_hour, []
+    real, other = archive_writer.write_hour, []
 
     def slow(*args, **kwargs):
         written = real(*args, **kwargs)
@@ -118,7 +118,7 @@ def test_of_two_runs_at_once_the_slower_one_changes_nothing(cloud, monkeypatch):
             cloud.archived()
         return written
 
-    monkeypatch.setattr(hours, "write_hour", slow)
+    monkeypatch.setattr(archive_writer, "write_hour", slow)
     with pytest.raises(ClientError, match="pre-conditions"):
         cloud.archived()
     assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
@@ -129,7 +129,7 @@ def test_of_two_runs_at_once_the_slower_one_changes_nothing(cloud, monkeypatch):
 
 def test_a_batch_that_comes_during_the_run_keeps_its_mark(cloud, monkeypatch):
     cloud.store(0, [1, 1, 1])
-    real = hours.write_hour
+    real = archive_writer.write_hour
 
     def meanwhile(*args, **kwargs):
         written = real(*args, **kwargs)
@@ -137,7 +137,7 @@ def test_a_batch_that_comes_during_the_run_keeps_its_mark(cloud, monkeypatch):
         return written
 
     with monkeypatch.context() as patched:
-        patched.setattr(hours, "write_hour", meanwhile)
+        patched.setattr(archive_writer, "write_hour", meanwhile)
         cloud.archived()
     assert cloud.speeds() == [1, 1, 1]
     assert PENDING in cloud.pending()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 from functions import archive as function
+from functions.archive import MOST_OF_A_ROBOT
 from functions.quarantine import entries
-from functions.shared.archive.marks import MARKS, MARKS_A_DAY, Marks
-from functions.shared.archive.planning import MOST_OF_A_ROBOT
+from functions.shared.archive import MARKS, MARKS_A_DAY, Marks
 from iort_contract.archive import ARCHIVE, DUE, HOUR, HOUR_REST_MS, TASK, Hour, Pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic

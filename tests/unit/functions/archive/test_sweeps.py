@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from functions import archive as function
-from functions.shared.archive.expiry import margin_s
+from functions.archive import margin_s
 from iort_contract.archive import ALL, HOUR, HOUR_REST_MS, SWEEP, TASK, Hour, Pending
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
 from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 
-from functions.shared.summary.processing import process
+from functions.shared.summary import process
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.batch import Batch
 from tests.fakes import (

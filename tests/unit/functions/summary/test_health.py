@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from functions.shared.metrics import MOST_VALUES
-from functions.shared.summary.health import measure, together
+from functions.shared.summary import measure, together
 from iort_contract.catalog.metrics import metrics_of
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.catalog.vesc import TEMPERATURES, hottest_degc

@@ -9,11 +9,10 @@ import pytest
 from botocore.exceptions import ClientError
 
 from functions import later
-from functions.shared import rate_limiter
-from functions.shared.rate_limiter import RateLimiter
-from functions.shared.summary import share
-from functions.shared.summary.processing import Bounds, process
-from functions.shared.summary.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from functions.shared import quotas, share
+from functions.shared.quotas import RateLimiter
+from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from functions.shared.summary import Bounds, process
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import TableError
 from iort_contract.tables import OVER_SHARE, PUT_OFF
@@ -109,7 +108,7 @@ def test_a_rate_limiter_refills_with_time():
 
 def test_a_rate_limiter_remembers_a_bounded_number_of_robots():
     limiter = RateLimiter(burst=1.0, a_second=0.1)
-    for i in range(rate_limiter._ROBOTS + 1):
+    for i in range(quotas._ROBOTS + 1):
         limiter.spend(f"car{i}", 0.0, 0.5)
     assert (limiter.left("car0", 0.0), limiter.left("car1", 0.0)) == (1.0, 0.5)
 

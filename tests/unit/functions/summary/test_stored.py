@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from functions.shared.summary.processing import process
-from functions.shared.summary.stored import SECOND_BATCHES, Reader
+from functions.shared.seconds import SECOND_BATCHES, Reader
+from functions.shared.summary import process
 from iort_contract.messages.batch import Batch
 from tests.fakes import TOPIC_OF_CAR
 from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch

@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import pytest
 
-from functions.shared.summary.processing import process
+from functions.shared.summary import process
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS
 from tests.fakes import (
     EXPIRES,

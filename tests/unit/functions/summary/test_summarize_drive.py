@@ -7,7 +7,7 @@ import random
 import pytest
 
 from functions import summarize
-from functions.shared.summary.volume import size_of
+from functions.summarize import size_of
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch

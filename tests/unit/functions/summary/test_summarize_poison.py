@@ -10,7 +10,7 @@ import zlib
 import pytest
 
 from functions.shared import tables as tables_module
-from functions.shared.summary.processing import process
+from functions.shared.summary import process
 from iort_contract.codec.columns import DICTIONARY
 from iort_contract.dynamodb import TableError
 from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from functions.shared.summary.volume import EVERY_S, PARTS, Volume, size_of
+from functions.summarize import EVERY_S, PARTS, Volume, size_of
 from iort_contract.tables import BATCH, PUT_OFF_TO_S, RECORD_BYTES, RECORD_DAY, ROBOT, TOPIC
 from tests.fakes import ROBOTS
 from tests.unit.functions.summary.summarizing import counted

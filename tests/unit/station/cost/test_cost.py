@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from bench.load.simulated import simulated_drive
 from bench.meters import message_sizes
 from functions.shared.metrics import Gathered, emit
-from functions.shared.summary.health import measure
+from functions.shared.summary import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.cloud import IOT, PUBNUB

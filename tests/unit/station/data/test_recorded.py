@@ -14,7 +14,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from functions.shared.summary.processing import recompute
+from functions.shared.summary import recompute
 from iort_analysis.archive import hours as archive_hours
 from iort_analysis.archive.stored import Origin
 from iort_analysis.samples.batches import RefusedItems

@@ -7,8 +7,8 @@ import json
 
 import pytest
 
-from functions.shared.summary.processing import process
-from functions.shared.summary.processing import recompute as summarize_again
+from functions.shared.summary import process
+from functions.shared.summary import recompute as summarize_again
 from iort_contract.messages.batch import Batch, RunEnd
 from iort_station.errors import StationError
 from iort_station.fleet import robots

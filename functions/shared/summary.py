@@ -5,38 +5,153 @@ from __future__ import annotations
 import gc
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from decimal import Decimal
 from functools import cache
+from itertools import chain
 from typing import Any
 
-import boto3
 from botocore.config import Config
 
 from functions.shared import clients
-from functions.shared.dead_letter import DeadLetterQueue, Refused
-from functions.shared.environment import variables
-from functions.shared.metrics import emit
-from functions.shared.summary.decoded import Decoded, decode_records
-from functions.shared.summary.health import measure, together
-from functions.shared.summary.seconds import Summaries, summarize_topic
-from functions.shared.summary.share import (
-    REQUESTS_S,
-    Change,
-    OverShareError,
-    Share,
-    robot_of,
-    robot_of_change,
-)
-from functions.shared.summary.stored import SECOND_BATCHES
+from functions.shared.clients import connect, variables
+from functions.shared.metrics import MOST_VALUES, emit
+from functions.shared.queues import DeadLetterQueue, Refused
+from functions.shared.seconds import SECOND_BATCHES, Summaries, summarize_topic
+from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_FIELDS, RTT_STREAM
+from iort_contract.catalog.vesc import FAULT_FIELD, TEMPERATURES, VOLTAGE_FIELD, measured_degc
 from iort_contract.codec.seconds import Statistics
-from iort_contract.dynamodb import TableError, quick
-from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
-from iort_contract.topics import parse_topic
+from iort_contract.dynamodb import TableError, plain, quick
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, BatchId, decode_item
+from iort_contract.statistics import count_holes, numbers_of
+from iort_contract.tables import PUT_OFF_TO_S, RECEIVED_MS, RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
+from iort_contract.topics import PING_PATHS, parse_topic
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class Decoded:
+    """The good batches of some stream records by topic, the refused ones, and the waiting ones; ``at_s`` is
+    the newest arrival in the table."""
+
+    batches: dict[str, list[Batch]] = field(default_factory=lambda: defaultdict(list))
+    records: dict[tuple[str, BatchId], Change] = field(default_factory=dict)
+    refused: list[Refused] = field(default_factory=list)
+    put_off: list[Change] = field(default_factory=list)
+    at_s: float = 0.0
+
+    def refuse(self, topic: str, keys: AbstractSet[BatchId], reason: str) -> None:
+        """Add batches of a topic to the refused ones."""
+        self.batches[topic] = [batch for batch in self.batches[topic] if batch.id not in keys]
+        for change in (self.records[topic, key] for key in sorted(keys)):
+            self.refused.append(Refused(change["SequenceNumber"], reason, change["NewImage"]))
+
+    def wait(self, topic: str) -> None:
+        """Move the batches of a topic to the waiting ones."""
+        self.put_off += [self.records[topic, batch.id] for batch in self.batches.pop(topic)]
+
+    def news(self, since_ms: int) -> dict[str, list[Batch]]:
+        """The batches that the cloud received since then, by topic."""
+        found: dict[str, list[Batch]] = {}
+        for topic, batches in self.batches.items():
+            for batch in batches:
+                received = self.records[topic, batch.id]["NewImage"].get(RECEIVED_MS)
+                if received is None or Decimal(received["N"]) >= since_ms:
+                    found.setdefault(topic, []).append(batch)
+        return found
+
+
+def decode_records(records: Iterable[Mapping[str, Any]], share: Share | None = None) -> Decoded:
+    """Decode stream records and charge each to its robot. Records over the robot's share are not decoded.
+    Removals (expiry) carry no image and are skipped, and so are expiries that the archive has put off."""
+    share = share or Share.unlimited()
+    decoded = Decoded()
+    for record in records:
+        change = record["dynamodb"]
+        image = change.get("NewImage")
+        # The rule stores a batch that is sent again as a whole, without this attribute.
+        if image is None or (record["eventName"] == "MODIFY" and PUT_OFF_TO_S in image):
+            continue
+        at_s = float(change.get("ApproximateCreationDateTime", time.time()))
+        decoded.at_s = max(decoded.at_s, at_s)
+        robot = robot_of_change(change)
+        if robot and share.over(robot, at_s):
+            decoded.put_off.append(change)
+            continue
+        meter = share.meter(robot, at_s)
+        try:
+            topic, batch = decode_item(plain(image))
+        except ContractError as error:
+            _log.warning("refused %s of %s: %s", change["Keys"], record["eventID"], error)
+            decoded.refused.append(Refused(change["SequenceNumber"], str(error), image))
+            meter.charge(REQUESTS_S)
+        else:
+            decoded.batches[str(topic)].append(batch)
+            decoded.records[str(topic), batch.id] = change
+            meter.charge()
+    return decoded
+
+
+# The cars' metrics, function ``health``.
+Measured = Mapping[str, float | list[float]]
+
+
+def measure(stream: str, batches: Sequence[Batch]) -> Measured:
+    """The metrics of one robot's batches of one stream; each batch counts once, however many seconds it has.
+
+    Battery (V) and temperature (degC) are the worst of the batches; gaps between samples are counted within
+    each batch.
+    """
+    if stream == RTT_STREAM:
+        return {f"RoundTrip{path.capitalize()}Ms": _numbers(batches, RTT_FIELDS[path]) for path in PING_PATHS}
+    if stream == AGENT_STREAM:
+        backlog = _numbers(batches, "backlog_batches")
+        return {
+            "AgentReports": sum(len(batch.times_us) for batch in batches),
+            "BacklogBatches": backlog[-1:],
+            "ThreadErrors": sum(_numbers(batches, "thread_errors")),
+        }
+    volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
+    # A temperature has few different values.
+    found = (measured_degc(name, value) for name in TEMPERATURES for value in set(_numbers(batches, name)))
+    degc = [value for value in found if value is not None]
+    return {
+        "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
+        "FaultSamples": sum(map(bool, _numbers(batches, FAULT_FIELD))),
+        "BatteryVolts": [min(volts)] if volts else [],
+        "TemperatureDegC": [max(degc)] if degc else [],
+    }
+
+
+def together(measured: Iterable[Measured]) -> Iterator[Measured]:
+    """Merge the metrics of several robots into as few log lines as possible: counts are added, values are
+    listed."""
+    counts: dict[str, float] = {}
+    values: dict[str, list[float]] = {}
+    for one in measured:
+        for name, value in one.items():
+            if isinstance(value, list):
+                values.setdefault(name, []).extend(value)
+            else:
+                counts[name] = counts.get(name, 0) + value
+    yield {**counts, **{name: found[:MOST_VALUES] for name, found in values.items()}}
+    for start in range(MOST_VALUES, max(map(len, values.values()), default=0), MOST_VALUES):
+        yield {name: found[start : start + MOST_VALUES] for name, found in values.items()}
+
+
+def _numbers(batches: Iterable[Batch], name: str) -> list[int | float]:
+    columns = (batch.columns.get(name, ()) for batch in batches)
+    return list(chain.from_iterable(map(numbers_of, columns)))
+
 
 # Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4
@@ -214,7 +329,7 @@ def stored_tables() -> Tables:
     given = variables(LaterEnvironment)
     # Requests come from this code only. Validating them took a third of Lambda 2's CPU time; the User-Agent,
     # made anew for each request, a fifth of it for a driving car.
-    client = quick(boto3.client("dynamodb", config=Config(parameter_validation=False, user_agent="iort")))
+    client = quick(connect("dynamodb", config=Config(parameter_validation=False, user_agent="iort")))
     tables = Tables(
         client,
         telemetry=given.telemetry_table,

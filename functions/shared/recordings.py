@@ -9,7 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from functions.shared import clients
-from functions.shared.environment import variables
+from functions.shared.clients import variables
 from iort_analysis.archive.hours import Stores
 from iort_analysis.archive.stored import Stored
 from iort_analysis.samples import batches

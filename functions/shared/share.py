@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.queues import send_all
-from functions.shared.rate_limiter import RateLimiter
+from functions.shared.quotas import RateLimiter
 from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS, TOPIC
 from iort_contract.topics import SHADOW, parse_topic

@@ -1,32 +1,46 @@
-"""The pending rows of the archive's manifest: what is to be archived, and when."""
+"""The adapters of the archive's writer, from its environment."""
 
 from __future__ import annotations
 
+import hashlib
 import heapq
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryFile
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from functions.shared.rate_limiter import RateLimiter
+from functions.shared import clients
+from functions.shared.clients import variables
+from functions.shared.quotas import RateLimiter
 from iort_contract.archive import (
     DUE_MS,
     FIRST_DUE_MS,
     HOUR,
     PENDING,
+    ArchivedHour,
     ArchiveTable,
+    Hour,
     Pending,
+    archived_hour,
     hour_of,
     parse_pending,
 )
-from iort_contract.dynamodb import Item
+from iort_contract.catalog.environments import ArchiveEnvironment
+from iort_contract.dynamodb import Item, TelemetryTable, quick
+from iort_contract.tables import TOPIC
 from iort_contract.topics import parse_topic
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
+    from types_boto3_s3 import S3Client
+    from types_boto3_sqs import SQSClient
+
 
 _log = logging.getLogger(__name__)
 # How many hours an environment remembers to have marked.
@@ -135,3 +149,117 @@ class Marks:
                 ExpressionAttributeNames={**names, "#due": DUE_MS},
                 ExpressionAttributeValues={f":{name}": {"N": str(value)} for name, value in values.items()},
             )
+
+
+_CHUNK = 1024 * 1024
+
+
+class Stored(NamedTuple):
+    """What an object has."""
+
+    sha256: str
+    size: int
+
+
+class Version(NamedTuple):
+    """A version of an object, and when it was written."""
+
+    etag: str
+    written_ms: int
+
+
+class Read(NamedTuple):
+    """An object as a temporary file, its version, and its SHA-256."""
+
+    file: IO[bytes]
+    etag: str
+    sha256: str
+
+
+class Objects:
+    """The objects of a bucket."""
+
+    def __init__(self, client: S3Client, bucket: str) -> None:
+        self._client, self._bucket = client, bucket
+
+    def etag(self, key: str) -> str | None:
+        """The version that an object has now; None without an object."""
+        version = self.version(key)
+        return version.etag if version is not None else None
+
+    def version(self, key: str) -> Version | None:
+        """The version that an object has now; None without an object."""
+        try:
+            head = self._client.head_object(Bucket=self._bucket, Key=key)
+            return Version(head["ETag"], round(head["LastModified"].timestamp() * 1000))
+        except ClientError as error:
+            if error.response["Error"]["Code"] in {"404", "NoSuchKey", "NotFound"}:
+                return None
+            raise
+
+    def read(self, key: str) -> Read:
+        """Read an object."""
+        answer = self._client.get_object(Bucket=self._bucket, Key=key)
+        file, digest = TemporaryFile(), hashlib.sha256()  # noqa: SIM115 - the caller's
+        for chunk in answer["Body"].iter_chunks(_CHUNK):
+            file.write(chunk)
+            digest.update(chunk)
+        file.seek(0)
+        return Read(file, answer["ETag"], digest.hexdigest())
+
+    def write(self, key: str, file: IO[bytes], etag: str | None) -> Stored:
+        """Write a file's content if the object still has this version; raises `ClientError` if it has not."""
+        condition: dict[str, Any] = {"IfNoneMatch": "*"} if etag is None else {"IfMatch": etag}
+        digest = hashlib.sha256()
+        file.seek(0)
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+        size = file.tell()
+        file.seek(0)
+        self._client.put_object(
+            Bucket=self._bucket, Key=key, Body=file, ChecksumAlgorithm="SHA256", **condition
+        )
+        return Stored(digest.hexdigest(), size)
+
+    def remove(self, key: str, etag: str) -> None:
+        """Remove an object, unless it has been written again."""
+        try:
+            self._client.delete_object(Bucket=self._bucket, Key=key, IfMatch=etag)
+        except ClientError as error:
+            if error.response["Error"]["Code"] not in {"PreconditionFailed", "NoSuchKey"}:
+                raise
+
+
+@dataclass(frozen=True)
+class Archive:
+    """The tables, the bucket and the queue."""
+
+    client: DynamoDBClient
+    telemetry: TelemetryTable
+    manifest: ArchiveTable
+    marks: Marks
+    objects: Objects
+    queue: SQSClient
+    given: ArchiveEnvironment
+
+    def row(self, topic: str, hour: Hour) -> ArchivedHour | None:
+        """An hour's row of the manifest."""
+        key = {TOPIC: {"S": topic}, HOUR: {"S": str(hour)}}
+        answer = self.client.get_item(TableName=self.manifest.name, Key=key, ConsistentRead=True)
+        return archived_hour(answer["Item"]) if "Item" in answer else None
+
+
+@cache
+def archive() -> Archive:
+    """The archive of this environment's deployment."""
+    given = variables(ArchiveEnvironment)
+    client = quick(clients.dynamodb())
+    return Archive(
+        client,
+        TelemetryTable(client, given.telemetry_table),
+        ArchiveTable(client, given.archive_table),
+        Marks(client, given.archive_table),
+        Objects(clients.s3(), given.files_bucket),
+        clients.sqs(),
+        given,
+    )

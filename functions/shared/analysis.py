@@ -1,15 +1,55 @@
-"""Findings about what failed or waits: a drive, or the plan or the comparison of a robot's range."""
+"""JSON and other content in the files' bucket, by key."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from botocore.exceptions import ClientError
 
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, DRIVES_WAIT, KINDS
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding
+
+if TYPE_CHECKING:
+    from types_boto3_s3 import S3Client
+
+
+class Kept:
+    """Objects of the files' bucket."""
+
+    def __init__(self, client: S3Client, bucket: str) -> None:
+        self._client, self._bucket = client, bucket
+
+    def put(self, key: str, content: bytes, content_type: str) -> None:
+        """Write an object; an earlier one is replaced."""
+        self._client.put_object(Bucket=self._bucket, Key=key, Body=content, ContentType=content_type)
+
+    def put_json(self, key: str, content: Any) -> None:
+        """Write an object of JSON."""
+        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+        self.put(key, text.encode(), "application/json")
+
+    def remove(self, prefix: str) -> None:
+        """Remove all objects whose keys begin so."""
+        for page in self._client.get_paginator("list_objects_v2").paginate(
+            Bucket=self._bucket, Prefix=prefix
+        ):
+            for found in page.get("Contents", ()):
+                self._client.delete_object(Bucket=self._bucket, Key=found["Key"])
+
+    def json(self, key: str) -> Any:
+        """Read an object of JSON; None if there is none."""
+        try:
+            answer = self._client.get_object(Bucket=self._bucket, Key=key)
+        except ClientError as error:
+            if error.response["Error"]["Code"] in {"NoSuchKey", "404"}:
+                return None
+            raise
+        return json.loads(answer["Body"].read())
+
 
 # A night plans what failed in the nights before it, up to a week.
 _PLANNED_AGAIN_US = 7 * 86_400 * 1_000_000

@@ -1,1 +1,0 @@
-"""What `make check` and the tests hold every template to. No stack is built here."""

@@ -1,1 +1,0 @@
-"""The stack that watches the others: dashboards, alarms and the budget."""

@@ -1,1 +1,0 @@
-"""What several stacks are made of: functions, queues, keys, policies. It knows the settings, and no stack."""
