@@ -3,7 +3,3 @@
 A module at this level is a command, or all commands share it. The bench may import every other package of the
 repository; only verify/, scripts/ and tests/ import the bench.
 """
-
-from pathlib import Path
-
-ROOT = Path(__file__).resolve().parent.parent

@@ -25,14 +25,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, write
-from bench.errors import BenchError
 from bench.floors import mosquitto
-from bench.meters import live_lane, usage
-from bench.meters.waiting import reached
+from bench.meters import live_lane
 from bench.report import thesis
-from bench.report.result import Table
-from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import CORE
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
@@ -40,6 +35,10 @@ from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
+from testkit import machine
+from testkit.command import Table, made, parser, write
+from testkit.ros import PYTHONPATH, RosError, RosGraph, python_with_rospy
+from testkit.waiting import InstrumentError, reached
 
 RATES_HZ = (50, 1000)
 # The most: processor time and live delay as a multiple of the floor's in the same run, memory, and the node's
@@ -85,7 +84,7 @@ def main() -> None:
         for rate_hz in RATES_HZ if program is not None and not options.soak else ():
             console.print(f"mosquitto, {rate_hz} Hz for {options.seconds} s ...")
             lanes.append(live_lane.measure(str(program), python, rate_hz, options.seconds))
-    except (BenchError, LocalError) as error:
+    except (InstrumentError, LocalError) as error:
         sys.exit(f"bench-agent: {error}")
     _table(runs, cycle, lanes).show(console)
     write(
@@ -122,10 +121,10 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         publisher.ready()
         publisher.go()
         publisher.publish_for(_WARM_UP_S)
-        before, began = (usage.of(agent.pid), usage.of(floor.pid)), time.monotonic()
+        before, began = (machine.usage_of(agent.pid), machine.usage_of(floor.pid)), time.monotonic()
         publisher.publish_for(seconds - 1)
         measured = (time.monotonic() - began) * rate_hz
-        after = usage.of(agent.pid), usage.of(floor.pid)
+        after = machine.usage_of(agent.pid), machine.usage_of(floor.pid)
         publisher.finish()
 
         def stored() -> int:

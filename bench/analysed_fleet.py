@@ -21,9 +21,6 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from bench.command import made, parser, progress, steps, write
-from bench.errors import BenchError
-from bench.meters import usage
 from bench.proof.cars import drive_of
 from bench.proof.speed import HOUR_S
 from bench.proof.stored import stored
@@ -37,6 +34,9 @@ from iort_station.errors import StationError
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
+from testkit import machine
+from testkit.command import made, parser, progress, steps, write
+from testkit.waiting import InstrumentError
 
 _S = 1_000_000
 _FUNCTIONS = ("Plan", "Analyse", "Evaluate", "Present")
@@ -64,7 +64,7 @@ def main() -> None:
     try:
         with TemporaryDirectory() as folder, EmbeddedCloud(Path(folder), progress=steps(console)) as embedded:
             figures = measure(embedded, given.hours, console)
-    except (BenchError, LocalError, StationError) as error:
+    except (InstrumentError, LocalError, StationError) as error:
         sys.exit(f"bench-analysis-cloud: {error}")
     except KeyboardInterrupt:
         sys.exit("bench-analysis-cloud: ended; nothing is kept")
@@ -87,7 +87,7 @@ def _hours(text: str) -> int:
 
 
 def measure(embedded: EmbeddedCloud, hours: int, console: Console) -> Figures:
-    """Write the hours, and analyse them; raises `BenchError` if a drive is not analysed."""
+    """Write the hours, and analyse them; raises `InstrumentError` if a drive is not analysed."""
     cloud = embedded.cloud
     _without_lambda_2(cloud)
     with progress(console) as bars:
@@ -113,7 +113,7 @@ def measure(embedded: EmbeddedCloud, hours: int, console: Console) -> Figures:
     without = [robot for robot in robots if not findings.drives(cloud, robot)]
     if without:
         said = [one.text for one in findings.findings(cloud, without[0])]
-        raise BenchError(f"nothing was analysed of {', '.join(without)}: {said or 'no drive was found'}")
+        raise InstrumentError(f"nothing was analysed of {', '.join(without)}: {said or 'no drive was found'}")
     samples = sum(int(item[SAMPLES]["N"]) for items in batches.values() for item in items)
     return Figures(
         robot_hours=hours,
@@ -146,12 +146,12 @@ def _cpu_s(embedded: EmbeddedCloud) -> dict[str, float]:
     """The processor time of the functions' processes so far."""
     spent = dict.fromkeys(_FUNCTIONS, 0.0)
     for name, pid in _workers(embedded):
-        spent[name] += usage.of(pid).cpu_s
+        spent[name] += machine.usage_of(pid).cpu_s
     return spent
 
 
 def _workers(embedded: EmbeddedCloud) -> Iterator[tuple[str, int]]:
-    for pid in usage.descendants(embedded.emulator.pid):
+    for pid in machine.descendants(embedded.emulator.pid):
         # A process may end meanwhile.
         with suppress(OSError):
             command = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")

@@ -20,16 +20,16 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from bench import ROOT
-from bench.command import progress
 from bench.proof import recordings, report, speed
 from bench.proof.analysing import Analysed, analysed, on_all_cores
 from bench.proof.cars import DriveSpec
 from bench.proof.judging import Car, coverage, detection, judge
 from bench.proof.plan import FULL, QUICK, Plan
 from bench.proof.truths import TRUTHS
-from bench.report import machine, writer
+from bench.report import writer
 from bench.report.result import Section
+from testkit import ROOT, machine
+from testkit.command import progress
 
 OUT = ROOT / "build" / "bench-analysis" / "report"
 _ROBOT_HOURS = 1000

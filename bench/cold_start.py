@@ -17,19 +17,17 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from py_compile import PycInvalidationMode
 from statistics import median
 from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from bench import ROOT
-from bench.command import parser, write
-from bench.report.result import Table
 from bench.sections.utilisation import ONE_VCPU_MB
-from scripts.layer import compile_all
-from tests.runtime.deployed import functions
-from tests.runtime.environment import Function, RuntimeFailedError, link_runtime, started
-from tests.runtime.events import events
+from testkit import ROOT
+from testkit.command import Table, parser, write
+from testkit.deployed import events, functions
+from testkit.runtime import Function, RuntimeFailedError, link_runtime, started
 
 LAYER = ROOT / "build" / "layer" / "local"
 # What has bytecode: what is deployed is the second.
@@ -109,7 +107,8 @@ def _kinds(function: Function, folder: Path) -> dict[str, Function]:
         shutil.copytree(function.layer, bare, ignore=shutil.ignore_patterns("__pycache__"))
     if not code.exists():
         shutil.copytree(function.code, code)
-        compile_all(code, sys.executable)
+        # As the layer's is: never compared with the source.
+        compileall.compile_dir(code, quiet=2, invalidation_mode=PycInvalidationMode.UNCHECKED_HASH)
     if function.layer is None:
         return {NOTHING: function, ALL: replace(function, code=code)}
     return {

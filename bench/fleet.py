@@ -20,12 +20,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, steps, write
-from bench.errors import BenchError
 from bench.load.fleet.figures import Fleet, limits, table
 from bench.load.fleet.run import measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
+from testkit.command import made, parser, steps, write
+from testkit.waiting import InstrumentError
 
 
 def main() -> None:
@@ -59,7 +59,7 @@ def main() -> None:
             else:
                 for count in options.robots:
                     drive(count)
-    except (BenchError, LocalError) as error:
+    except (InstrumentError, LocalError) as error:
         sys.exit(f"bench-fleet: {error}")
     write(options.json, {**made(), "runs": [run.as_json() for run in runs]})
     sys.exit(0 if all(run.good for run in runs if run.keeps_up or not options.limit) else 1)

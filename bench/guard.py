@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from bench import ROOT
 from bench.report.result import Ratio
+from testkit import ROOT
 
 Report = dict[str, Any]
 # Machines with the same values are of one kind.

@@ -17,11 +17,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.command import made, parser, steps, wound_up, write
-from bench.errors import BenchError
-from bench.keeping import disk, kills, report, week
+from bench.keeping import kills, report, week
 from iort_station.errors import StationError
 from local.errors import LocalError
+from testkit import machine
+from testkit.command import made, parser, steps, wound_up, write
+from testkit.waiting import InstrumentError
 
 
 def main() -> None:
@@ -35,7 +36,7 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=time.time_ns() % 2**32, help="of the random moments")
     arguments.add_argument("--out", type=Path, help="write the report, the plot and the figures here")
     given = arguments.parse_args()
-    disk.enter("bench.kept")
+    machine.enter("bench.kept")
     console = Console()
     say = steps(console)
     killed = soaked = None
@@ -47,7 +48,7 @@ def main() -> None:
             if given.soak:
                 soaked = week.soak(Path(folder) / "soak", given.soak, given.minutes, say)
                 soaked.table().show(console)
-    except (BenchError, LocalError, StationError) as error:
+    except (InstrumentError, LocalError, StationError) as error:
         sys.exit(f"bench-kept: {error}")
     except KeyboardInterrupt:
         sys.exit("bench-kept: ended")

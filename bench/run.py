@@ -21,17 +21,17 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench import ROOT
-from bench.command import confirm, wound_up
-from bench.report import machine, spending, writer
+from bench.report import spending, writer
 from bench.report.result import Section
 from bench.sections import SECTIONS
-from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.errors import StationError
 from local.errors import LocalError
+from testkit import ROOT, machine
+from testkit.command import confirm, wound_up
+from testkit.target import AWS, EMBEDDED, Target, open_target
 
 OUT = ROOT / "build" / "bench"
 

@@ -16,7 +16,7 @@ from iort_analysis.archive.writing import write_day, write_hour
 from iort_contract.archive import ArchivedHour, Hour, archived_hour, day_key, hour_key, hour_of, refused_key
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import parse_topic
-from tests.fakes import ARCHIVE, SUMMARY, TELEMETRY, FakeDynamoDB
+from testkit.dynamodb import ARCHIVE, SUMMARY, TELEMETRY, FakeDynamoDB
 
 Item = dict[str, Any]
 NEVER_S, PAST_S = 2**40, 1

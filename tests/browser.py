@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bench.meters import chromium
-from tests.waiting import GUARD_S
+from testkit import chromium
+from testkit.waiting import GUARD_S, until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -58,13 +57,6 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     for context in contexts:
         context.close()
     assert not errors, errors
-
-
-def until(true: Callable[[], Any], what: str, seconds: float = GUARD_S) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, f"waited {seconds} s for {what}"
-        time.sleep(0.02)
 
 
 def plain(text: str) -> str:

@@ -6,7 +6,7 @@ import struct
 
 from hypothesis import strategies as st
 
-from tests.ros1_types import HEADER, SIZES, STRING, Message, serialize
+from testkit.ros1_types import HEADER, SIZES, STRING, Message, serialize
 
 _BUILTIN = (*SIZES, STRING)
 # Field names of real packages, and names that a decoder may use itself.

@@ -22,7 +22,7 @@ from aiohttp import WSMsgType, web
 from typing_extensions import Self
 
 from iort_contract.ros1.definition import DURATION, TIME, Field, parse
-from tests.ports import free_port
+from testkit.ports import free_port
 
 
 class RosbridgeStandin:

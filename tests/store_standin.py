@@ -23,7 +23,7 @@ from iort_contract.messages.requests.files import (
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
 from local.network.certificates import Authority
-from tests.agent_fakes import Loopback
+from testkit.agent import Loopback
 
 
 class Store:

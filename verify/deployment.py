@@ -20,11 +20,10 @@ from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
 from stacks.settings import DEV
-from verify.errors import VerifyError
+from testkit.waiting import InstrumentError, until
 from verify.preflight.deployed import STACKS, stack
 from verify.preflight.finding import listed
 from verify.questions.identity.certificates import POLICY
-from verify.tools.waiting import until
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
@@ -72,7 +71,7 @@ class Deployment:
         self._run, self._poll_s = run, poll_s
 
     def deploy(self, settings: Mapping[str, str]) -> None:
-        """Create the stacks, or update them to the settings. Raises `VerifyError` if the CDK fails."""
+        """Create the stacks, or update them to the settings. Raises `InstrumentError` if the CDK fails."""
         named = "".join(f", {key}={value}" for key, value in settings.items())
         self._cdk(f"deploy{named}", _DEPLOY_S, ["deploy", "--require-approval", "never"], settings)
 
@@ -89,7 +88,7 @@ class Deployment:
         ):
             try:
                 step()
-            except (StationError, VerifyError, BotoCoreError, ClientError) as error:  # noqa: PERF203 - all are tried
+            except (StationError, InstrumentError, BotoCoreError, ClientError) as error:  # noqa: PERF203 - all are tried
                 left.append(f"{what}: {error}")
         return left
 
@@ -121,7 +120,7 @@ class Deployment:
             except (StationError, BotoCoreError, ClientError) as error:  # noqa: PERF203 - the next one may go
                 left.append(f"{row[ROBOT]}: {error}")
         if left:
-            raise VerifyError("; ".join(left))
+            raise InstrumentError("; ".join(left))
 
     def _revoke_claims(self) -> None:
         if self._stack("fleet") is not None:
@@ -143,7 +142,7 @@ class Deployment:
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         node = shutil.which("node", path=path)
         if node is None:
-            raise VerifyError("the CDK command line is not installed: run `make setup`")
+            raise InstrumentError("the CDK command line is not installed: run `make setup`")
         context = {"namespace": self._cloud.namespace, **_OF_ITS_OWN, **settings}
         self._say(step)
         try:
@@ -162,4 +161,4 @@ class Deployment:
                 timeout_s=timeout_s,
             )
         except LocalError as error:
-            raise VerifyError(str(error)) from error
+            raise InstrumentError(str(error)) from error

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bench.report.result import Table
 from local.deployment import ROOT
+from testkit.command import Table
 from verify import report
 from verify.question import Question, compared
 from verify.questions import ALL

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench.target import EMBEDDED, Target
-from verify.errors import CannotAskError
+from testkit.target import EMBEDDED, Target
+from testkit.waiting import InstrumentError
 
 # Prefix of notes beside the answer, such as a version: they are reported, but not compared.
 NOTE = "note_"
@@ -18,6 +18,10 @@ FIRST, CHANGED, ENDED = "first deployment", "changed deployment", "end of the de
 
 Seen = Mapping[str, Any]
 Ask = Callable[[Target], Seen]
+
+
+class CannotAskError(InstrumentError):
+    """A question cannot be asked here; the text says why."""
 
 
 class Verdict(enum.Enum):

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.report.result import Table
-from verify.errors import VerifyError
+from testkit.command import Table
+from testkit.waiting import InstrumentError
 from verify.question import NOTE, Answer, Verdict, compared
 
 KEPT = Path(__file__).resolve().parent / "aws.json"
@@ -53,7 +53,7 @@ class Measured:
 
 
 def load(path: Path = KEPT) -> Measured:
-    """The kept answers; empty without a file. Raises `VerifyError` for a file of another form."""
+    """The kept answers; empty without a file. Raises `InstrumentError` for a file of another form."""
     if not path.exists():
         return Measured()
     try:
@@ -61,7 +61,7 @@ def load(path: Path = KEPT) -> Measured:
         seen = {one["name"]: one["seen"] for one in report["answers"] if one["seen"] is not None}
         return Measured(by=report["by"], date=report["date"], region=report["region"], seen=seen)
     except (KeyError, TypeError, ValueError) as error:
-        raise VerifyError(f"{path} must be a report of verify: {error!r}") from error
+        raise InstrumentError(f"{path} must be a report of verify: {error!r}") from error
 
 
 def redacted(text: str) -> str:

@@ -24,18 +24,18 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench.command import confirm, wound_up
-from bench.report import machine
-from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF
 from iort_station.errors import StationError
 from local.deployment import ROOT
 from local.errors import LocalError
 from stacks.settings import Settings
+from testkit import machine
+from testkit.command import confirm, wound_up
+from testkit.target import AWS, EMBEDDED, Target, open_target
+from testkit.waiting import InstrumentError
 from verify import price, report
 from verify.deployment import CHANGES, Deployment
-from verify.errors import VerifyError
 from verify.preflight import command as preflight
 from verify.question import CHANGED, ENDED, FIRST, Answer, Question, Verdict, ask
 from verify.questions import ALL
@@ -58,7 +58,7 @@ def main() -> None:
         sys.exit(run(_options()))
     except KeyboardInterrupt:
         sys.exit(130)
-    except (LocalError, StationError, VerifyError, BotoCoreError, ClientError) as error:
+    except (LocalError, StationError, InstrumentError, BotoCoreError, ClientError) as error:
         Console(stderr=True).print(f"verify: {error}", style="red", markup=False)
         sys.exit(2)
 
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
             deployment = deployment or Deployment(cloud, options.out, say)
             findings.extend(_looked(cloud, console))
             if not options.yes:
-                confirm(console, _announced(cloud), VerifyError)
+                confirm(console, _announced(cloud), InstrumentError)
         try:
             if deployment:
                 deployment.deploy({})
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                 ExitStack() as lent,
             ):
                 # Several questions need them; without, these are not asked.
-                with suppress(VerifyError, StationError, ClientError):
+                with suppress(InstrumentError, StationError, ClientError):
                     lent.enter_context(keys_lent(target))
                 region = target.cloud.client("iot").meta.region_name
                 # One by one, so that the report has all answers before an interrupt.
@@ -156,13 +156,13 @@ def _asked(questions: Sequence[Question], phase: str, target: Target, console: C
 
 
 def _looked(cloud: Cloud, console: Console) -> list[str]:
-    """The preflight's lines for the report. Raises `VerifyError` if the deployment would fail."""
+    """The preflight's lines for the report. Raises `InstrumentError` if the deployment would fail."""
     found = preflight.look(cloud, Settings(namespace=cloud.namespace))
     lines = [preflight.line(finding) for finding in found]
     for text in lines:
         console.print(report.redacted(text), markup=False, highlight=False)
     if preflight.stopped(found):
-        raise VerifyError("nothing was created: the preflight says what to do")
+        raise InstrumentError("nothing was created: the preflight says what to do")
     return lines
 
 

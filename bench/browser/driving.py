@@ -20,16 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.command import made, parser, write
-from bench.errors import BenchError
 from bench.load.course import LEASE_S, ROBOT, Course
-from bench.load.tabs import Tabs
 from bench.load.tries import Heard, Try
-from bench.report.result import Table
-from bench.ros.graph import python_with_rospy
 from local.errors import LocalError
 from local.figures import Spread
 from local.network.proxy import FREEZE, PASS
+from testkit.chromium import Tabs
+from testkit.command import Table, made, parser, write
+from testkit.ros import python_with_rospy
+from testkit.waiting import InstrumentError
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserType, Page
@@ -106,7 +105,7 @@ class Driver:
             if done.get_attribute("data-phase") == "driving":
                 return
             time.sleep(_PAUSE_S)
-        raise BenchError(f"the car is not driven: {self.page.locator('.drive-said').inner_text()}")
+        raise InstrumentError(f"the car is not driven: {self.page.locator('.drive-said').inner_text()}")
 
     def drive(self) -> None:
         """Drive on until commands have moved the car for a moment."""
@@ -114,12 +113,12 @@ class Driver:
             self.hold()
             began = time.monotonic()
             self.page.keyboard.down("ArrowUp")
-            with suppress(BenchError):
+            with suppress(InstrumentError):
                 self.course.wait(began, moving=True, within_s=1)
                 time.sleep(_DRIVEN_S)
                 if time.monotonic() - self.course.last_motion().at < 0.2:
                     return
-        raise BenchError("the car does not move")
+        raise InstrumentError("the car does not move")
 
     def release(self) -> None:
         for key in ("ArrowUp", "Space"):
@@ -135,7 +134,7 @@ def _press_ms(driver: Driver, count: int) -> Spread:
         before = time.monotonic()
         driver.page.keyboard.down("ArrowUp")
         # A hold may end at that moment; then this was no measurement.
-        with suppress(BenchError):
+        with suppress(InstrumentError):
             heard = driver.course.wait(before, moving=True, within_s=1)
             took.append(heard.wall_s * 1000 - float(driver.page.evaluate("pressed_ms")))
         driver.release()
@@ -205,7 +204,7 @@ def _stops(
         began = time.monotonic() - _SEEN_S
         failed_at, again = FAILURES[failure](driver)
         failed = Heard(failed_at, time.time() - (time.monotonic() - failed_at), 0.0)
-        with suppress(BenchError):
+        with suppress(InstrumentError):
             course.wait(failed_at, moving=False, within_s=LEASE_S * 6)
             course.quiet(LEASE_S)
         heard = [one for one in course.heard if one.at >= began]
@@ -222,7 +221,9 @@ def _stops(
         if len(done) == tries:
             break
     else:
-        raise BenchError(f"{failure}: the car stood in {tries * _VOID - len(done)} of {tries * _VOID} tries")
+        raise InstrumentError(
+            f"{failure}: the car stood in {tries * _VOID - len(done)} of {tries * _VOID} tries"
+        )
     after_ms = [(one.first.at - one.failed.at) * 1000 for one in done if one.first is not None]
     latest_s = max((one.late_s for one in done if one.late_s is not None), default=0.0)
     missed = [one for one in done if one.why]
@@ -262,7 +263,7 @@ def main() -> None:
                     console.print(f"try {one.number} of {one.failure}", style="bold")
                     for line in one.lines(course.cloud, ROBOT):
                         console.print(f"  {line}", soft_wrap=True)
-    except (BenchError, LocalError) as error:
+    except (InstrumentError, LocalError) as error:
         sys.exit(f"bench-drive: {error}")
     _table(press_ms, found).show(console)
     written: dict[str, Any] = {"press_ms": asdict(press_ms), "stops": [asdict(one) for one in found]}

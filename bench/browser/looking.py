@@ -23,11 +23,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench import command
-from bench.errors import BenchError
-from bench.load.agent_process import AgentProcess
-from bench.meters import chromium
-from bench.meters.waiting import wait_for
 from iort_contract.cloud import VIEWER
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.viewing import VIEW_LEASE_MS
@@ -41,6 +36,9 @@ from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.proxy import Proxy
+from testkit import chromium, command
+from testkit.car import AgentProcess
+from testkit.waiting import InstrumentError, until
 
 _STREAM = "vesc"
 _WATCHED = "car1"
@@ -105,7 +103,7 @@ def main() -> None:
     console = Console()
     try:
         looks = _looked(options, console)
-    except BenchError as error:
+    except InstrumentError as error:
         sys.exit(f"looking: {error}")
     table = Table(title=f"{options.cars} cars, messages a second and stream at the broker")
     for name in ("look", "watched car", "each other car", ""):
@@ -133,7 +131,7 @@ def _looked(options: argparse.Namespace, console: Console) -> list[Look]:
         stack.enter_context(counted.broker)
         server = stack.enter_context(_served(embedded.cloud))
         looking = _Looking(browser, server.url, counted, options, console)
-        wait_for(lambda: len(counted.over(1.0)) > 0, "a car", 60)
+        until(lambda: len(counted.over(1.0)) > 0, "a car", 60)
         return [
             looking.at("nobody looks", None),
             looking.at("the fleet", "#/"),
@@ -165,11 +163,11 @@ class _Looking:
     def one_car(self) -> Iterator[Look]:
         """Look at one car, with a second viewer, and go one after the other."""
         with self._page("#/alarms") as first:
-            wait_for(lambda: first.evaluate(f"iort.robots.{_WATCHED} !== undefined"), "the car", 30)
+            until(lambda: first.evaluate(f"iort.robots.{_WATCHED} !== undefined"), "the car", 30)
             _sleeps(self._counted)
             before, began = self._counted.silent_s(_WATCHED), time.monotonic()
             first.goto(f"{self._url}#/car/{_WATCHED}")
-            wait_for(lambda: self._counted.silent_s(_WATCHED) < before, "the car to wake", 10, poll_s=0.01)
+            until(lambda: self._counted.silent_s(_WATCHED) < before, "the car to wake", 10, poll_s=0.01)
             woke_ms = (time.monotonic() - began) * 1000
             yield self._count("one car", first, f"awake after {woke_ms:.0f} ms")
             with self._page(f"#/car/{_WATCHED}") as second:
@@ -189,7 +187,7 @@ class _Looking:
                     os.kill(process["id"], signal.SIGKILL)
             slept_s = _sleeps(self._counted)
         if slept_s > VIEW_LEASE_MS / 1000 + 2:
-            raise BenchError(f"a killed page held its car awake for {slept_s:.1f} s")
+            raise InstrumentError(f"a killed page held its car awake for {slept_s:.1f} s")
         return self._count("its process is killed", None, f"idle after {slept_s:.1f} s")
 
     @contextmanager
@@ -197,7 +195,7 @@ class _Looking:
         context = self._browser.new_context(viewport=_LAPTOP)
         page = context.new_page()
         page.goto(f"{self._url}{view}")
-        wait_for(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect", 30)
+        until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect", 30)
         try:
             yield page
         finally:
@@ -225,7 +223,7 @@ def _far(browser: Any, cloud: Cloud, console: Console) -> Look:
         with _served(far) as server:
             page = browser.new_page(viewport=_LAPTOP)
             page.goto(f"{server.url}#/car/{_WATCHED}")
-            wait_for(lambda: page.evaluate(f"iort.robots.{_WATCHED}?.state") == "live", "the car", 30)
+            until(lambda: page.evaluate(f"iort.robots.{_WATCHED}?.state") == "live", "the car", 30)
             proxy.reset_every(_DROPS_S)
             end, longest_s, began = time.monotonic() + _FAR_S, 0.0, page.evaluate("iort.received")
             while time.monotonic() < end:
@@ -241,7 +239,7 @@ def _far(browser: Any, cloud: Cloud, console: Console) -> Look:
 def _sleeps(counted: Counted) -> float:
     """Wait until the watched car sends no more than an idle one; return how long it went on, in seconds."""
     began = time.monotonic()
-    wait_for(lambda: counted.silent_s(_WATCHED) > _SILENT_S, "the car to sleep", 60, poll_s=0.01)
+    until(lambda: counted.silent_s(_WATCHED) > _SILENT_S, "the car to sleep", 60, poll_s=0.01)
     return max(0.0, time.monotonic() - began - counted.silent_s(_WATCHED))
 
 

@@ -21,14 +21,13 @@ from typing import Any
 
 from rich.console import Console
 
-from bench.command import made, parser, write
-from bench.errors import BenchError
 from bench.load.cars import RATE_HZ
-from bench.meters import chromium, usage
-from bench.report.result import Table
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
+from testkit import chromium, machine
+from testkit.command import Table, made, parser, write
+from testkit.waiting import InstrumentError
 
 # Share of a processor; the rest stays free for the user of the machine.
 MAX_BUSY = 0.30
@@ -58,7 +57,7 @@ def main() -> None:
     console = Console()
     try:
         views, heap, process, bounds = _watched(console, options)
-    except BenchError as error:
+    except InstrumentError as error:
         sys.exit(f"bench-page: {error}")
     rows = [
         [view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}"] for view in views
@@ -151,7 +150,7 @@ def _process_mb(browser: Any) -> float:
     found = browser.send("SystemInfo.getProcessInfo")["processInfo"]
     renderers = [each for each in found if each["type"] == "renderer"]
     # The others are Chromium's spare ones.
-    return usage.of(max(renderers, key=lambda each: each["cpuTime"])["id"]).rss_mb
+    return machine.usage_of(max(renderers, key=lambda each: each["cpuTime"])["id"]).rss_mb
 
 
 if __name__ == "__main__":

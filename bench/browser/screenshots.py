@@ -20,11 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from bench import ROOT
-from bench.errors import BenchError
-from bench.load.agent_process import AgentProcess
 from bench.load.cars import Publisher, SimulatedCar, drive
-from bench.meters import chromium
 from bench.proof.analysing import analysed
 from bench.proof.cars import drive_of
 from iort_agent.sources.sim.vehicle import VehicleConfig
@@ -48,6 +44,9 @@ from iort_station.page.history import downloads
 from iort_station.page.server import PageServer
 from iort_station.times import iso
 from local.cloud import EmbeddedCloud
+from testkit import ROOT, chromium
+from testkit.car import AgentProcess
+from testkit.waiting import InstrumentError
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100
@@ -86,7 +85,7 @@ def main() -> None:
     options = parser.parse_args()
     try:
         _take(options.only, options.out)
-    except BenchError as error:
+    except InstrumentError as error:
         sys.exit(f"screenshots: {error}")
 
 

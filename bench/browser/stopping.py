@@ -22,12 +22,6 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.console import Console
 from typing_extensions import Self
 
-from bench.command import made, parser, write
-from bench.errors import BenchError
-from bench.load.agent_process import AgentProcess
-from bench.meters import chromium
-from bench.meters.waiting import wait_for
-from bench.report.result import Table
 from iort_station.fleet import robots, stopping
 from iort_station.page import answers as control
 from iort_station.page import motion
@@ -36,6 +30,10 @@ from iort_station.page.server import Handler, PageServer
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from local.figures import Spread
+from testkit import chromium
+from testkit.car import AgentProcess
+from testkit.command import Table, made, parser, write
+from testkit.waiting import InstrumentError, until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -104,7 +102,7 @@ class Course:
     def release(self) -> None:
         """Let the car move again."""
         stopping.release(self.cloud, [_ROBOT], by="bench")
-        wait_for(lambda: not self._motion().asked and not self._motion().stopped, "the release", _START_S)
+        until(lambda: not self._motion().asked and not self._motion().stopped, "the release", _START_S)
 
     def ready(self) -> bool:
         """Whether the car has said that a stop ends its motion."""
@@ -143,9 +141,9 @@ def _press(course: Course, page: Page, tries: int, progress: Callable[[str], Non
     for number in range(tries):
         before = len(course.answered_ms)
         page.locator(".stop-press").click()
-        wait_for(lambda known=before: len(course.answered_ms) > known, "the answer", _START_S)  # type: ignore[misc]  # bound now
+        until(lambda known=before: len(course.answered_ms) > known, "the answer", _START_S)  # type: ignore[misc]  # bound now
         # Not playwright's own waiting: the page's policy forbids what that evaluates.
-        wait_for(lambda: page.evaluate("window.shown_ms !== undefined"), "the car's word", _START_S)
+        until(lambda: page.evaluate("window.shown_ms !== undefined"), "the car's word", _START_S)
         pressed = float(page.evaluate("pressed_ms"))
         took["taken"].append(course.taken_ms[-1] - pressed)
         took["answered"].append(course.answered_ms[-1] - pressed)
@@ -170,7 +168,7 @@ def main() -> None:
             chromium.opened() as browser,
             Course(Path(folder)) as course,
         ):
-            wait_for(course.ready, "the car", _START_S)
+            until(course.ready, "the car", _START_S)
             context = browser.new_context()
             page = context.new_page()
             page.goto(course.server.invitation())
@@ -181,7 +179,7 @@ def main() -> None:
             page.bring_to_front()
             page.evaluate(_WATCH, _ROBOT)
             took = _press(course, page, options.tries, lambda text: console.print(f"  {text}", style="dim"))
-    except (BenchError, LocalError) as error:
+    except (InstrumentError, LocalError) as error:
         sys.exit(f"bench-stop: {error}")
     _table(took).show(console)
     figures: dict[str, Any] = {

@@ -15,8 +15,8 @@ from pathlib import Path
 import yaml
 from typing_extensions import Self
 
-from bench.errors import BenchError
 from local.network.certificates import Authority
+from testkit.waiting import InstrumentError
 
 HOST = "127.0.0.1"
 # The robot that `Mosquitto.car` configures.
@@ -44,7 +44,7 @@ def found() -> str | None:
 class Mosquitto:
     """The broker from `__enter__` to `__exit__`; `identity` makes certificates that it accepts.
 
-    Raises `BenchError` where it does not start.
+    Raises `InstrumentError` where it does not start.
     """
 
     def __init__(self, program: str, folder: Path) -> None:
@@ -76,7 +76,7 @@ class Mosquitto:
             except OSError as error:
                 if self._process.poll() is not None or time.monotonic() > deadline:
                     said = (self._folder / "mosquitto.log").read_text()
-                    raise BenchError(f"mosquitto does not start: {said}") from error
+                    raise InstrumentError(f"mosquitto does not start: {said}") from error
                 time.sleep(0.02)  # mosquitto does not report when it listens
             else:
                 return self

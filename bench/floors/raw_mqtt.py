@@ -22,14 +22,14 @@ from typing import Any
 import yaml
 from typing_extensions import Self
 
-from bench.errors import BenchError
+from testkit.waiting import InstrumentError
 
 _TIMEOUT_S = 20.0
 _CONNACK, _PUBLISH, _SUBACK, _PINGRESP = 2, 3, 9, 13
 _NOTHING = b""
 
 
-class RawError(BenchError):
+class RawError(InstrumentError):
     """The broker sent an unexpected packet, or none."""
 
 

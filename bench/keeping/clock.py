@@ -12,7 +12,7 @@ import struct
 import subprocess
 from pathlib import Path
 
-from bench.errors import BenchError
+from testkit.waiting import InstrumentError
 
 _FILE, _PRELOAD = "BENCH_CLOCK", "LD_PRELOAD"
 
@@ -33,10 +33,12 @@ class Clock:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """The environment of a process with a clock of its own. Raises `BenchError` without a C compiler."""
+    """The environment of a process with a clock of its own. Raises `InstrumentError` without a C compiler."""
     compiler, library, file = shutil.which("cc"), folder / "clock.so", folder / "clock"
     if compiler is None:
-        raise BenchError("there is no C compiler, which makes the soak's clock: apt install gcc libc6-dev")
+        raise InstrumentError(
+            "there is no C compiler, which makes the soak's clock: apt install gcc libc6-dev"
+        )
     source = Path(__file__).with_name("clock.c")
     subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl"], check=True)
     file.write_bytes(struct.pack("=q", 0))

@@ -12,17 +12,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.errors import BenchError
-from bench.keeping import disk
 from bench.keeping.counted import Counted, count, counted
 from bench.keeping.up import Up
-from bench.load.agent_process import AgentProcess
-from bench.report.result import Table
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations.delivery import audit, counts
 from local.figures import Spread
+from testkit import machine
+from testkit.car import AgentProcess
+from testkit.command import Table
+from testkit.waiting import InstrumentError
 
 CARS, RATE_HZ = 5, 50
 # What a killed agent may take with it: the open batch of a second, and the time until that is on its disk.
@@ -104,7 +104,7 @@ def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Ki
     say("starting the cloud")
     folder.mkdir(parents=True)
     with ExitStack() as stack, ExitStack() as driving:
-        small = stack.enter_context(disk.Disk(folder / "state")) if disk.possible() else None
+        small = stack.enter_context(machine.Disk(folder / "state")) if machine.possible() else None
         up = stack.enter_context(Up(folder / "state"))
         settings: dict[str, Any] = {
             "sources": [{"type": "sim", "rate_hz": RATE_HZ, "pose": {"rate_hz": 0}}],
@@ -158,8 +158,8 @@ def drive(folder: Path, kills: int, seed: int, say: Callable[[str], None]) -> Ki
     )
 
 
-def _full(small: disk.Disk, up: Up, seconds: float) -> float:
-    """Let the disk be full. Raises `BenchError` if a batch is stored all the same."""
+def _full(small: machine.Disk, up: Up, seconds: float) -> float:
+    """Let the disk be full. Raises `InstrumentError` if a batch is stored all the same."""
     # It starts with free space only.
     up.wait_until_whole()
     with small.full():
@@ -169,7 +169,7 @@ def _full(small: disk.Disk, up: Up, seconds: float) -> float:
         threading.Event().wait(seconds)
         after = _stored(up.cloud)
     if after != before:
-        raise BenchError(f"{after - before} batches were stored on a full disk")
+        raise InstrumentError(f"{after - before} batches were stored on a full disk")
     return 0.0
 
 
@@ -179,7 +179,7 @@ def _wait_until_driving(cloud: Cloud, since_us: int | None = None) -> None:
     for i in range(CARS):
         while next(audit.headers(cloud, f"car{i + 1}", VESC_STREAM, since_us), None) is None:
             if time.monotonic() > deadline:
-                raise BenchError(f"car{i + 1} has sent no batch in {_FIRST_S:.0f} s")
+                raise InstrumentError(f"car{i + 1} has sent no batch in {_FIRST_S:.0f} s")
             threading.Event().wait(0.2)
 
 

@@ -16,17 +16,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.errors import BenchError
 from bench.keeping.clock import Clock, inherited
 from bench.keeping.counted import count
 from bench.load.fleet.generator import Columns, Load, Robot, laps
-from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
+from testkit import machine
+from testkit.waiting import InstrumentError
 
 CARS, RATE_HZ = 5, 50
 _HOUR_S = 3_600
@@ -65,7 +65,7 @@ class Car(Robot):
         pause, deadline = threading.Event(), time.monotonic() + _CONNECT_S
         while len(self.sent_ms) - len(self.acknowledged) > most:
             if time.monotonic() > deadline:
-                raise BenchError(f"{self.name}: no acknowledgement in {_CONNECT_S:.0f} s")
+                raise InstrumentError(f"{self.name}: no acknowledgement in {_CONNECT_S:.0f} s")
             pause.wait(0.005)
 
 
@@ -103,7 +103,7 @@ def _cars(cloud: Cloud, folder: Path) -> list[Car]:
         car.client.start()
     for car in cars:
         if not car.connected.wait(_CONNECT_S):
-            raise BenchError(f"{car.name} was not connected within {_CONNECT_S:.0f} s")
+            raise InstrumentError(f"{car.name} was not connected within {_CONNECT_S:.0f} s")
     return cars
 
 
@@ -130,7 +130,7 @@ def _summarized(cloud: Cloud, cars: list[Car]) -> None:
             if item is not None and int(item[SECOND]["N"]) >= car.last_s:
                 break
             if time.monotonic() > deadline:
-                raise BenchError(f"{car.name}: no summary in {_SUMMARY_S:.0f} s")
+                raise InstrumentError(f"{car.name}: no summary in {_SUMMARY_S:.0f} s")
             threading.Event().wait(0.1)
 
 
@@ -141,13 +141,13 @@ def _wait_until_idle(embedded: EmbeddedCloud) -> None:
     [tasks] = [url for url in sqs.list_queues()["QueueUrls"] if "ArchiveTasks" in url]
     deadline = time.monotonic() + _IDLE_S
     while time.monotonic() < deadline:
-        before = usage.below(emulator).cpu_s
+        before = machine.usage_below(emulator).cpu_s
         counts = sqs.get_queue_attributes(QueueUrl=tasks, AttributeNames=["All"])["Attributes"]
         threading.Event().wait(_QUIET_S)
-        quiet = usage.below(emulator).cpu_s == before
+        quiet = machine.usage_below(emulator).cpu_s == before
         if quiet and not int(counts["ApproximateNumberOfMessages"]):
             return
-    raise BenchError(f"the functions still work after {_IDLE_S:.0f} s")
+    raise InstrumentError(f"the functions still work after {_IDLE_S:.0f} s")
 
 
 def _look(embedded: EmbeddedCloud, hour: int, batches: int, began: float) -> Look:
@@ -157,7 +157,7 @@ def _look(embedded: EmbeddedCloud, hour: int, batches: int, began: float) -> Loo
         batches=batches,
         seconds=round(time.monotonic() - began, 1),
         emulator_mb=_private_mb(emulator),
-        functions_mb=round(sum(map(_private_mb, usage.descendants(emulator))), 1),
+        functions_mb=round(sum(map(_private_mb, machine.descendants(emulator))), 1),
         ledger_mb=_disk_mb(embedded.folder.glob("ledger.db*")),
         files_mb=_disk_mb((embedded.folder / "s3").rglob("*")),
     )

@@ -16,13 +16,12 @@ from types import TracebackType
 
 from typing_extensions import Self
 
-from bench import ROOT
-from bench.errors import BenchError
-from bench.meters import usage
 from iort_station import kept
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.errors import StationError
 from local.processes import Child
+from testkit import ROOT, machine
+from testkit.waiting import InstrumentError
 
 _FIRST_S, _AGAIN_S = 600.0, 120.0
 _POLL_S = 0.05
@@ -52,7 +51,7 @@ class Up:
     @property
     def emulator(self) -> int | None:
         """The emulator's process; None while there is none."""
-        for pid in usage.descendants(self._child.pid):
+        for pid in machine.descendants(self._child.pid):
             with suppress(OSError):
                 if b"local.emulator.run" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     return pid
@@ -61,12 +60,12 @@ class Up:
     def kill_emulator(self) -> float:
         """SIGKILL to the emulator and its functions; returns the seconds until it answers again."""
         if (pid := self.emulator) is not None:
-            _kill([pid, *usage.descendants(pid)])
+            _kill([pid, *machine.descendants(pid)])
         return self._answering()
 
     def kill_all(self) -> float:
         """SIGKILL to every process of the cloud at once, and a new start; returns as `kill_emulator`."""
-        _kill([self._child.pid, *usage.descendants(self._child.pid)])
+        _kill([self._child.pid, *machine.descendants(self._child.pid)])
         self._child.kill()
         self._start()
         return self._answering()
@@ -74,7 +73,7 @@ class Up:
     def kill_function(self) -> float:
         """SIGKILL to the processes of the functions."""
         if (pid := self.emulator) is not None:
-            _kill(usage.descendants(pid))
+            _kill(machine.descendants(pid))
         return 0.0
 
     def wait_until_whole(self) -> None:
@@ -118,7 +117,7 @@ class Up:
                 # An emulator that ends too often ends it.
                 self._start()
             if time.monotonic() > deadline:
-                raise BenchError(f"the cloud is not up after {seconds:.0f} s:\n{self._child.tail()}")
+                raise InstrumentError(f"the cloud is not up after {seconds:.0f} s:\n{self._child.tail()}")
             self._child.wait(_POLL_S)
 
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from bench import ROOT
-from bench.errors import BenchError
 from bench.keeping import clock
 from bench.keeping.counted import Counted, counted
 from bench.keeping.soak import CARS, Look
-from bench.report.result import Table
+from testkit import ROOT
+from testkit.command import Table
+from testkit.waiting import InstrumentError
 
 # Growth from the second quarter of the hours to the last: less than measuring varies.
 MOST_GROWTH = 0.1
@@ -82,7 +82,7 @@ class Soak:
 
 
 def soak(folder: Path, hours: int, minutes: int, say: Callable[[str], None]) -> Soak:
-    """Soak in a process of its own; raises `BenchError` if it fails."""
+    """Soak in a process of its own; raises `InstrumentError` if it fails."""
     folder.mkdir(parents=True)
     command = [sys.executable, "-m", "bench.keeping.soak", str(folder)]
     command += ["--hours", str(hours), "--minutes", str(minutes)]
@@ -105,5 +105,5 @@ def soak(folder: Path, hours: int, minutes: int, say: Callable[[str], None]) -> 
             process.wait()
             raise
     if process.returncode or not end:
-        raise BenchError(f"the soak ended with status {process.returncode}")
+        raise InstrumentError(f"the soak ended with status {process.returncode}")
     return Soak(hours, minutes, looks, end["sent"], counted(end["found"]))

@@ -16,9 +16,7 @@ from pathlib import Path
 
 from typing_extensions import Self
 
-from bench.errors import BenchError
 from bench.load.tries import Heard
-from bench.ros.graph import RosGraph
 from iort_station.fleet import robots
 from iort_station.page import answers as control
 from iort_station.page import motion
@@ -26,6 +24,8 @@ from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.proxy import Proxy
+from testkit.ros import RosGraph
+from testkit.waiting import InstrumentError
 
 ROBOT, TOPIC = "driven", "/cmd_vel"
 LEASE_S = 0.5
@@ -96,14 +96,14 @@ class Course:
         self.agent.wait()
 
     def wait(self, after: float, *, moving: bool, within_s: float) -> Heard:
-        """The first command after a time that moves the car, or that stops it; raises `BenchError`."""
+        """The first command after a time that moves the car, or that stops it; raises `InstrumentError`."""
 
         def found() -> Heard | None:
             return next((one for one in self.heard if one.at > after and (one.speed != 0) == moving), None)
 
         with self._news:
             if (one := self._news.wait_for(found, within_s)) is None:
-                raise BenchError(f"no {'motion' if moving else 'stop'} within {within_s:g} s")
+                raise InstrumentError(f"no {'motion' if moving else 'stop'} within {within_s:g} s")
             return one
 
     def last_motion(self) -> Heard:

@@ -9,15 +9,15 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from bench.load.simulated import RATE_HZ, simulated_drive
-from bench.meters.waiting import wait_for
-from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.delivery import counts
+from testkit.car import RATE_HZ, simulated_drive
+from testkit.target import Target
+from testkit.waiting import until
 
 _KEPT_S = 86_400
 _CATCH_UP_S = 120.0
@@ -45,7 +45,7 @@ def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[st
         item |= {TOPIC: topic, RECEIVED_MS: second[-1][0] // 1000, EXPIRES_S: expires_s}
         items.append({name: serialize(value) for name, value in item.items()})
         client.put_item(TableName=table, Item=items[-1])
-    wait_for(
+    until(
         lambda: counts.samples_summarized(target.cloud, robot, VESC_STREAM) >= len(samples),
         "Lambda 2 to summarise what was stored",
         _CATCH_UP_S,

@@ -17,7 +17,6 @@ from pathlib import Path
 from statistics import quantiles
 
 from bench.ros.mixed_robot import topics
-from bench.ros.vesc_message import TYPE, body
 from iort_agent.agent import Agent
 from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config
@@ -26,7 +25,8 @@ from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.sim import PoseConfig, SimConfig
 from iort_agent.spool import QueueConfig
 from iort_agent.spool.sqlite import make_spool
-from tests.agent_fakes import Loopback
+from testkit.agent import Loopback
+from testkit.ros1_types import TYPE, body
 
 
 def main() -> None:

@@ -14,10 +14,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.errors import BenchError
-from bench.meters import usage
-from bench.meters.waiting import reached
-from bench.target import Target
+from testkit import machine
+from testkit.target import Target, configure
+from testkit.waiting import InstrumentError, reached
 
 _LOGS_S = 60.0
 _REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
@@ -43,13 +42,13 @@ class Measured:
 def measure(target: Target, function: str, event: Event, calls: int, found: Measured) -> None:
     """Invoke the function ``calls`` times, one after the other, and add the round to ``found``.
 
-    Raises `BenchError` where an invocation fails, or no REPORT line comes.
+    Raises `InstrumentError` where an invocation fails, or no REPORT line comes.
     """
     began_ms = int(time.time() * 1000)
     before = _cpu(target)
     told = [invoke(target, function, event(i)) for i in range(calls)]
     if target.embedded is not None:
-        found.cpu_ms.append(usage.spent_ms(before, _cpu(target)) / calls)
+        found.cpu_ms.append(machine.spent_ms(before, _cpu(target)) / calls)
     # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
     reports = [line for line in told if line is not None]
     if len(reports) < calls:
@@ -60,17 +59,19 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
 
 def _cpu(target: Target) -> dict[int, int]:
     return (
-        {} if target.embedded is None else usage.threads_ns(usage.descendants(target.embedded.emulator.pid))
+        {}
+        if target.embedded is None
+        else machine.threads_ns(machine.descendants(target.embedded.emulator.pid))
     )
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
-    """Run the function once; return its REPORT line, if the answer has it. Raises `BenchError` on failure."""
+    """Run the function once; return its REPORT line, if the answer has it. Raises `InstrumentError`."""
     answer = target.cloud.client("lambda").invoke(
         FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
     )
     if "FunctionError" in answer:
-        raise BenchError(f"{function}: {answer['Payload'].read()[:400]!r}")
+        raise InstrumentError(f"{function}: {answer['Payload'].read()[:400]!r}")
     return report_line(base64.b64decode(answer.get("LogResult", "")).decode(errors="replace"))
 
 
@@ -94,17 +95,10 @@ def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[st
         return len(reports) >= calls
 
     if not reached(all_there, within_s=_LOGS_S, poll_s=0.5) and not reports:
-        raise BenchError(f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all")
+        raise InstrumentError(
+            f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
+        )
     return reports
-
-
-def configure(client: Any, function: str, **change: Any) -> None:
-    """Change the function's configuration, and wait until it is in force."""
-    updated = client.get_waiter("function_updated_v2")
-    # An interrupt may have left the change before under way, and AWS refuses one meanwhile.
-    updated.wait(FunctionName=function)
-    client.update_function_configuration(FunctionName=function, **change)
-    updated.wait(FunctionName=function)
 
 
 @contextmanager

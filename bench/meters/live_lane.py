@@ -14,13 +14,13 @@ from pathlib import Path
 
 from bench.floors.mosquitto import ROBOT, Mosquitto
 from bench.meters.watcher import subscribed
-from bench.ros.graph import RosGraph
 from bench.ros.mixed_robot import CORE
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import decode_live
 from iort_contract.topics import LIVE, build_topic, live_topic
 from local.figures import Spread
+from testkit.ros import RosGraph
 
 TOPIC = "/sensors/core"
 _FLOOR = "bench/floor"

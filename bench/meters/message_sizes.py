@@ -16,7 +16,6 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from bench.load.simulated import simulated_drive
 from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.archive.writing import write_hour
 from iort_contract.archive import hour_of
@@ -30,6 +29,7 @@ from iort_contract.statistics import summarize_second
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cost.sizes import Measured
+from testkit.car import simulated_drive
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
 _T_US, _MS = 1_750_000_000_000_000, 1_750_000_000_000

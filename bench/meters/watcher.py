@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from bench.errors import BenchError
 from bench.floors.mosquitto import HOST, Mosquitto
+from testkit.waiting import InstrumentError
 
 NAME = "bench-watcher"
 _WAIT_S = 20.0
@@ -36,7 +36,7 @@ def subscribed(
     )
     client.start()
     if not connected.wait(_WAIT_S):
-        raise BenchError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
+        raise InstrumentError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
     wanted = [mqtt5.Subscription(topic_filter=each, qos=mqtt5.QoS(qos)) for each in topic_filters]
     client.subscribe(mqtt5.SubscribePacket(subscriptions=wanted)).result(_WAIT_S)
     try:

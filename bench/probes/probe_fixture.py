@@ -11,15 +11,14 @@ from typing import Any
 
 from typing_extensions import Self
 
-from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
-from bench.meters.waiting import reached
-from bench.target import Target, temporary_function
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.topics import LIVE, PING, PONG, build_topic, record_topic
 from iort_station.operations.delivery import counts
+from testkit.target import Target, temporary_function
+from testkit.waiting import InstrumentError, reached
 
 WAIT_S = 30.0
 _WHO = """
@@ -31,7 +30,7 @@ def handler(event, context):
 """
 
 
-class AbilityMissingError(BenchError):
+class AbilityMissingError(InstrumentError):
     """The service lacks the ability; the text says what the probe saw."""
 
 

@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import iort_analysis
 import iort_contract
-from bench import ROOT
 from bench.proof.cars import DriveSpec
 from bench.proof.drives import digest, simulated
 from iort_agent.sources.sim import ALL
@@ -24,6 +23,7 @@ from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, Measured
 from iort_contract.catalog.derived import F1TENTH
+from testkit import ROOT
 
 KEPT = ROOT / "build" / "bench-analysis" / "results"
 Done = Callable[[], None]

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import iort_agent.sources.sim
-from bench import ROOT
 from bench.proof.cars import DriveSpec
 from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.driver import Wish
@@ -24,6 +23,7 @@ from iort_agent.sources.sim.vehicle import Vehicle
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import TACHOMETER_COUNTS, VESC_STREAM
+from testkit import ROOT
 
 KEPT = ROOT / "build" / "bench-analysis" / "drives"
 RATE_HZ, POSE_RATE_HZ = 50, 20

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import ROOT
 from bench.report.result import Section
 from iort_agent.sources.recording.player import Message
 from iort_agent.sources.recording.rosbag import Recording, Unread
@@ -24,6 +23,7 @@ from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.catalog.analysis.car import GROUPS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from testkit import ROOT
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.errors import BenchError
 from bench.floors.decoding import columns
 from bench.proof.cars import drive_of
 from bench.proof.drives import RATE_HZ
@@ -23,6 +22,7 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_station.cost.bill.analysing import Function, drive_items
 from iort_station.cost.usage import Usage
+from testkit.waiting import InstrumentError
 
 HOUR_S = 3600.0
 _REPEATS = 3
@@ -70,11 +70,11 @@ def hour_cpu_s(car: int) -> Hour:
 
 
 def _check(streams: Mapping[str, Block], floor: Mapping[str, Mapping[str, NDArray[np.float64]]]) -> None:
-    """Raise `BenchError` if the floor has not decoded what we have."""
+    """Raise `InstrumentError` if the floor has not decoded what we have."""
     for stream, block in streams.items():
         for name, column in block.columns.items():
             if not np.array_equal(column, floor[stream][name]):
-                raise BenchError(f"{stream}.{name}: the floor must decode the same values")
+                raise InstrumentError(f"{stream}.{name}: the floor must decode the same values")
 
 
 def bill(robot_hours: float, cpu_s: float, drive_s: float, function: Function | None = None) -> Bill:

@@ -11,7 +11,7 @@ from bench.proof.drives import simulated
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.dynamodb import Item
 from iort_contract.messages.batch import Batch
-from tests.fakes import item_of
+from testkit.dynamodb import item_of
 
 _S = 1_000_000
 

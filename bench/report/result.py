@@ -2,41 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import rich.table
-from rich.console import Console
-from rich.markup import escape
+from testkit.command import Row, Table
 
 NOT_MEASURED = "-"
-Row = Sequence[str]
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table: cells are text. ``**text**`` is bold in Markdown, and makes a row red on a terminal."""
-
-    title: str
-    head: Row
-    rows: Sequence[Row]
-
-    def as_markdown(self) -> str:
-        """Return the table without its title."""
-        lines = [self.head, ["---", *["---:"] * (len(self.head) - 1)], *self.rows]
-        return "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-
-    def show(self, console: Console) -> None:
-        shown = rich.table.Table(title=self.title, title_justify="left", title_style="bold")
-        for i, name in enumerate(self.head):
-            shown.add_column(name, justify="right" if i else "left")
-        for row in self.rows:
-            cells = [escape(cell.replace("**", "")) for cell in row]
-            shown.add_row(*cells, style="red" if any(cell.startswith("**") for cell in row) else "")
-        console.print(shown)
 
 
 @dataclass(frozen=True)

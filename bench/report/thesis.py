@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bench.report.result import Table
+from testkit.command import Table
 
 SOURCE = "KTH thesis of 2018"
 ROS, AWS_IOT, LAMBDA, DYNAMODB, CLOUDWATCH = "ROS", "AWS IoT", "Lambda", "DynamoDB", "CloudWatch"

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.result import Plot, Ratio, Section
+from testkit.command import Table
 
 
 class Report(NamedTuple):

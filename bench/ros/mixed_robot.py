@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench.ros import vesc_message
-from tests.ros.mixed.robot import MESSAGES
+from testkit import ros1_types
+from testkit.ros1_types import MESSAGES
 
 _RANGES, _MAP_CELLS = 720, 200
 _ARM, _GRIPPER = tuple(f"joint_{i}" for i in range(1, 7)), ("finger_left", "finger_right")
@@ -49,7 +49,7 @@ class Topic:
 
 
 def _vesc(message: Any, _: Classes, i: int) -> None:
-    for name, value in zip(vesc_message.FIELDS, vesc_message.values(i), strict=True):
+    for name, value in zip(ros1_types.FIELDS, ros1_types.values(i), strict=True):
         setattr(message.state, name, value)
 
 
@@ -137,7 +137,7 @@ def _nothing(_: Any, __: Classes, ___: int) -> None:
     pass
 
 
-_CORE = Topic("/sensors/core", "vesc", vesc_message.TYPE, 50, _vesc, "base_link")
+_CORE = Topic("/sensors/core", "vesc", ros1_types.TYPE, 50, _vesc, "base_link")
 # The topics of each node of the mixed robot.
 MIXED: dict[str, tuple[Topic, ...]] = {
     "base": (

@@ -19,7 +19,7 @@ from bench.sections import (
     utilisation,
     viewing,
 )
-from bench.target import Say, Target
+from testkit.target import Say, Target
 
 Run = Callable[[Target, Say], Section]
 

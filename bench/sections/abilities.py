@@ -12,9 +12,10 @@ from typing import NamedTuple
 from bench.probes import dynamodb, functions, iot_core, watching
 from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture
 from bench.report import thesis
-from bench.report.result import Section, Table
+from bench.report.result import Section
 from bench.report.thesis import UNSAID, said
-from bench.target import Say, Target
+from testkit.command import Table
+from testkit.target import Say, Target
 
 _IOT_CORE, _DYNAMODB, _LAMBDA, _PUBNUB, _CLOUDWATCH = "IoT Core", "DynamoDB", "Lambda", "PubNub", "CloudWatch"
 # The thesis' entry on the point of an ability.

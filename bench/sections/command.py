@@ -17,12 +17,12 @@ from statistics import median
 from typing import NamedTuple
 
 from bench.load import stored_drive
-from bench.load.simulated import RATE_HZ
 from bench.report.result import Section
 from bench.report.spread import ratio
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
+from testkit.car import RATE_HZ
+from testkit.target import Say, Target
 
 ROBOT = "bench-command"
 REPEATS = 5

@@ -7,12 +7,12 @@ from dataclasses import asdict, replace
 from bench.report import plots
 from bench.report.fleet_costs import fleets
 from bench.report.result import Section
-from bench.target import Say, Target
 from iort_contract.cloud import PUBNUB
 from iort_station.cost import report
 from iort_station.cost.bill import line_items, model
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
+from testkit.target import Say, Target
 
 # Computed, not measured: the same settings have the same cost.
 _COMPUTED = 1.01

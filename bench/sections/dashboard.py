@@ -9,13 +9,9 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from bench.errors import BenchError
-from bench.load.agent_process import AgentProcess
-from bench.meters import chromium
 from bench.report import plots
 from bench.report.result import Section
 from bench.report.spread import spread, text
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.operations.delivery import audit, trace
@@ -23,6 +19,10 @@ from iort_station.page.page import BUILT, load_keys
 from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
 from local.figures import THESIS
+from testkit import chromium
+from testkit.car import AgentProcess
+from testkit.target import Say, Target
+from testkit.waiting import InstrumentError
 
 ROBOT = "bench-dashboard"
 SECONDS = 24
@@ -84,11 +84,11 @@ def run(target: Target, say: Say) -> Section:
             else:
                 threading.Event().wait(SECONDS)
             if agent.process.poll() is not None:
-                raise BenchError("the agent stopped while it was watched")
+                raise InstrumentError("the agent stopped while it was watched")
             updates = list(found)
         figures = audit.last_figures(target.cloud, bundle.robot)
     if not updates:
-        raise BenchError("no live update was heard")
+        raise InstrumentError("no live update was heard")
     hops = trace.trace(updates, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
     heard = [(one.here_us - one.sample_us) / 1000 for one in updates]
     shown = [at - t / 1000 for t, at in painted]

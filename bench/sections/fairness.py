@@ -11,17 +11,17 @@ import time
 from collections.abc import Callable, Iterable
 
 from bench.floors.raw_mqtt import RawClient
-from bench.load.agent_process import AgentProcess
-from bench.load.worst_case import worst_batches
-from bench.meters.waiting import reached, wait_for
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND
 from iort_contract.topics import LIVE, build_topic, record_topic
 from iort_station.data.recorded import summary_table, topic_of
+from testkit.car import AgentProcess
+from testkit.target import Say, Target
+from testkit.waiting import reached, until
+from testkit.worst_case import worst_batches
 
 # AWS IoT accepts this many publishes a second from a connection.
 RATE_HZ = 100
@@ -72,7 +72,7 @@ def run(target: Target, say: Say) -> Section:
     topic = build_topic(LIVE, other.robot, VESC_STREAM, target.cloud.namespace)
     found: Delays = {kind: [] for kind in KINDS}
     with target.listener(car.robot) as listener, AgentProcess(car), RawClient(other.folder) as client:
-        wait_for(lambda: listener.heard, "the first live update")
+        until(lambda: listener.heard, "the first live update")
         # Warm up once with each kind: the first message creates clients and environments.
         for message in KINDS.values():
             _stretch(client, topic, message, 2)

@@ -21,19 +21,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.errors import BenchError
 from bench.floors.mosquitto import Mosquitto, found
-from bench.meters import usage
 from bench.meters.watcher import subscribed
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
-from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import MIXED, topics
-from bench.target import Say, Target
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import LIVE, RECORD, parse_topic
+from testkit import machine
+from testkit.ros import PACKAGES, SYSTEM_PYTHON, RosGraph, python_with_rospy
+from testkit.target import Say, Target
+from testkit.waiting import InstrumentError
 
 SECONDS = 30
 RECORDER, AGENT, FLOOR = "rosbag record", "agent", "bare rospy subscriber"
@@ -137,7 +137,7 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         (smaller := folder / "bz2").mkdir()
         compress = [*rosbag, "compress", "--quiet", "--bz2", f"--output-dir={smaller}", str(bag)]
         if graph.run(compress).wait(_END_S + seconds):
-            raise BenchError("`rosbag compress` failed")
+            raise InstrumentError("`rosbag compress` failed")
         result.bag_bz2_bytes = (smaller / bag.name).stat().st_size
     result.cpu_s = {who: after[who].cpu_s - before[who].cpu_s for who in processes}
     result.rss_mb = {who: after[who].rss_mb for who in processes}
@@ -145,9 +145,9 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
     return result
 
 
-def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, usage.Usage]:
+def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, machine.Usage]:
     # `rosbag` is a script that has started the recorder.
-    return {who: usage.of(one.pid) + usage.below(one.pid) for who, one in processes.items()}
+    return {who: machine.usage_of(one.pid) + machine.usage_below(one.pid) for who, one in processes.items()}
 
 
 def _await_received(socket: Path, published: Mapping[str, int]) -> None:
@@ -166,7 +166,7 @@ def _finish(process: subprocess.Popen[str], number: signal.Signals) -> None:
     try:
         process.wait(_CATCH_UP_S + _END_S)
     except subprocess.TimeoutExpired as error:
-        raise BenchError(f"{process.args!r:.80} did not end") from error
+        raise InstrumentError(f"{process.args!r:.80} did not end") from error
 
 
 def _in_bag(bag: Path) -> Counter[str]:

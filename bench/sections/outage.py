@@ -13,12 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
 
-from bench.load.agent_process import AgentProcess
-from bench.meters.waiting import reached, wait_for
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
-from bench.target import Say, Target
 from iort_agent.config import load_config
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -28,6 +25,9 @@ from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.operations.delivery import audit, counts
 from local.network.proxy import PASS, REFUSE, Proxy
+from testkit.car import AgentProcess
+from testkit.target import Say, Target
+from testkit.waiting import reached, until
 
 ROBOT = "bench-outage"
 RATE_HZ = 50
@@ -62,7 +62,7 @@ def run(target: Target, say: Say) -> Section:
         target.listener(bundle.robot) as listener,
         AgentProcess(bundle) as agent,
     ):
-        wait_for(lambda: listener.heard, "the first live update")
+        until(lambda: listener.heard, "the first live update")
         say(f"driving for {BEFORE_S} s")
         threading.Event().wait(BEFORE_S)
         cut_us = time.time_ns() // 1000

@@ -16,19 +16,19 @@ from typing import Any, NamedTuple
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
 
-from bench.errors import BenchError
 from bench.load import stored_drive
-from bench.load.simulated import RATE_HZ
-from bench.meters import usage
 from bench.meters.message_sizes import item_bytes
 from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
+from testkit import machine
+from testkit.car import RATE_HZ
+from testkit.target import Say, Target
+from testkit.waiting import InstrumentError
 
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"
@@ -140,7 +140,7 @@ def _range(values: list[float]) -> str:
 
 
 def _read(target: Target, ways: dict[str, Callable[[], int]], points: int, say: Say) -> dict[str, Way]:
-    """Read in turns, once to warm up. Raises `BenchError` if a way does not read all points."""
+    """Read in turns, once to warm up. Raises `InstrumentError` if a way does not read all points."""
     found = {name: Way() for name in ways}
     for turn in range(REPEATS + 1):
         for name, read in ways.items():
@@ -155,7 +155,7 @@ def _read(target: Target, ways: dict[str, Callable[[], int]], points: int, say: 
                 way.server_cpu_s += [] if look.server_cpu_s is None else [round(look.server_cpu_s, 4)]
     for name, way in found.items():
         if way.read != points:
-            raise BenchError(f"{name}: {way.read} of {points} points")
+            raise InstrumentError(f"{name}: {way.read} of {points} points")
     return found
 
 
@@ -173,7 +173,7 @@ def _timed(target: Target, read: Callable[[], int]) -> _Look:
     cpu_s, wall_s = time.process_time(), time.perf_counter()
     count = read()
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    server_s = usage.spent_ms(before, _server_ns(target)) / 1000 if before else None
+    server_s = machine.spent_ms(before, _server_ns(target)) / 1000 if before else None
     return _Look(count, wall_s, cpu_s, server_s)
 
 
@@ -182,7 +182,7 @@ def _server_ns(target: Target) -> dict[int, int]:
     if target.embedded is None:
         return {}
     pid = target.embedded.emulator.pid
-    return usage.threads_ns([pid, *usage.descendants(pid)])
+    return machine.threads_ns([pid, *machine.descendants(pid)])
 
 
 def pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:

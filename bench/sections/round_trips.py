@@ -10,17 +10,17 @@ from __future__ import annotations
 from itertools import product
 
 from bench.floors.raw_mqtt import tcp_connect_s
-from bench.meters.asking import asking, round_trips_ms
 from bench.meters.round_trips import RAW, RoundTrips
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio, rounded, text
 from bench.sections import thesis_ping
-from bench.target import Say, Target
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
+from testkit.car import asking, round_trips_ms
+from testkit.target import Say, Target
 
 SIZES = {"0.5 KB": 512, "5 KB": 5 * 1024, "50 KB": 50 * 1024, "127 KB": 127 * 1024 - 200}
 RATES_HZ = (1, 10, 50)

@@ -9,7 +9,7 @@ from bench.load.fleet.figures import table
 from bench.load.fleet.run import measure
 from bench.report import plots
 from bench.report.result import Section
-from bench.target import Say, Target
+from testkit.target import Say, Target
 
 # Seconds that each fleet drives; a large fleet makes as many batches in less time.
 FLEETS = {1: 10, 10: 10, 100: 10, 500: 4}

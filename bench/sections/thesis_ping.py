@@ -10,14 +10,11 @@ import threading
 from collections.abc import Mapping
 from statistics import median
 
-from bench.errors import BenchError
-from bench.load.agent_process import AgentProcess
 from bench.meters.round_trips import RAW, RoundTrips
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio, rounded, spread, text
 from bench.report.thesis import PING_MS, SOURCE
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import T_US
 from iort_contract.topics import BROKER, PING_PATHS
@@ -26,6 +23,9 @@ from iort_station.page.page import load_keys
 from iort_station.page.pubnub import Listener
 from local.figures import THESIS, THESIS_MS
 from local.network.proxy import Proxy
+from testkit.car import AgentProcess
+from testkit.target import Say, Target
+from testkit.waiting import InstrumentError
 
 ONE_WAY_S = PING_MS / 2 / 1000
 WITH = f"with {ONE_WAY_S * 1000:.0f} ms each way"
@@ -51,7 +51,7 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
                         found.setdefault(f"{way} at {rate_hz} Hz", []).append(values)
             found[ECHO] = [[lines.raw.ping() * 1000 for _ in range(20)]]
         if lines.lost:
-            raise BenchError(f"{WITH}: {lines.lost} pings did not come back")
+            raise InstrumentError(f"{WITH}: {lines.lost} pings did not come back")
         say(f"{WITH}, to a PubNub subscriber")
         found[DASHBOARD] = [_to_subscriber(target, proxy.port)]
     return found
@@ -80,7 +80,7 @@ def _to_subscriber(target: Target, port: int) -> list[float]:
         threading.Event().wait(_DRIVE_S)
         measured = list(delays_ms)
     if not measured:
-        raise BenchError(f"{WITH}: no live update was heard")
+        raise InstrumentError(f"{WITH}: no live update was heard")
     return measured
 
 

@@ -19,22 +19,22 @@ from itertools import count
 from statistics import median
 from typing import Any
 
-from bench import ROOT
-from bench.errors import BenchError
 from bench.floors.functions import live as live_floor
 from bench.floors.functions import summarize as summarize_floor
 from bench.load import stored_drive
 from bench.load.events import live_event, stream_event
-from bench.load.simulated import RATE_HZ
-from bench.meters.invocations import Event, Measured, configure, invoke, measure, reporting
+from bench.meters.invocations import Event, Measured, invoke, measure, reporting
 from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio, spread
-from bench.target import Say, Target, temporary_function
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.codec.columns import DICTIONARY
 from iort_contract.topics import LIVE, RECORD, build_topic
+from testkit import ROOT
+from testkit.car import RATE_HZ
+from testkit.target import Say, Target, configure, temporary_function
+from testkit.waiting import InstrumentError
 
 SIZES_MB = (128, 256, 512, 1024, 1769)
 # "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".
@@ -256,6 +256,6 @@ def _cycle() -> dict[str, float]:
         check=False,
     )
     if done.returncode:
-        raise BenchError(f"bench.meters.cycle failed: {done.stderr[-800:]}")
+        raise InstrumentError(f"bench.meters.cycle failed: {done.stderr[-800:]}")
     found: dict[str, float] = json.loads(done.stdout)
     return found

@@ -9,11 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 
-from bench.load.agent_process import AgentProcess
-from bench.meters.waiting import wait_for
 from bench.report.result import Section
 from bench.report.spread import Spread, spread, text
-from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
@@ -27,6 +24,9 @@ from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.page.page import load_keys
 from iort_station.page.pubnub import Listener
+from testkit.car import AgentProcess
+from testkit.target import Say, Target
+from testkit.waiting import until
 
 ROBOT = "bench-viewing"
 IDLE_S, WATCHED_S, WAKES = 60, 20, 20
@@ -73,7 +73,7 @@ def run(target: Target, say: Say) -> Section:
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}
     robot = target.robot(ROBOT, sources=[source])
     with _listening(target, robot.robot) as viewers, AgentProcess(robot):
-        wait_for(lambda: viewers.heard[IOT], "the first live message")
+        until(lambda: viewers.heard[IOT], "the first live message")
         threading.Event().wait(_WARM_UP_S)
         say(f"nobody looks for {IDLE_S} s")
         before = len(viewers.heard[IOT])
@@ -114,11 +114,11 @@ def _wakes(target: Target, robot: str, viewers: Viewers, way: str, say: Say) -> 
         say(f"wake {wake + 1} of {WAKES}, by {way}")
         began = time.monotonic()
         viewing.view(target.cloud, [robot], lease)
-        wait_for(lambda: viewers.since(way, began, _FULL_MS), "a message at the full rate")  # noqa: B023 - within the loop
+        until(lambda: viewers.since(way, began, _FULL_MS), "a message at the full rate")  # noqa: B023 - within the loop
         found.append((viewers.since(way, began, _FULL_MS)[0].at - began) * 1000)
         ended = time.monotonic()
         viewing.view(target.cloud, [robot], replace(lease, lease_ms=0))
-        wait_for(lambda: viewers.since(IOT, ended, _IDLE_MS), "the car to sleep again")  # noqa: B023 - as above
+        until(lambda: viewers.since(IOT, ended, _IDLE_MS), "the car to sleep again")  # noqa: B023 - as above
     return found
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable
 from typing import Any
 
 from typing_extensions import Self
@@ -54,11 +52,3 @@ class Running:
                 return
             self.samples.append((stream, t_us, values))
             self._more.notify_all()
-
-
-def eventually(condition: Callable[[], Any]) -> None:
-    """Poll a condition that has no event."""
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)

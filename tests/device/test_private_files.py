@@ -22,7 +22,7 @@ from iort_agent.spool import PROCESS
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
 from iort_contract.catalog.vesc import VESC_STREAM
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.unit.agent.test_agent import config_file
 
 SECRET = b"another's, and not for the bucket"

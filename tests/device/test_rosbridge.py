@@ -24,8 +24,9 @@ from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig
 from iort_agent.sources.rosbridge.connection import Times
-from tests.device.running import Running, eventually
-from tests.ports import free_port
+from testkit.ports import free_port
+from testkit.waiting import until
+from tests.device.running import Running
 from tests.rosbridge_standin import RosbridgeStandin
 
 CORE = "/sensors/core"
@@ -186,7 +187,7 @@ def test_the_source_reconnects_and_resubscribes_each_time(
 def test_the_source_may_start_before_the_server(log: pytest.LogCaptureFixture) -> None:
     server = RosbridgeStandin(free_port())
     with Running(config(server)) as running:
-        eventually(lambda: "nobody listens there: is rosbridge_server running?" in log.text)
+        until(lambda: "nobody listens there: is rosbridge_server running?" in log.text)
         with server:
             server.wait_for("subscribe")
             server.publish(CORE, state())
@@ -196,7 +197,7 @@ def test_the_source_may_start_before_the_server(log: pytest.LogCaptureFixture) -
 
 def test_pings_keep_a_quiet_connection_open(server: RosbridgeStandin) -> None:
     with Running(config(server, times=SOON._replace(ping_s=0.5, dead_s=60.0))) as running:
-        eventually(lambda: server.pings >= 4)
+        until(lambda: server.pings >= 4)
     assert running.source.connection.connects == 1
 
 
@@ -205,7 +206,7 @@ def test_the_source_disconnects_from_a_server_without_answers(
 ) -> None:
     server.deaf = True
     with Running(config(server, times=SOON._replace(ping_s=0.5, dead_s=2.0))) as running:
-        eventually(lambda: running.source.connection.connects == 2)
+        until(lambda: running.source.connection.connects == 2)
     assert "no answer for 2 s" in log.text
 
 
@@ -226,7 +227,7 @@ def test_a_slow_topic_keeps_its_subscription(server: RosbridgeStandin) -> None:
             server.publish("/fast", {"n": time.monotonic()})
             time.sleep(0.05)  # the pace of a publisher
         server.publish("/slow", numbered(2))
-        eventually(lambda: running.source.report()["/slow"]["messages"] == 2)
+        until(lambda: running.source.report()["/slow"]["messages"] == 2)
         # The source knows the pace after an interruption.
         server.cut()
         server.wait_for("subscribe", 4)
@@ -246,8 +247,8 @@ def test_a_latched_message_is_stored_once(server: RosbridgeStandin, *, stamped: 
         running.wait_for(1)
         server.wait_for("unsubscribe", 2)
         server.cut()
-        eventually(lambda: running.source.connection.connects == 2)
-        eventually(lambda: running.source.report()["/map"].get("latched_again", 0) >= 3)
+        until(lambda: running.source.connection.connects == 2)
+        until(lambda: running.source.report()["/map"].get("latched_again", 0) >= 3)
         # A latched message does not prove that the server is deaf: the cut is the only interruption.
         assert running.source.report()["/map"]["interruptions"] == 1
         server.publish("/map", {**message, "changed": 1}, latch="/map_server")
@@ -302,7 +303,7 @@ def test_a_long_interruption_is_reported_while_it_lasts(server: RosbridgeStandin
     with Running(config(server)) as running:
         server.wait_for("subscribe")
         server.__exit__()
-        eventually(lambda: running.source.report()[CORE].get("dark_s", 0) >= 0.3)
+        until(lambda: running.source.report()[CORE].get("dark_s", 0) >= 0.3)
         server.__enter__()
 
 
@@ -356,7 +357,7 @@ def test_an_invalid_message_does_not_stop_the_source(server: RosbridgeStandin, n
         server.wait_for("subscribe")
         server.send(nonsense)
         server.publish(CORE, state(5))
-        eventually(lambda: running.samples and running.samples[-1][2] == {"speed": 5, "fault_code": 0})
+        until(lambda: running.samples and running.samples[-1][2] == {"speed": 5, "fault_code": 0})
     assert running.source.connection.connects == 1
 
 
@@ -364,7 +365,7 @@ def test_the_servers_complaints_are_logged(server: RosbridgeStandin, log: pytest
     with Running(config(server)):
         server.wait_for("subscribe")
         server.send('{"op": "status", "level": "error", "msg": "Unable to load vesc_msgs.msg"}')
-        eventually(lambda: "the server says: Unable to load vesc_msgs.msg" in log.text)
+        until(lambda: "the server says: Unable to load vesc_msgs.msg" in log.text)
 
 
 def test_another_server_on_the_port_is_reported(log: pytest.LogCaptureFixture) -> None:
@@ -372,7 +373,7 @@ def test_another_server_on_the_port_is_reported(log: pytest.LogCaptureFixture) -
         url = f"{server.url}/elsewhere"
         topics = ((CORE, TopicConfig(stream="vesc", time="arrival")),)
         with Running(FastConfig(RosbridgeConfig(url=url, topics=topics))):
-            eventually(lambda: "is no rosbridge server" in log.text)
+            until(lambda: "is no rosbridge server" in log.text)
 
 
 def test_an_error_names_the_missing_websocket_package(

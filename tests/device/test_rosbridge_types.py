@@ -13,7 +13,8 @@ pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
 from iort_contract.messages.message_type import message_type
-from tests.device.running import Running, eventually
+from testkit.waiting import until
+from tests.device.running import Running
 from tests.device.test_rosbridge import CORE, VESC, config, state
 from tests.rosbridge_standin import RosbridgeStandin
 
@@ -106,7 +107,7 @@ def test_held_messages_are_sent_when_the_agent_ends() -> None:
         with Running(config(server)) as running:
             server.wait_for("subscribe")
             server.publish(CORE, state(5))
-            eventually(lambda: running.source.report()[CORE]["messages"] == 1)
+            until(lambda: running.source.report()[CORE]["messages"] == 1)
     assert [values["speed"] for _, _, values in running.samples] == [5]
 
 

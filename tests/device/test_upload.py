@@ -27,9 +27,9 @@ from iort_contract.messages.requests.files import (
     file_key,
 )
 from iort_contract.topics import FILE, PING, build_topic
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
+from testkit.waiting import GUARD_S
 from tests.store_standin import store
-from tests.waiting import GUARD_S
 
 
 class Rig:

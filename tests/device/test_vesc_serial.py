@@ -17,7 +17,8 @@ from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.vesc import VescConfig, why
-from tests.device.running import Running, eventually
+from testkit.waiting import until
+from tests.device.running import Running
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
 
 
@@ -121,7 +122,7 @@ def test_an_unknown_length_is_logged_once_and_never_misread(
 ) -> None:
     vesc.answer = lambda frame, n: [framed(values(n) + b"\x00\x00")]
     with Running(config(vesc)) as running:
-        eventually(lambda: running.source.counts.unknown >= 20)
+        until(lambda: running.source.counts.unknown >= 20)
     assert running.samples == []
     errors = [record for record in log.records if record.levelno >= logging.WARNING]
     assert len(errors) == 1
@@ -140,7 +141,7 @@ def test_a_late_answer_is_not_used_for_the_next_request(vesc: VescStandin) -> No
 
     vesc.answer = answer
     with Running(config(vesc, rate_hz=1.0, timeout_s=0.3)) as running:
-        eventually(lambda: running.source.counts.timeouts == 1)
+        until(lambda: running.source.counts.timeouts == 1)
         vesc.say(kept[0])
         running.wait_for(6)
         assert running.source.counts.late == 1
@@ -152,7 +153,7 @@ def test_the_source_resumes_after_a_replug(vesc: VescStandin, log: pytest.LogCap
         for i in range(3):
             running.wait_for(10, more=True)
             vesc.unplug()
-            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023 - called within the iteration
+            until(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023 - called within the iteration
             vesc.plug()
         running.wait_for(10, more=True)
         assert running.source.counts.opened == 4
@@ -165,7 +166,7 @@ def test_the_source_finds_a_controller_plugged_in_later(
 ) -> None:
     vesc = VescStandin(tmp_path / "vesc")
     with Running(config(vesc)) as running:
-        eventually(lambda: "waiting for it to be plugged in" in log.text)
+        until(lambda: "waiting for it to be plugged in" in log.text)
         with vesc:
             running.wait_for(3)
 
@@ -174,8 +175,8 @@ def test_silence_is_reported_and_overcome(vesc: VescStandin, log: pytest.LogCapt
     with Running(config(vesc, timeout_s=0.05)) as running:
         running.wait_for(5)
         vesc.answer = lambda frame, n: []
-        eventually(lambda: "no answer: is it a VESC" in log.text)
-        eventually(lambda: running.source.counts.opened >= 2)
+        until(lambda: "no answer: is it a VESC" in log.text)
+        until(lambda: running.source.counts.opened >= 2)
         vesc.answer = lambda frame, n: [frame]
         running.wait_for(5, more=True)
     assert log.text.count("no answer: is it a VESC") == 1
@@ -185,7 +186,7 @@ def test_silence_is_reported_and_overcome(vesc: VescStandin, log: pytest.LogCapt
 def test_a_wrong_baud_rate_is_reported_as_noise(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     vesc.answer = lambda frame, n: [bytes(byte ^ 0x5A for byte in frame) * 20]
     with Running(config(vesc, timeout_s=0.05)):
-        eventually(lambda: "is the baud rate right?" in log.text)
+        until(lambda: "is the baud rate right?" in log.text)
 
 
 def test_a_slow_controller_skips_polls_and_never_queues(vesc: VescStandin) -> None:
@@ -208,7 +209,7 @@ def test_two_programs_cannot_share_the_port(vesc: VescStandin, log: pytest.LogCa
     with Running(config(vesc)) as first:
         first.wait_for(3)
         with Running(config(vesc)) as second:
-            eventually(lambda: "in use by another program" in log.text)
+            until(lambda: "in use by another program" in log.text)
         assert second.samples == []
         first.wait_for(3, more=True)
 
@@ -225,7 +226,7 @@ def test_a_file_other_than_a_serial_port_is_reported(
 ) -> None:
     make(tmp_path / "port")
     with Running(VescConfig(port=str(tmp_path / "port"))):
-        eventually(lambda: words in log.text)
+        until(lambda: words in log.text)
 
 
 def test_an_error_names_the_group_of_the_port() -> None:
@@ -240,7 +241,7 @@ def test_the_source_stops_at_once(vesc: VescStandin, trouble: str) -> None:
     if trouble == "absent":
         vesc.unplug()
     with Running(config(vesc, timeout_s=30.0)) as running:
-        eventually(lambda: trouble == "absent" or bool(vesc.asked))
+        until(lambda: trouble == "absent" or bool(vesc.asked))
         running.stop.set()
         running.thread.join(25)
         assert not running.thread.is_alive(), "it waited for an answer"

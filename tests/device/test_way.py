@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, Finding
 from iort_agent.verbs import connectivity
-from tests.ports import free_port
+from testkit.ports import free_port
 
 NOW = datetime.now(timezone.utc)
 DAY = timedelta(days=1)

@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
@@ -26,9 +25,9 @@ from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.pubnub.standin import PubNubStandIn
+from testkit.ports import free_port
+from testkit.waiting import until
 from tests.local.pubnub.pubnub_sdk import sdk
-from tests.ports import free_port
-from tests.waiting import GUARD_S
 
 
 @pytest.fixture(scope="session")
@@ -81,15 +80,6 @@ def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any
     assert done.returncode == 0, done.stderr
     written: dict[str, Any] = json.loads(report.read_text())
     return written
-
-
-def until(condition: Callable[[], Any], *, seconds: float = GUARD_S) -> Any:
-    """Poll for the condition's first true value; tables notify nobody of changes."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"not true within {seconds} s"
-        time.sleep(0.05)
-    return value
 
 
 def fire(embedded: EmbeddedCloud, name: str) -> None:

@@ -19,9 +19,9 @@ from typing import Any
 
 import pytest
 
-from bench import ROOT
-from bench.ros.graph import PYTHONPATH, SYSTEM_PYTHON, python_with_rospy
-from tests.ports import free_port
+from testkit import ROOT
+from testkit.ports import free_port
+from testkit.ros import PYTHONPATH, SYSTEM_PYTHON, python_with_rospy
 
 SCRIPTS = Path(__file__).resolve().parent / "nodes"
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs"

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.ros.conftest import Graph, Process
 
 CONFIG = {

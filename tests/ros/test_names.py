@@ -12,7 +12,7 @@ import yaml
 
 from iort_agent.errors import AgentError
 from iort_agent.status import fetch
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.faults.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
 from tests.ros.test_downlink import connected, drive, has, start
@@ -67,7 +67,7 @@ def test_one_of_two_simultaneous_nodes_waits_and_neither_ends(graph: Graph) -> N
         heard = [newest(one) > n for one, n in zip(both, before, strict=True)]
         return heard.count(True) == 1 and registered(graph, "/iort_agent") == holder
 
-    until(settled, seconds=WAIT_S)
+    until(settled, within_s=WAIT_S)
     assert sum(said(one, WAITS) for one in both) >= 1
     assert [one.alive() for one in both] == [True, True]
 
@@ -90,7 +90,7 @@ def test_the_status_names_the_waiting_source_and_other_sources_continue(graph: G
     taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
     until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
     agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
-    (alarm,) = until(agent.waits, seconds=WAIT_S)
+    (alarm,) = until(agent.waits, within_s=WAIT_S)
     assert alarm.startswith(f"source waits: {WAITS}")
     assert alarm.endswith("set sources[].node")
     before = agent.samples("vesc")

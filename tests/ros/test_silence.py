@@ -11,7 +11,7 @@ import yaml
 
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.faults.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
 from tests.ros.test_source import WHEEL
@@ -38,7 +38,7 @@ class Car:
         self.process = graph.module("iort_agent.cli", "run", "--config", config, "--drain-s", 0)
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = until(self._answer, seconds=WAIT_S)
+        found: dict[str, Any] = until(self._answer, within_s=WAIT_S)
         return found
 
     def _answer(self) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
-from tests.local.conftest import embedded, until  # noqa: F401 - a fixture
+from testkit.waiting import until
+from tests.local.conftest import embedded  # noqa: F401 - a fixture
 from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.robot import TOPICS
 

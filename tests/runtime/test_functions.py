@@ -15,10 +15,8 @@ pytest.importorskip("awslambdaric", reason="it has wheels for Linux alone")
 
 from scripts.layer import compile_all
 from stacks.settings import ROOT
-from tests.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
-from tests.runtime.deployed import functions
-from tests.runtime.environment import RuntimeFailedError, started
-from tests.runtime.events import events
+from testkit.deployed import events, functions
+from testkit.runtime import ERROR, PUBNUB_KEY, RESPONSE, RuntimeFailedError, started
 
 LAYER = ROOT / "build" / "layer" / "local"
 # Per function: the answer to its event, and the services that it calls.

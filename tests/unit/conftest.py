@@ -89,7 +89,7 @@ def dynamodb(aws, tables):
     """moto's DynamoDB with the tables as the template declares them."""
     import boto3
 
-    from tests.fakes import NAMES, QUARANTINE
+    from testkit.dynamodb import NAMES, QUARANTINE
 
     client = boto3.client("dynamodb")
     nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
@@ -112,7 +112,7 @@ def s3(aws):
     import boto3
     from botocore.config import Config
 
-    from tests.fakes import FILES
+    from testkit.dynamodb import FILES
 
     client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
     client.create_bucket(Bucket=FILES, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})

@@ -8,7 +8,7 @@ import pytest
 
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
-from tests.ports import free_port
+from testkit.ports import free_port
 from tests.web.cars import GAIN, PUBLISH_KEY, SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from bench.target import Target
-from verify.tools.waiting import until
+from testkit.target import Target
+from testkit.waiting import until
 
 _PROBE = "verify: does this arrive?"
 Message = dict[str, Any]
-# Returns the first message that matches. Raises `VerifyError` if none arrives in time.
+# Returns the first message that matches. Raises `InstrumentError` if none arrives in time.
 Receive = Callable[[Callable[[Message], bool], str], Message]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.target import Target
+from testkit.target import Target
 
 
 def lines(target: Target, function: str, since_ms: int) -> list[str]:

@@ -8,14 +8,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.target import Target
 from iort_contract.topics import PING, PONG, RECORD, build_topic, record_topic
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.page.pubnub import Listener
-from verify.errors import CannotAskError, VerifyError
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.target import Target
+from testkit.waiting import InstrumentError
+from verify.question import CannotAskError
 from verify.tools.spoofing import spoofed
 
 
@@ -62,10 +63,10 @@ class Pair(NamedTuple):
         self.publish(topic, spoofed(message, self.victim, lane, name, namespace))
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Publish; raises `VerifyError` if the broker refuses."""
+        """Publish; raises `InstrumentError` if the broker refuses."""
         answer = self.robot.publish(topic, payload)
         if answer != "SUCCESS":
-            raise VerifyError(f"the broker answered {answer} on {topic}")
+            raise InstrumentError(f"the broker answered {answer} on {topic}")
 
     def asked(self, name: str, message: bytes) -> dict[str, Any]:
         """The answer on the robot's own lane pong."""

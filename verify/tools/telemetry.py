@@ -6,7 +6,6 @@ import json
 import time
 from typing import Any
 
-from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import STREAMS
@@ -15,9 +14,9 @@ from iort_station.fleet import registry
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
-from verify.errors import VerifyError
-from verify.tools.robot import Robot
-from verify.tools.waiting import until
+from testkit.mqtt import Robot
+from testkit.target import Target
+from testkit.waiting import InstrumentError, until
 
 RUN = "0badcafe"
 
@@ -72,8 +71,8 @@ def entries(target: Target, robot: str) -> list[DeadLetter]:
 
 
 def only_entry(target: Target, robot: str, *, within_s: float = 90.0) -> DeadLetter:
-    """Wait for the robot's entry in the quarantine; raises `VerifyError` unless it is the only one."""
+    """Wait for the robot's entry in the quarantine; raises `InstrumentError` unless it is the only one."""
     found = until(lambda: entries(target, robot), "the entry in the quarantine", within_s=within_s)
     if len(found) != 1:
-        raise VerifyError(f"the quarantine must have one entry of {robot}, got {len(found)}")
+        raise InstrumentError(f"the quarantine must have one entry of {robot}, got {len(found)}")
     return found[0]

@@ -12,7 +12,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from bench.target import Target
 from iort_agent.files.upload import trusting
 from iort_contract.messages.requests.files import (
     Address,
@@ -24,7 +23,8 @@ from iort_contract.messages.requests.files import (
     file_key,
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.target import Target
 
 _CODE = re.compile(r"<Code>([^<]+)</Code>")
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from bench.report.result import Table
 from local.figures import Spread
+from testkit.command import Table
 
 # Summaries that are later are late.
 BEHIND_S = 10.0

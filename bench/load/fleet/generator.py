@@ -20,11 +20,11 @@ from typing import Any
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from bench.load.simulated import simulated_drive
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import CMD, PING_PATHS, PONG, build_topic, record_topic
+from testkit.car import simulated_drive
 
 Columns = dict[str, list[Value]]
 _SECOND_US = 1_000_000

@@ -16,11 +16,8 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from bench import ROOT
-from bench.errors import BenchError
 from bench.load.fleet.figures import Fleet
 from bench.load.fleet.generator import Load
-from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
@@ -31,6 +28,8 @@ from iort_station.operations.delivery import counts
 from iort_station.operations.delivery.audit import headers
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
+from testkit import ROOT, machine
+from testkit.waiting import InstrumentError
 
 # Takes the name of the step when it begins.
 Tell = Callable[[str], None]
@@ -110,7 +109,7 @@ def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
 
     def said() -> Iterator[dict[str, Any]]:
         yield from map(json.loads, process.stdout or ())
-        raise BenchError(f"the load generator ended with status {process.wait()}")
+        raise InstrumentError(f"the load generator ended with status {process.wait()}")
 
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -119,10 +118,10 @@ def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
             process.terminate()
 
 
-def _usage(generator: int, emulator: int) -> dict[str, usage.Usage]:
+def _usage(generator: int, emulator: int) -> dict[str, machine.Usage]:
     return {
-        "load generator": usage.of(generator),
-        **dict(zip(OURS, (usage.of(emulator), usage.below(emulator)), strict=True)),
+        "load generator": machine.usage_of(generator),
+        **dict(zip(OURS, (machine.usage_of(emulator), machine.usage_below(emulator)), strict=True)),
     }
 
 

@@ -25,8 +25,9 @@ from iort_station import data
 from iort_station.data import findings
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud
-from tests.fakes import item_of
-from tests.local.conftest import fire, run_agent, until
+from testkit.dynamodb import item_of
+from testkit.waiting import until
+from tests.local.conftest import fire, run_agent
 from tests.unit.analysis.simulated import streams
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,8 @@ from bench import run
 from bench.load.events import live_event
 from bench.report import spending
 from bench.sections import SECTIONS, utilisation
-from bench.target import AWS, open_target
 from iort_station.fleet import identity, robots
+from testkit.target import AWS, open_target
 
 
 def memory_mb(cloud) -> int:

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.meters import usage
 from local.deployment import ROOT
-from tests.local.conftest import until
-from tests.waiting import GUARD_S
+from testkit import machine
+from testkit.waiting import GUARD_S, until
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler makes the clock: apt install gcc")
@@ -23,7 +22,7 @@ def test_a_bench_that_is_ended_leaves_no_process_behind(tmp_path):
     with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as bench:
 
         def running() -> dict[int, str]:
-            found = {pid: _command(pid) for pid in usage.descendants(bench.pid)}
+            found = {pid: _command(pid) for pid in machine.descendants(bench.pid)}
             return found if any("local.emulator.run" in one for one in found.values()) else {}
 
         started = until(running)

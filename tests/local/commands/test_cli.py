@@ -16,9 +16,9 @@ from iort_contract.messages.requests.files import File, file_key
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud
 from iort_station.cost.usage import Usage
-from tests.local.conftest import run_agent, until
-from tests.ports import free_port
-from tests.waiting import GUARD_S
+from testkit.ports import free_port
+from testkit.waiting import GUARD_S, until
+from tests.local.conftest import run_agent
 
 
 def test_a_robot_is_added_listed_and_removed(iort, tmp_path):

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from local.deployment import ROOT
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.recordings import recording
 
 TIMEOUT_S = 400

@@ -17,7 +17,8 @@ from iort_contract.messages.requests.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
 from local.demo.run import DOWNLINK
-from tests.local.conftest import recorded, until
+from testkit.waiting import until
+from tests.local.conftest import recorded
 from tests.local.robots.test_shadow import driving
 from tests.manual import COMMANDS, examples
 

@@ -22,9 +22,8 @@ from iort_contract.messages.requests.files import File, file_key
 from iort_station.data.recorded import topic_of
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.faults.test_uplink import self_signed, set_status
-from tests.waiting import GUARD_S
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 

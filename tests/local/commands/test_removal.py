@@ -13,7 +13,7 @@ from iort_station.cli.main import app
 from iort_station.fleet import identity, registry, robots
 from local.deployment import deploy
 from scripts import destroy
-from tests.local.conftest import until
+from testkit.waiting import until
 
 
 @pytest.fixture(scope="module")

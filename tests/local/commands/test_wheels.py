@@ -13,8 +13,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
 from local.cloud import EmbeddedCloud
 from scripts import wheels
+from testkit.waiting import until
 from tests.installed import Installed
-from tests.local.conftest import until
 
 RATE_HZ, DRIVE_S = 20, 2
 

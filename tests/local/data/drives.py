@@ -15,8 +15,7 @@ from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from tests.local.conftest import until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
 
 RATE_HZ = 50
 # The log's column and the contract's field of the counter.

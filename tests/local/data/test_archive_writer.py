@@ -7,7 +7,8 @@ import json
 from iort_contract.archive import DUE_MS, HOUR, PENDING, ArchiveTable, archived_hour, parse_pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.local.conftest import fire, run_agent, until
+from testkit.waiting import until
+from tests.local.conftest import fire, run_agent
 from tests.local.data.drives import RATE_HZ, counter_log
 
 SECONDS = 3

@@ -19,11 +19,12 @@ from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.operations.delivery import counts
+from testkit.mqtt import Robot
+from testkit.waiting import until
 from tests.foxglove import flat, opened
-from tests.local.conftest import run_agent, until
+from tests.local.conftest import run_agent
 from tests.local.data.test_query import iort
 from tests.recordings import recording
-from verify.tools.robot import Robot
 
 VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
 

@@ -25,10 +25,10 @@ from iort_station.operations.delivery import counts
 from iort_station.page.listening import listening
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
-from tests.local.conftest import until
+from testkit.mqtt import Robot
+from testkit.waiting import until
 from tests.local.data.drives import Agent
 from verify.preflight.deployed import transport
-from verify.tools.robot import Robot
 
 _FULL_MS, _IDLE_MS = 100, 10_000
 

@@ -49,12 +49,11 @@ from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.network.proxy import REFUSE, Proxy
-from tests.local.conftest import until
+from testkit.mqtt import Robot
+from testkit.ports import free_port
+from testkit.waiting import GUARD_S, until
 from tests.local.data.drives import Agent
 from tests.local.data.test_archive import HOUR_US, START, stored
-from tests.ports import free_port
-from tests.waiting import GUARD_S
-from verify.tools.robot import Robot
 
 ROBOT, STREAM = "moving", "vesc"
 VEHICLE = {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 1.5}

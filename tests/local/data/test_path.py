@@ -17,7 +17,8 @@ from iort_station import data
 from iort_station.operations.delivery import counts
 from iort_station.page.pubnub import Listener
 from local.cloud import EmbeddedCloud
-from tests.local.conftest import run_agent, until
+from testkit.waiting import until
+from tests.local.conftest import run_agent
 from tests.local.data.drives import Agent
 from tests.recordings import recording
 

@@ -18,7 +18,7 @@ from iort_contract.topics import build_topic
 from iort_station import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 START = 1_700_000_000_000_000
 BATCHES, EACH, FIELDS = 80, 150, 50

@@ -16,8 +16,8 @@ from iort_station.fleet import registry
 from iort_station.operations import recompute
 from iort_station.operations.delivery import counts
 from iort_station.operations.recompute import Recomputed
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
 
 RUN = "0badcafe"
 SECONDS = 6

@@ -14,11 +14,11 @@ from rosbags.rosbag1 import Writer
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
+from testkit.ros1_types import Message, header
 from tests.local.conftest import run_agent
 from tests.local.data.drives import Agent
 from tests.ros.mixed.compare import compare, read
 from tests.ros.mixed.robot import TOPICS, Maker, Topic
-from tests.ros1_types import Message, header
 from tests.unit.station.recordings.test_round_trip import KNOWN
 
 COUNT, RATE_HZ = 500, 50

@@ -24,10 +24,9 @@ from iort_station.fleet import identity, robots
 from iort_station.operations.delivery import accounts, audit, counts
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.data.drives import RATE_HZ, Agent, counted, counter_log
 from tests.local.faults.test_uplink import set_status
-from tests.waiting import GUARD_S
 
 OUTAGE_S = 60
 DRIVE_S = 75

@@ -11,7 +11,7 @@ from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from iort_station.operations.delivery import counts
 from local.cloud import EmbeddedCloud
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.ros.conftest import Graph, graph, ros_python  # noqa: F401 - fixtures
 from tests.ros.test_source import WHEEL
 

@@ -23,8 +23,8 @@ from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
 
 
 @pytest.fixture

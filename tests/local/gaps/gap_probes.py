@@ -20,7 +20,7 @@ from ministack.core import iam_actions, iam_evaluator, lambda_runtime
 from ministack.core.responses import request_scope
 from ministack.services import cloudwatch_logs, dynamodb, iot, iot_data, lambda_svc, sqs
 
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
     "sqs",

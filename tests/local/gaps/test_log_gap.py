@@ -13,7 +13,7 @@ from ministack.core import lambda_runtime
 from ministack.services import lambda_svc
 
 from local.gaps.functions import log_end, log_retention
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 
 @pytest.fixture(scope="module")

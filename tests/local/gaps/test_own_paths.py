@@ -8,7 +8,7 @@ import urllib.request
 
 import pytest
 
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ import pytest
 from local.deployment import ROOT
 from local.emulator import patched
 from local.errors import LocalError
+from testkit.waiting import GUARD_S
 from tests.local.gaps import gap_probes
-from tests.waiting import GUARD_S
 
 PATCHES = [patch.stem for patch in patched.PATCHES]
 HEAD = re.compile(
@@ -26,7 +26,7 @@ HEAD = re.compile(
 ASK = """
 import json, sys
 from tests.local.gaps import gap_probes
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 print(json.dumps({name: bool(getattr(gap_probes, name)()) for name in sys.argv[1:]}))
 """
 

@@ -16,9 +16,9 @@ from ministack.services import dynamodb, lambda_svc, sqs
 from local.gaps.functions.stream_retries import StreamMappings
 from local.keeping import queues
 from local.keeping.ledger import LedgerError
+from testkit.waiting import GUARD_S
 from tests.local.gaps import series_table
 from tests.local.keeping.in_process import ACCOUNT, REGION, kept
-from tests.waiting import GUARD_S
 
 QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
 

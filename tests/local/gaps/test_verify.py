@@ -15,14 +15,14 @@ from dataclasses import replace
 
 import pytest
 
-from bench.target import AWS, EMBEDDED, Target
 from iort_contract.tables import ROBOT
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.page.page import load_keys
+from testkit.target import AWS, EMBEDDED, Target
+from testkit.waiting import InstrumentError
 from verify import price, report, run
 from verify.deployment import CHANGES
-from verify.errors import VerifyError
 from verify.question import CHANGED, ENDED, Question, Verdict, ask
 from verify.questions import ALL
 from verify.questions.messages import live
@@ -96,7 +96,7 @@ def test_a_run_deploys_queries_reports_and_destroys(embedded, tmp_path):
 
 def test_a_run_without_consent_deploys_nothing(embedded, tmp_path):
     recorder = Recorder()
-    with pytest.raises(VerifyError, match="no terminal to ask"):
+    with pytest.raises(InstrumentError, match="no terminal to ask"):
         run.run(options(tmp_path, yes=False), embedded.cloud, recorder)
     assert recorder.told == []
 
@@ -106,11 +106,11 @@ def test_a_failed_run_is_destroyed_and_its_answers_are_reported(embedded, tmp_pa
         def deploy(self, settings):
             super().deploy(settings)
             if settings:
-                raise VerifyError("cdk deploy failed")
+                raise InstrumentError("cdk deploy failed")
 
     recorder, first = Failing(), RULES[0]
     with_key = replace(first, name="a.question", phase=CHANGED)
-    with pytest.raises(VerifyError, match="cdk deploy failed"):
+    with pytest.raises(InstrumentError, match="cdk deploy failed"):
         run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
     assert recorder.told == [{}, CHANGES, "destroyed"]
     assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
@@ -119,12 +119,12 @@ def test_a_failed_run_is_destroyed_and_its_answers_are_reported(embedded, tmp_pa
 def test_leftovers_after_a_failure_are_reported(embedded, tmp_path, capsys):
     class Failing(Recorder):
         def deploy(self, settings):
-            raise VerifyError("cdk deploy failed")
+            raise InstrumentError("cdk deploy failed")
 
         def destroy(self):
             return ["the stack storage"]
 
-    with pytest.raises(VerifyError, match="cdk deploy failed"):
+    with pytest.raises(InstrumentError, match="cdk deploy failed"):
         run.run(options(tmp_path), embedded.cloud, Failing())
     assert "left over: the stack storage" in capsys.readouterr().out
 

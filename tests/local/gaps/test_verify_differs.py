@@ -9,10 +9,10 @@ import time
 
 import pytest
 
-from bench.target import EMBEDDED, Target
 from iort_contract.cloud import fleet_name
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, rule_name
+from testkit.target import EMBEDDED, Target
 from verify.question import Verdict, ask
 from verify.questions import ALL
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.meters.usage import descendants
 from functions.live import REFUSALS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
@@ -16,8 +15,9 @@ from iort_contract.messages.requests.files import decode_file_answer
 from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_topic
 from iort_station.operations import quarantine
 from iort_station.page.pubnub import Listener
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.machine import descendants
+from testkit.mqtt import Robot
+from testkit.waiting import until
 
 BAD, GOOD = 80, 20
 

@@ -17,9 +17,9 @@ from iort_contract.tables import ROBOT
 from iort_station.fleet import identity, robots
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
-from tests.local.conftest import run_agent, until
-from tests.waiting import GUARD_S
-from verify.tools.robot import WAIT_S, Robot
+from testkit.mqtt import WAIT_S, Robot
+from testkit.waiting import GUARD_S, until
+from tests.local.conftest import run_agent
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 

@@ -20,8 +20,8 @@ from iort_agent.identity import parse_certificate
 from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
 from iort_station.fleet import identity, registry
 from local.cloud import ROOT
+from testkit.mqtt import Robot
 from tests.local.identity.test_identity import certificates, command
-from verify.tools.robot import Robot
 
 # The process dies as if the battery failed: before AWS IoT is asked to register, or right after.
 KILLED = """

@@ -18,9 +18,9 @@ from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import CMD, FLEET, PING, PONG, RULE, build_topic
 from iort_station.fleet import identity, robots
+from testkit.mqtt import Robot, payload_for
+from testkit.waiting import InstrumentError
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
-from verify.errors import VerifyError
-from verify.tools.robot import Robot, payload_for
 
 WAIT_S = 60
 # The broker's answers to allowed requests.
@@ -65,7 +65,7 @@ class Session:
                 if row.does == PUBLISH
                 else self._robot.subscribe(row.what)
             )
-        except VerifyError:
+        except InstrumentError:
             # The library's error only reports a missing answer; the lost connection shows the denial.
             assert self._robot.lost.wait(WAIT_S), row
             said = "LOST"

@@ -21,6 +21,7 @@ from iort_station.fleet import broker
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role, signed_url
 from iort_station.page import motion
+from testkit.waiting import GUARD_S
 from tests.isolation import (
     CONNECT,
     DRIVER,
@@ -32,7 +33,6 @@ from tests.isolation import (
     VIEWER,
     Row,
 )
-from tests.waiting import GUARD_S
 
 PEOPLE = (VIEWER, DRIVER, EVERYBODY)
 

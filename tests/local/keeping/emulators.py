@@ -23,7 +23,7 @@ from local.deployment import ROOT
 from local.emulator import patched
 from local.network.certificates import Authority
 from local.processes import Child
-from tests.ports import free_port
+from testkit.ports import free_port
 
 REGION, ACCOUNT = "eu-west-1", "000000000000"
 ROLE = f"arn:aws:iam::{ACCOUNT}:role/anybody"

@@ -7,9 +7,8 @@ import signal
 
 from botocore.exceptions import BotoCoreError
 
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.keeping.emulators import Emulator
-from tests.waiting import GUARD_S
 
 
 class Failing(Emulator):

@@ -11,9 +11,8 @@ from contextlib import contextmanager, suppress
 import paho.mqtt.client as mqtt
 import pytest
 
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.keeping.emulators import ROLE, Emulator
-from tests.waiting import GUARD_S
 
 TABLE = "records"
 _EVERYTHING = {

@@ -9,7 +9,7 @@ from contextlib import closing
 import pytest
 from botocore.exceptions import ClientError
 
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.keeping.emulators import REGION, ROLE, Emulator
 
 _WAIT = {"StartAt": "Wait", "States": {"Wait": {"Type": "Wait", "Seconds": 3600, "End": True}}}

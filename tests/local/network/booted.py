@@ -15,7 +15,7 @@ import pytest
 
 from local.deployment import ROOT
 from local.processes import Child
-from tests.local.conftest import until
+from testkit.waiting import until
 
 _TOOL = "systemd-nspawn"
 # Its own unit is ours, or none: we ask no systemd of this machine.

@@ -14,16 +14,15 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from bench.keeping.disk import Disk
-from bench.meters import usage
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from local.deployment import ROOT
 from local.processes import Child
-from tests.local.conftest import until
+from testkit import machine
+from testkit.machine import Disk
+from testkit.waiting import GUARD_S, until
 from tests.local.network.namespaces import ANY, Machine
-from tests.waiting import GUARD_S
 
 BIN = Path(sys.executable).parent
 
@@ -67,7 +66,7 @@ class Laboratory:
     def kill(self) -> None:
         """SIGKILL to all processes of `make up` at once, as at a power cut of a machine that has written
         everything."""
-        for pid in (self.up.pid, *usage.descendants(self.up.pid)):
+        for pid in (self.up.pid, *machine.descendants(self.up.pid)):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self.up.wait(GUARD_S)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from local.processes import Child
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 ANY = -1
 TOOLS = ("ip", "nsenter", "unshare")

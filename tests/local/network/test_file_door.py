@@ -18,8 +18,7 @@ from iort_contract.messages.requests.files import PART_BYTES
 from local.network import file_door
 from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor
-from tests.local.conftest import until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
 
 HOST = "127.0.0.2"
 BODY = b"content"

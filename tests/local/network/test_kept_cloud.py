@@ -26,7 +26,7 @@ from local.processes import Child
 from local.state import USUAL_PORTS, StateFolder
 from local.up import service
 from local.up.down import stop
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 
 @pytest.fixture

@@ -18,11 +18,10 @@ from local.deployment import ROOT
 from local.processes import Child
 from local.up.down import stop
 from local.up.service import NAME
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.network.booted import booted
 from tests.local.network.laboratory import BIN, Laboratory, waiting
 from tests.local.network.namespaces import two_machines
-from tests.waiting import GUARD_S
 
 
 @pytest.fixture(scope="module")

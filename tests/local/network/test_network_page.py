@@ -18,9 +18,8 @@ from local.up import network_page
 from local.up.login import TRIES, Password
 from local.up.network_page import COOKIE, SOCKET, NetworkPage
 from local.up.pages import shown
-from tests.browser import until
-from tests.ports import free_port
-from tests.waiting import GUARD_S
+from testkit.ports import free_port
+from testkit.waiting import GUARD_S, until
 
 ADDRESS = Listen("127.0.0.3", ("127.0.0.3",))
 NAMED = Listen("::1", ("::1", "localhost"))

@@ -13,8 +13,9 @@ from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cli.main import app
 from iort_station.operations.delivery import audit
-from tests.local.conftest import run_agent, until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
+from tests.local.conftest import run_agent
 
 T0_US = 1_760_000_000_000_000
 

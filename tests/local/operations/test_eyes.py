@@ -13,8 +13,9 @@ from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations.monitoring import cloudwatch, cloudwatch_logs
 from local.emulator import first_calls
-from tests.local.conftest import run_agent, until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
+from tests.local.conftest import run_agent
 
 FAULT, LOW_V = 5, 9.5
 

@@ -20,8 +20,8 @@ from iort_station.cloud import EMBEDDED
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.operations import quarantine
 from iort_station.operations.delivery import counts
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
 
 RUN = "0badcafe"
 

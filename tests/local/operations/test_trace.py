@@ -9,9 +9,8 @@ from pathlib import Path
 
 from iort_station.operations.delivery import trace
 from local.deployment import ROOT
-from tests.local.conftest import until
+from testkit.waiting import GUARD_S, until
 from tests.local.data.drives import Agent
-from tests.waiting import GUARD_S
 
 
 def _trace(embedded, *arguments):

@@ -19,7 +19,8 @@ from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from tests.browser import plain, shown, until
+from testkit.waiting import until
+from tests.browser import plain, shown
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import run_agent
 

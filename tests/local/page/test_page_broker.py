@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from bench.load.agent_process import AgentProcess
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ, Value
 from iort_contract.messages.live import LiveSample, encode_live
@@ -16,7 +15,9 @@ from iort_station.page import motion
 from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
 from local.network.proxy import PASS, REFUSE, Proxy
-from tests.browser import plain, show, shown, until
+from testkit.car import AgentProcess
+from testkit.waiting import until
+from tests.browser import plain, show, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -9,7 +9,7 @@ from pubnub.enums import PNReconnectionPolicy
 from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 WAIT_S = GUARD_S
 

@@ -17,8 +17,8 @@ from functions.shared import pubnub_client
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
 from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.standin import PubNubStandIn
-from tests.ports import free_port
-from tests.waiting import GUARD_S
+from testkit.ports import free_port
+from testkit.waiting import GUARD_S
 
 KEYS = {"publish_key": "pub-c-ours", "subscribe_key": "sub-c-ours"}
 MESSAGE = {"robot": "car", "sample": {"speed": 1200, "text": 'a "quoted" ä'}}

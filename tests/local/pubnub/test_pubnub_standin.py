@@ -17,8 +17,8 @@ from pubnub.pubnub import SubscribeListener
 from iort_station.page.pubnub import Listener
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
+from testkit.ports import free_port
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
-from tests.ports import free_port
 
 
 def subscribe(pubnub, *channels):

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from local.pubnub.standin import PubNubStandIn
+from testkit.ports import free_port
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, publish
-from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from bench.meters.asking import Ask, asking
 from iort_agent.config import load_config
 from iort_agent.errors import AskError
 from iort_agent.files.upload import downloader
@@ -35,8 +34,9 @@ from iort_contract.messages.requests.ask import Ask as Question
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_station.fleet import robots
 from iort_station.operations import quarantine
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.car import Ask, asking
+from testkit.mqtt import Robot
+from testkit.waiting import until
 
 HALL = (Path(__file__).parents[3] / "docs/examples/hall.csv").read_text()
 WAIT_S = 60.0

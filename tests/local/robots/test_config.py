@@ -15,7 +15,7 @@ from iort_station.fleet import registry
 from iort_station.fleet.control import slept
 from iort_station.operations.delivery import counts
 from iort_station.page import answers
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.robots.test_shadow import driving
 
 

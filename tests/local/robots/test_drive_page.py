@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from playwright.sync_api import TimeoutError  # noqa: A004 - as playwright names it
 
-from bench.load.agent_process import AgentProcess
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
@@ -18,7 +17,8 @@ from iort_station.page import answers as control
 from iort_station.page import motion
 from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
-from tests.browser import until
+from testkit.car import AgentProcess
+from testkit.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -42,11 +42,10 @@ from iort_contract.topics import FILE, PING, PONG, build_topic
 from iort_station.fleet import files, robots
 from iort_station.operations.delivery import counts
 from local.deployment import ROOT
+from testkit.mqtt import Robot
+from testkit.waiting import GUARD_S, until
 from tests.images import TOPIC, jpeg, write_bag
-from tests.local.conftest import until
 from tests.local.data.drives import Agent
-from tests.waiting import GUARD_S
-from verify.tools.robot import Robot
 
 CONTENT = b"a small file"
 T_US = 1_700_000_000_000_000

@@ -27,9 +27,8 @@ from iort_station.cloud import EMBEDDED
 from iort_station.errors import StationError
 from iort_station.fleet import identity, registry, robots
 from local.cloud import ROOT
-from tests.local.conftest import until
-from tests.waiting import GUARD_S
-from verify.tools.robot import STALE, Robot
+from testkit.mqtt import STALE, Robot
+from testkit.waiting import GUARD_S, until
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 

@@ -17,8 +17,8 @@ from iort_station.fleet import identity, registry, robots
 from iort_station.operations import quarantine
 from iort_station.page.pubnub import Listener
 from local.deployment import ROOT
-from tests.local.conftest import recorded, until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
+from tests.local.conftest import recorded
 
 EXAMPLES = ROOT / "docs" / "examples"
 SMALL = EXAMPLES / "batch_and_live.py"
@@ -118,7 +118,7 @@ def test_a_small_client_stores_a_batch_and_shows_a_live_sample(language, embedde
             # On a slow machine its only live message may be too old to be shown.
             subprocess.run(command, check=True, timeout=GUARD_S)
             with suppress(AssertionError):
-                until(lambda: listener.heard, seconds=5)
+                until(lambda: listener.heard, within_s=5)
             return listener.heard
 
         live = until(shown)[0]

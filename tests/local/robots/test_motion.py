@@ -18,7 +18,7 @@ from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations.delivery import counts
 from local.demo.run import DOWNLINK
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.robots.test_shadow import Shadow, driving
 
 _KEY_S = 0.05

@@ -13,8 +13,7 @@ from typing import Any
 from iort_contract.topics import SHADOW
 from iort_station.operations.delivery import counts
 from local.cloud import ROOT
-from tests.local.conftest import until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
 
 
 @contextmanager

@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-from bench.load.worst_case import worst_batches
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
@@ -18,8 +17,9 @@ from iort_contract.topics import record_topic
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import control
 from iort_station.operations.delivery import counts
-from tests.local.conftest import until
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.waiting import until
+from testkit.worst_case import worst_batches
 
 S = 1_000_000
 GOOD = 8

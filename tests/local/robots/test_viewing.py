@@ -8,7 +8,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
 from iort_station.page.answers import actions
 from iort_station.page.server import PageServer
-from tests.local.conftest import until
+from testkit.waiting import until
 from tests.local.data.drives import Agent
 
 _FULL_MS, _IDLE_MS = 100, 10_000

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from rosbags.rosbag1 import Reader
 
-from tests.ros1_types import Message, fields
+from testkit.ros1_types import Message, fields
 
 
 class Recorded(NamedTuple):

@@ -8,9 +8,9 @@ from collections import defaultdict
 
 from typing_extensions import Self
 
+from testkit.ros1_types import as_json
 from tests.ros.conftest import Graph
 from tests.ros.mixed.robot import TOPICS
-from tests.ros1_types import as_json
 from tests.rosbridge_standin import RosbridgeStandin
 
 

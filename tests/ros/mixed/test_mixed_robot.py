@@ -29,12 +29,13 @@ from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.network.proxy import PASS, REFUSE, Proxy
-from tests.local.conftest import embedded, iort, until  # noqa: F401 - fixtures
+from testkit.ros1_types import as_json
+from testkit.waiting import until
+from tests.local.conftest import embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read
 from tests.ros.mixed.robot import NODES, TOPICS
 from tests.ros.mixed.rosbridge import GraphServer
-from tests.ros1_types import as_json
 
 RECORD = Path("/usr/lib/rosbag/record")
 DURATION_S = float(os.environ.get("IORT_MIXED_S") or 20)
@@ -222,7 +223,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
         for line in (mixed.out / f"{node}.sent").read_text().splitlines():
             topic, content = line.split(" ")
             sent[topic, node].append(base64.b64decode(content))
-    until(mixed.settled, seconds=300)
+    until(mixed.settled, within_s=300)
     server = mixed.server
     unheard = _unheard(publishers, before, sent) if server is None else server.unheard
     for publisher in publishers.values():

@@ -28,7 +28,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.node import DEFAULT_NODE, shared
 from iort_contract.messages.control.commands import Command, FleetMessage, encode_command, encode_fleet
 from iort_contract.messages.requests.ask import Answer, Refusal, decode_ask, encode_answer
-from tests.agent_fakes import Loopback, Published, link_of
+from testkit.agent import Loopback, Published, link_of
 
 
 def say(line: str) -> None:

@@ -16,8 +16,8 @@ import time
 
 import rospy
 
+from testkit.ros1_types import header
 from tests.ros.mixed.robot import NODES, Maker
-from tests.ros1_types import header
 
 parser = argparse.ArgumentParser()
 parser.add_argument("node", choices=NODES)

@@ -36,7 +36,7 @@ from iort_contract.messages.account import lost
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.messages.message_type import MessageType, message_type
-from tests.agent_fakes import Loopback, Published
+from testkit.agent import Loopback, Published
 
 T0 = 1_700_000_000_000_000
 

@@ -22,7 +22,7 @@ from iort_contract.catalog.streams import CATALOG, LOG_STREAM
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.live import decode_live
 from iort_contract.topics import LIVE, RECORD, build_topic
-from tests.agent_fakes import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock
 
 T0_S = 1_700_000_000.0
 

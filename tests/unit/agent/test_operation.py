@@ -37,7 +37,7 @@ from iort_agent.verbs.check import check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
 from iort_contract.messages.control.driving import stick_downlink
-from tests.agent_fakes import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock
 
 
 def record(level: int, text: str) -> logging.LogRecord:

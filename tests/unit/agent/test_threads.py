@@ -31,7 +31,7 @@ from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_agent.status import StatusServer, fetch
 from iort_contract.messages.batch import decode_batch
-from tests.agent_fakes import Loopback, ManualClock, Published
+from testkit.agent import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
 from tests.unit.agent.control.downlink_rig import FakeGraph
 from tests.unit.agent.control.test_asks import ANSWERS, NAME, TOPIC, string

@@ -110,8 +110,8 @@ from iort_contract.ros1.message import Messages, RosType
 from iort_contract.ros1.serialized import pack, unpack
 from iort_contract.topics import parse_topic
 from iort_contract.track import parse_track, track_of
+from testkit.dynamodb import item_of
 from tests.examples import examples
-from tests.fakes import item_of
 from tests.mutation import mutated_bytes, mutated_item, mutated_json, mutated_value
 from tests.unit.contract.ros1.ros1_messages import HEADER, header, text
 

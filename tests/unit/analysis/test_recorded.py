@@ -7,7 +7,7 @@ import random
 from iort_analysis.drives.recorded import Recorded, recorded
 from iort_contract.messages.analysis.findings import DriveKey
 from iort_contract.messages.batch import Batch
-from tests.fakes import item_of
+from testkit.dynamodb import item_of
 
 START_US, S = 1_700_000_000_000_000, 1_000_000
 RUN = "00c0ffee"

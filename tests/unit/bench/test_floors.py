@@ -8,7 +8,6 @@ import pytest
 
 from bench.floors.functions import live as live_floor
 from bench.floors.functions import summarize as summarize_floor
-from bench.load.simulated import RATE_HZ, simulated_drive
 from functions.shared.summary import process
 from iort_contract.codec.columns import DICTIONARY
 from iort_contract.codec.seconds import flat_second
@@ -17,7 +16,8 @@ from iort_contract.messages.batch import Batch
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, decode_live_update, encode_live
 from iort_contract.tables import SECOND, STATS, TOPIC
-from tests.fakes import SUMMARY, TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
+from testkit.car import RATE_HZ, simulated_drive
+from testkit.dynamodb import SUMMARY, TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 
 FIRST_US = 1_700_000_000_000_000
 

@@ -8,7 +8,7 @@ from bench.keeping import report
 from bench.keeping.counted import Counted
 from bench.keeping.soak import Look
 from bench.keeping.week import Soak
-from bench.report import machine
+from testkit import machine
 from tests.unit.bench.test_kills import DRIVE
 
 

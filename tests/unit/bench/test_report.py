@@ -9,9 +9,10 @@ import pytest
 
 from bench import guard
 from bench.report import plots, writer
-from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.result import Plot, Ratio, Section
 from bench.report.spread import ratio, spread
 from scripts.docs_parts import REPORT
+from testkit.command import Table
 
 MACHINE = {
     "date": "2026-01-02T03:04:05+00:00",

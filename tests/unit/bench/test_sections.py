@@ -292,7 +292,7 @@ def test_a_command_is_compared_with_python_of_the_same_turn():
 
 
 def test_the_documentation_lists_every_section():
-    from bench import ROOT
+    from testkit import ROOT
 
     text = (ROOT / "docs/explanation/benchmark.md").read_text()
     assert {key for key in SECTIONS if f"| `{key}` |" in text} == set(SECTIONS)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bench.load.worst_case import cases, worst_batches
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES, ContractError
 from iort_contract.messages.batch import decode_batch
+from testkit.worst_case import cases, worst_batches
 
 
 def test_only_unbounded_batches_are_refused():

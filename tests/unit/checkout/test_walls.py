@@ -67,7 +67,7 @@ def test_the_imports_keep_all_walls(house: Path) -> None:
         ("packages", "stacks/site.py", "iort_station.page.page"),
         ("packages", "stacks/site.py", "functions.live"),
         ("packages", "local/demo/run.py", "bench.run"),
-        ("packages", "local/demo/run.py", "tests.fakes"),
+        ("packages", "local/demo/run.py", "testkit.dynamodb"),
         ("embedded-cloud", "local/demo/run.py", "stacks.settings"),
         ("agent", "device/iort_agent/lanes/live.py", "iort_agent.config"),
         ("agent", "device/iort_agent/common/schema.py", "iort_agent.spool.memory"),

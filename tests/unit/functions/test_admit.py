@@ -22,7 +22,7 @@ from iort_contract.tables import (
     CONNECTED_MS,
     SERIAL,
 )
-from tests.fakes import ROBOTS
+from testkit.dynamodb import ROBOTS
 
 LATER_S = int(time.time()) + 3600
 

@@ -10,7 +10,7 @@ import pytest
 
 from functions.alert import QUIET_S, Notices, causes, process
 from iort_contract.limits import ContractError
-from tests.fakes import NAMES
+from testkit.dynamodb import NAMES
 
 NOW_S = 1_700_000_000
 

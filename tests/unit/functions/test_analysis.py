@@ -40,7 +40,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.fakes import ARCHIVE, FILES, FINDINGS, ROBOTS, TELEMETRY, item_of
+from testkit.dynamodb import ARCHIVE, FILES, FINDINGS, ROBOTS, TELEMETRY, item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
 S = 1_000_000

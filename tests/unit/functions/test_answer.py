@@ -44,7 +44,7 @@ from iort_contract.messages.requests.files import File, file_key
 from iort_contract.tables import ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_contract.track import parse_track
-from tests.fakes import FILES, FINDINGS, ROBOTS
+from testkit.dynamodb import FILES, FINDINGS, ROBOTS
 
 NOW_S = 1_700_000_000.0
 NOW_US, NOW_MS = int(NOW_S * 1e6), int(NOW_S * 1000)

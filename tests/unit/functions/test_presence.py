@@ -13,7 +13,7 @@ from functions import presence
 from iort_contract.catalog.metrics import metrics_of
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
-from tests.fakes import ROBOTS
+from testkit.dynamodb import ROBOTS
 
 MINUTE_MS = 60_000
 T0 = 1_700_000_000_000

@@ -14,7 +14,7 @@ from functions.quarantine import Entry, Store, Stream, entries, process
 from functions.shared.queues import DeadLetterQueue, Refused, message
 from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
-from tests.fakes import QUARANTINE, TOPIC_OF_CAR
+from testkit.dynamodb import QUARANTINE, TOPIC_OF_CAR
 
 RAW = b"\xff\x00not JSON, not even text"
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"

@@ -15,7 +15,7 @@ from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station import data
 from iort_station.errors import StationError
-from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
+from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 
 START = 1_700_000_000_000_000
 ENOUGH_MS = 60_000

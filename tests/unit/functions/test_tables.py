@@ -18,7 +18,7 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.dynamodb import TableError, plain, quick
 from iort_contract.messages.batch import Batch, BatchId, batch_id
 from iort_contract.tables import BATCH, EXPIRES_S, SECOND, TOPIC
-from tests.fakes import (
+from testkit.dynamodb import (
     ROBOTS,
     SUMMARY,
     TELEMETRY,

@@ -37,7 +37,7 @@ from iort_contract.messages.requests.files import (
 )
 from iort_contract.tables import FILES_BYTES, FILES_DAY, ROBOT
 from iort_contract.topics import FILE, PING, PONG, build_topic
-from tests.fakes import FILES, ROBOTS
+from testkit.dynamodb import FILES, ROBOTS
 
 NOW_S = 1_700_000_000.0
 ID = "0123456789abcdef"

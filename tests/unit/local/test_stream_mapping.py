@@ -17,8 +17,8 @@ from functions.shared.summary import process
 from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
 from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard, Stream
+from testkit.dynamodb import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 from tests.examples import examples
-from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 
 S = 1_000_000
 T0 = 1_700_000_000 * S

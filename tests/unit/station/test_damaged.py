@@ -27,8 +27,8 @@ from iort_station import data
 from iort_station.operations.delivery import audit
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
+from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of
 from tests.archived import FakeS3, archive, expire
-from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, item_of
 from tests.mutation import ODD_ATTRIBUTES, mutated_item
 from tests.unit.functions.summary.summarizing import Stream
 from tests.unit.station.data.test_data import FakeCloud, cloud_of

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from botocore.exceptions import ClientError
 
-from bench.target import AWS
+from testkit.target import AWS
 from verify.question import Verdict, ask
 from verify.questions import ALL
 

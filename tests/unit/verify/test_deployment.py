@@ -8,9 +8,9 @@ from types import SimpleNamespace
 from botocore.exceptions import ClientError
 from rich.console import Console
 
-from bench.command import wound_up
 from local.errors import LocalError
 from stacks.settings import Settings
+from testkit.command import wound_up
 from verify.deployment import CHANGES, Deployment
 from verify.preflight.deployed import STACKS
 

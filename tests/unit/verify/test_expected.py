@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from bench.target import EMBEDDED, Target
 from iort_station.cloud import Cloud
+from testkit.target import EMBEDDED, Target
 from verify.question import NOTE, Verdict, ask, compared
 from verify.questions import ALL
 

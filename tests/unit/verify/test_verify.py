@@ -7,13 +7,13 @@ import json
 
 import pytest
 
-from bench.target import AWS, EMBEDDED, Target
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import PRICES
 from local.deployment import ROOT
+from testkit.target import AWS, EMBEDDED, Target
+from testkit.waiting import InstrumentError
 from verify import page, price, report
-from verify.errors import CannotAskError, VerifyError
-from verify.question import Question, Verdict, ask
+from verify.question import CannotAskError, Question, Verdict, ask
 from verify.questions import ALL
 
 RUN = report.Run(target="AWS", region="eu-west-1", by="A. Tester", date="2026-01-01", version="abc")
@@ -58,7 +58,7 @@ def test_a_note_is_reported_and_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "error", [VerifyError("no answer"), OSError("connection reset"), KeyError("another form")]
+    "error", [InstrumentError("no answer"), OSError("connection reset"), KeyError("another form")]
 )
 def test_an_error_is_reported_as_the_answer(error):
     answer = verdict(check(error))
@@ -75,7 +75,7 @@ def test_a_question_that_cannot_be_asked_has_its_reason():
 
 def test_a_kept_report_is_read_back(tmp_path):
     report.write(
-        tmp_path, RUN, [verdict(check({"one": 2})), verdict(check(VerifyError("x"), name="b.question"))]
+        tmp_path, RUN, [verdict(check({"one": 2})), verdict(check(InstrumentError("x"), name="b.question"))]
     )
     known = report.load(tmp_path / "report.json")
     assert (known.by, known.seen) == ("A. Tester", {"a.question": {"one": 2}})
@@ -86,7 +86,7 @@ def test_a_kept_report_is_read_back(tmp_path):
 
 def test_an_invalid_report_file_is_refused(tmp_path):
     (tmp_path / "report.json").write_text("[]")
-    with pytest.raises(VerifyError, match="must be a report of verify"):
+    with pytest.raises(InstrumentError, match="must be a report of verify"):
         report.load(tmp_path / "report.json")
 
 
@@ -101,7 +101,7 @@ def test_an_invalid_report_file_is_refused(tmp_path):
     ],
 )
 def test_a_report_contains_no_secret(tmp_path, secret):
-    answers = [verdict(check({"one": f"a {secret} b"})), verdict(check(VerifyError(f"a {secret} b")))]
+    answers = [verdict(check({"one": f"a {secret} b"})), verdict(check(InstrumentError(f"a {secret} b")))]
     report.write(tmp_path, RUN, answers)
     for name in ("report.json", "report.md"):
         text = (tmp_path / name).read_text()

@@ -26,7 +26,7 @@ from iort_station.page import invitations
 from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import PageServer, on_loopback
-from tests.ports import free_port
+from testkit.ports import free_port
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",

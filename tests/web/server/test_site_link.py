@@ -8,7 +8,7 @@ from aiohttp import web
 
 from iort_station.page.background import BackgroundServer
 from iort_station.page.server import PageServer
-from tests.browser import until
+from testkit.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

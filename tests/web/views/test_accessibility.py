@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 from iort_contract.catalog.streams import LOG_STREAM
-from tests.browser import drawn, plain, show, until
+from testkit.waiting import until
+from tests.browser import drawn, plain, show
 from tests.web.cars import SAMPLE, Car
 from tests.web.lab import VIEWS, Lab
 

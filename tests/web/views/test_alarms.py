@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from iort_contract.catalog.metrics import METRICS
-from tests.browser import show, until
+from testkit.waiting import until
+from tests.browser import show
 from tests.web.cars import SAMPLE, Car
 from tests.web.lab import NOW_S, VIEWS, Lab
 

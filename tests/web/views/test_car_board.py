@@ -10,7 +10,8 @@ import pytest
 from iort_agent.sources.sim.driver import HALL
 from iort_contract.catalog.streams import LOG_STREAM, POSE_STREAM
 from iort_station.page.server import PageServer
-from tests.browser import drawn, plain, show, until
+from testkit.waiting import until
+from tests.browser import drawn, plain, show
 from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
 from tests.web.lab import Lab
 

@@ -11,7 +11,8 @@ import pytest
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
-from tests.browser import drawn, show, until
+from testkit.waiting import until
+from tests.browser import drawn, show
 from tests.web.cars import SUBSCRIBE_KEY, Car
 from tests.web.lab import NOW_S, Lab
 

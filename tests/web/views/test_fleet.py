@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from iort_station.page.server import PageServer
-from tests.browser import show, shown, until
+from testkit.waiting import until
+from tests.browser import show, shown
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from tests.browser import show, until
+from testkit.waiting import until
+from tests.browser import show
 from tests.web.cars import Car
 from tests.web.lab import Lab
 

@@ -18,9 +18,10 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
 from iort_station.page.server import PageServer
+from testkit.dynamodb import TELEMETRY, item_of
+from testkit.waiting import until
 from tests.archived import FakeS3, archive, expire
-from tests.browser import plain, until
-from tests.fakes import TELEMETRY, item_of
+from tests.browser import plain
 from tests.unit.station.data.test_data import START, cloud_of
 from tests.web.cars import GAIN, SUBSCRIBE_KEY
 from tests.web.lab import VIEWS, Lab

@@ -8,7 +8,8 @@ import pytest
 
 from iort_station.page import insights as laps
 from iort_station.page.server import PageServer
-from tests.browser import plain, until
+from testkit.waiting import until
+from tests.browser import plain
 from tests.unit.station.analysis.test_laps import driven_cloud
 from tests.unit.station.data.test_data import START
 from tests.web.cars import SUBSCRIBE_KEY

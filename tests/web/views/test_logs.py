@@ -7,8 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from iort_station.page.server import PageServer
-from tests.browser import until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
 from tests.web.cars import SUBSCRIBE_KEY
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ import pytest
 
 from iort_agent.lanes.attachment import thumbnail
 from iort_station.page.server import PageServer
-from tests.browser import drawn, show, until
+from testkit.waiting import until
+from tests.browser import drawn, show
 from tests.images import jpeg
 from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.browser import show, until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
+from tests.browser import show
 from tests.web.cars import Car
 from tests.web.lab import WHY_NOT, Lab, history
 

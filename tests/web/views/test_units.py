@@ -14,7 +14,8 @@ from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.page.server import PageServer
 from local.deployment import ROOT
-from tests.browser import drawn, plain, show, shown, until
+from testkit.waiting import until
+from tests.browser import drawn, plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 from tests.web.lab import VIEWS, Lab
 

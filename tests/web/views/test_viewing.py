@@ -10,8 +10,8 @@ import pytest
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S
 from iort_station.page.server import PageServer
-from tests.browser import show, until
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S, until
+from tests.browser import show
 from tests.web.cars import SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:

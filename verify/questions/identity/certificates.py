@@ -6,15 +6,14 @@ import json
 import shutil
 import time
 
-from bench.target import Target
 from iort_agent.errors import IdentityError
 from iort_agent.verbs import provision
 from iort_station.fleet import identity, robots
-from verify.errors import VerifyError
+from testkit.mqtt import CONNECT_AGAIN_S, Robot, refusal, soon_refused
+from testkit.target import Target
+from testkit.waiting import InstrumentError, until
 from verify.question import Seen, question
-from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal, soon_refused
 from verify.tools.robots import registered, removed_after
-from verify.tools.waiting import until
 
 _MQTT = "https://docs.aws.amazon.com/iot/latest/developerguide/mqtt.html"
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
@@ -48,7 +47,7 @@ def rotated(target: Target) -> Seen:
     try:
         provision.renew(bundle.config, claim, status_socket=bundle.folder / "none.sock")
     except IdentityError as error:
-        raise VerifyError(str(error)) from error
+        raise InstrumentError(str(error)) from error
     renewed = len(identity.certificates(target.cloud, bundle.robot))
     time.sleep(CONNECT_AGAIN_S)
     with Robot(bundle.folder) as robot:

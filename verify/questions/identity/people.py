@@ -15,7 +15,6 @@ from urllib.request import Request, urlopen
 
 from botocore.credentials import ReadOnlyCredentials
 
-from bench.target import Target
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import DRIVER, VIEWER
@@ -23,9 +22,10 @@ from iort_contract.messages.viewing import lease_topic
 from iort_contract.topics import CMD, LIVE, build_topic
 from iort_station.fleet.roles import Role
 from iort_station.page import motion
-from verify.errors import VerifyError
+from testkit.mqtt import STALE, WAIT_S, Person
+from testkit.target import Target
+from testkit.waiting import InstrumentError
 from verify.question import CHANGED, Seen, question
-from verify.tools.robot import STALE, WAIT_S, Person
 from verify.tools.uploading import trust
 
 _IOT = "https://docs.aws.amazon.com/iot/latest/developerguide"
@@ -43,7 +43,7 @@ def _may(connect: Connect, act: Callable[[Person], str]) -> str:
         person.online()
         try:
             return act(person)
-        except VerifyError:
+        except InstrumentError:
             if not person.lost.is_set():
                 raise
             return "DISCONNECTED"

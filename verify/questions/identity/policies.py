@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bench.target import Target
 from iort_station.fleet import robots
-from verify.errors import CannotAskError
-from verify.question import ENDED, Seen, question
+from testkit.mqtt import Robot
+from testkit.target import Target
+from verify.question import ENDED, CannotAskError, Seen, question
 from verify.questions.identity.certificates import POLICY
-from verify.tools.robot import Robot
 from verify.tools.robots import removed_after
 
 _CLOUDFORMATION = "https://docs.aws.amazon.com/AWSCloudFormation/latest/TemplateReference"

@@ -10,7 +10,6 @@ from typing import Any
 
 import yaml
 
-from bench.target import Target
 from iort_agent.errors import IdentityError
 from iort_agent.verbs import provision
 from iort_agent.verbs.registration import Exchange, load_claim, make_key
@@ -23,9 +22,10 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_station.fleet import identity, registry
-from verify.errors import VerifyError
+from testkit.mqtt import refusal
+from testkit.target import Target
+from testkit.waiting import InstrumentError
 from verify.question import Seen, question
-from verify.tools.robot import refusal
 from verify.tools.robots import removed_after
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
@@ -46,7 +46,7 @@ _MADE = {
 }
 
 
-class _RefusedError(VerifyError):
+class _RefusedError(InstrumentError):
     """RegisterThing was refused; the error's text is the code."""
 
 
@@ -58,7 +58,7 @@ def _agent() -> Iterator[None]:
     except IdentityError as error:
         if code := _REFUSED.search(str(error)):
             raise _RefusedError(code[1]) from error
-        raise VerifyError(str(error)) from error
+        raise InstrumentError(str(error)) from error
 
 
 def _provision(file: Path, robot: str | None = None) -> str:

@@ -6,10 +6,10 @@ import concurrent.futures
 import time
 from typing import Any
 
-from bench.target import Target
 from iort_contract.topics import CMD, FLEET, build_topic
+from testkit.mqtt import CONNECT_AGAIN_S, Robot, refusal
+from testkit.target import Target
 from verify.question import Seen, question
-from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal
 from verify.tools.robots import pair_of, registered
 
 _MQTT = "https://docs.aws.amazon.com/iot/latest/developerguide/mqtt.html"

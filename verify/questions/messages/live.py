@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import count
 
-from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
@@ -21,11 +20,11 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import viewing
 from iort_station.page.page import PubNubKeys, load_keys, store_keys
-from verify.errors import CannotAskError
-from verify.question import Seen, question
-from verify.tools.robot import Robot
+from testkit.mqtt import Robot
+from testkit.target import Target
+from testkit.waiting import until
+from verify.question import CannotAskError, Seen, question
 from verify.tools.telemetry import RUN
-from verify.tools.waiting import until
 
 _STALE = 0
 # Two clocks of AWS differ by less than the first, the operator's and AWS' by less than the second.

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import FLEET, LIVE, PING, PONG, RULE, build_topic, live_topic, record_topic
 from iort_station.operations.quarantine import DeadLetter
+from testkit.target import Target
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.robots import pair_of
 from verify.tools.telemetry import entries, items, only_entry
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"

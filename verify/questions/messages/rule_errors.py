@@ -8,14 +8,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from bench.target import Target
 from functions.quarantine import entries
 from iort_contract.tables import TOPIC
 from iort_contract.topics import PING, PONG, RULE, build_topic, rule_name
-from verify.errors import VerifyError
+from testkit.target import Target
+from testkit.waiting import InstrumentError, until
 from verify.question import Seen, question
 from verify.tools.robots import Pair, pair_of
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 
@@ -54,7 +53,7 @@ def _heard(pair: Pair, topic: str, payload: bytes) -> bytes:
         data.publish(topic=topic, qos=1, payload=payload)
         try:
             return pair.robot.next_message(within_s=2)[1]
-        except VerifyError:
+        except InstrumentError:
             return None
 
     return until(heard, f"the rule's answer to {topic}", within_s=50)

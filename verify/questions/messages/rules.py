@@ -9,7 +9,6 @@ import time
 import uuid
 from typing import Any
 
-from bench.target import Target
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
@@ -19,11 +18,12 @@ from iort_contract.messages.requests.files import File, FileRequest, encode_file
 from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import ANSWER, ASK, FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW, build_topic
 from iort_station.fleet import registry
+from testkit.target import Target
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.robots import listener, pair_of
 from verify.tools.spoofing import spoofed
 from verify.tools.telemetry import RUN, batch, items
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _SQL = f"{_GUIDE}/iot-sql-select.html"

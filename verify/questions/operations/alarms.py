@@ -8,18 +8,17 @@ from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
-from bench.target import Target
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.messages.page import AlarmEntry
 from iort_contract.topics import LIVE, build_topic
 from iort_station.operations.monitoring import alarms
-from verify.errors import VerifyError
+from testkit.mqtt import Robot
+from testkit.target import Target
+from testkit.waiting import InstrumentError, until
 from verify.question import CHANGED, Seen, question
 from verify.tools.inbox import inbox
-from verify.tools.robot import Robot
 from verify.tools.telemetry import RUN
-from verify.tools.waiting import until
 
 _REASON = "verify: does it notify?"
 _ALARM = "ALARM"
@@ -37,7 +36,7 @@ def _quiet_alarm(target: Target) -> dict[str, Any]:
         for alarm in page["MetricAlarms"]:
             if alarm["StateValue"] != _ALARM:
                 return dict(alarm)
-    raise VerifyError("every alarm of the deployment is in ALARM")
+    raise InstrumentError("every alarm of the deployment is in ALARM")
 
 
 _NOTIFIED = {

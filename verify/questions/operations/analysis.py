@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from bench.target import Target
 from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
 from iort_contract.messages.analysis.run import AnalysisRequest
 from iort_station.data import findings
@@ -14,10 +13,11 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.analysis import SUCCEEDED, Progress
+from testkit.target import Target
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.robots import registered
 from verify.tools.telemetry import batch, send, stored
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/step-functions/latest/dg"
 _API = "https://docs.aws.amazon.com/step-functions/latest/apireference"

@@ -7,15 +7,14 @@ import json
 import time
 from typing import Any
 
-from bench.target import Target, temporary_function
 from iort_contract.messages.event import rule_event
 from iort_contract.tables import BY_FUNCTION, TOPIC
 from iort_contract.topics import LAMBDA, PING, build_topic
-from verify.errors import CannotAskError, VerifyError
-from verify.question import Seen, question
+from testkit.target import Target, temporary_function
+from testkit.waiting import InstrumentError, until
+from verify.question import CannotAskError, Seen, question
 from verify.tools.logs import lines
 from verify.tools.telemetry import only_entry
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256
@@ -85,7 +84,7 @@ def runtime(target: Target) -> Seen:
         answer = client.invoke(FunctionName=name, Payload=b"{}")
         found = json.loads(answer["Payload"].read())
         if "FunctionError" in answer:
-            raise VerifyError(f"the function failed: {found}")
+            raise InstrumentError(f"the function failed: {found}")
         named = client.get_function_configuration(FunctionName=name)["Runtime"]
     return {
         "parameters_that_boto3_does_not_know": found["unknown"],

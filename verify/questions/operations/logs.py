@@ -6,13 +6,11 @@ import re
 import time
 from datetime import datetime, timedelta, timezone
 
-from bench.meters.invocations import configure
-from bench.target import Target, temporary_function
 from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
-from verify.errors import VerifyError
+from testkit.target import Target, configure, temporary_function
+from testkit.waiting import InstrumentError, until
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, send
-from verify.tools.waiting import until
 
 _CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
@@ -73,7 +71,7 @@ def metric(target: Target) -> Seen:
     began = time.monotonic()
     try:
         counted = until(lambda: _counted(target, since) > before, _METRIC, within_s=_WITHIN_S)
-    except VerifyError:
+    except InstrumentError:
         counted = False
     return {
         "counted": counted,

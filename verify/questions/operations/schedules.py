@@ -9,11 +9,11 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
-from bench.target import EMBEDDED, Target
 from iort_contract.archive import DUE, TASK
+from testkit.target import EMBEDDED, Target
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.logs import lines
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/scheduler/latest/UserGuide"
 # AWS calls within 60 s of the time.

@@ -9,17 +9,16 @@ from typing import Any
 
 import pyarrow.parquet
 
-from bench.target import Target
 from iort_contract.archive import ARCHIVE, HOUR, HOUR_US, TASK, ArchivedHour, ArchiveTable, archived_hour
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
 from iort_station import data
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import archive
-from verify.errors import VerifyError
+from testkit.target import Target
+from testkit.waiting import InstrumentError, until
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, items, send, stored, topic
-from verify.tools.waiting import until
 
 _SQS = "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide"
 _S3 = "https://docs.aws.amazon.com/AmazonS3/latest/userguide"
@@ -47,7 +46,7 @@ def _again(target: Target, row: ArchivedHour) -> None:
         Payload=json.dumps({TASK: ARCHIVE, TOPIC: row.topic, HOUR: row.hour}),
     )
     if "FunctionError" in answer:
-        raise VerifyError(f"the archive's function failed: {answer['Payload'].read()!r}")
+        raise InstrumentError(f"the archive's function failed: {answer['Payload'].read()!r}")
 
 
 def _object(target: Target, row: ArchivedHour) -> dict[str, Any]:

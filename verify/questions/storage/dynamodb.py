@@ -6,7 +6,6 @@ from typing import cast
 
 from botocore.exceptions import ClientError
 
-from bench.target import Target
 from iort_contract.tables import (
     ADMISSION,
     BATCH,
@@ -18,7 +17,8 @@ from iort_contract.tables import (
     STREAMS,
     TOPIC,
 )
-from verify.errors import VerifyError
+from testkit.target import Target
+from testkit.waiting import InstrumentError
 from verify.question import Seen, question
 
 _GUIDE = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide"
@@ -95,4 +95,4 @@ def failed_condition(target: Target) -> Seen:
             "status": error.response["ResponseMetadata"]["HTTPStatusCode"],
             "row": item.get(ROBOT) == {"S": name},
         }
-    raise VerifyError("the condition did not fail")
+    raise InstrumentError("the condition did not fail")

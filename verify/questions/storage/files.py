@@ -7,11 +7,11 @@ import http.client
 import json
 import time
 
-from bench.target import Target, temporary_function
 from iort_contract.messages.requests.files import FILES_PREFIX, PART_BYTES, File, part_range
+from testkit.target import Target, temporary_function
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.uploading import asking, sent, trust
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/AmazonS3/latest/userguide"
 _API = "https://docs.aws.amazon.com/AmazonS3/latest/API"

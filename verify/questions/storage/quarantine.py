@@ -5,16 +5,16 @@ from __future__ import annotations
 import base64
 import json
 
-from bench.target import Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_contract.topics import rule_name
 from iort_station.operations.delivery import counts
 from iort_station.operations.replay import replay
+from testkit.target import Target
+from testkit.waiting import until
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, listed, only_entry, send, topic
-from verify.tools.waiting import until
 
 
 def _summarized(target: Target, robot: str) -> int:

@@ -8,17 +8,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from bench.load.worst_case import worst_batches
-from bench.target import Target, temporary_function
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_station.data.recorded import summary_table
 from iort_station.fleet import control
 from iort_station.operations.replay import replay
+from testkit.target import Target, temporary_function
+from testkit.waiting import until
+from testkit.worst_case import worst_batches
 from verify.question import Seen, question
 from verify.tools.logs import lines
 from verify.tools.telemetry import batch, entries, items, listed, send, topic
-from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 # So many at once are beyond a robot's share on every machine.

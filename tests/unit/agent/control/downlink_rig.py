@@ -21,7 +21,7 @@ from iort_agent.ros1.types import OnTrigger
 from iort_contract.limits import Value
 from iort_contract.messages.control.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

@@ -33,7 +33,7 @@ from iort_contract.messages.requests.ask import (
     encode_answer,
 )
 from iort_contract.messages.requests.files import file_key
-from tests.agent_fakes import Loopback, link_of
+from testkit.agent import Loopback, link_of
 from tests.unit.agent.control.downlink_rig import FakeGraph
 
 NAME, SOON_S = "calibration", 30.0

@@ -10,7 +10,7 @@ from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.messages.control.commands import FleetMessage, decode_fleet, encode_fleet
 from iort_contract.ros1.definition import parse
-from tests.agent_fakes import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, T0, Rig, doubles
 
 SHARE = {"/pose": {"name": "pose", "rate_hz": 5}}

@@ -11,7 +11,7 @@ import pytest
 
 from iort_agent.control.guard import KeptStop
 from iort_agent.errors import ConfigError
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import T0, FakeGuard, Rig, doubles
 
 POSE: dict[str, Any] = {

@@ -18,7 +18,7 @@ import pytest
 from iort_agent.control import guard as guard_process
 from iort_agent.control.guard import Guard, KeptStop
 from iort_contract.ros1.definition import parse
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 
 
 def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(

@@ -16,7 +16,7 @@ from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.shadow import OverShare, Reported, decode_desired, encode_reported
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
 
 BASE = RuntimeSettings(
     record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"

@@ -25,7 +25,7 @@ from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIEL
 from iort_contract.ros1.decode import Decoder, Large
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import Messages, RosMessage, RosType, filled
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
 from tests.unit.contract.ros1.ros1_messages import HEADER, text, u32
 

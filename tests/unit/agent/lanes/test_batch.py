@@ -17,7 +17,7 @@ from iort_agent.spool.memory import MemorySpool
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
 from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of
 from iort_contract.ros1.message import RosMessage, RosType
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.examples import examples
 from tests.unit.contract.ros1.ros1_messages import text
 

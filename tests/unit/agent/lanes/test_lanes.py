@@ -28,7 +28,7 @@ from iort_agent.status import render
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.control.settings import ALWAYS
 from iort_contract.topics import BROKER, LIVE
-from tests.agent_fakes import Loopback, ManualClock, Published
+from testkit.agent import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200

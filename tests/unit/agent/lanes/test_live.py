@@ -8,7 +8,7 @@ from iort_agent.lanes.live import Demand, LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import LiveSample, decode_live
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
 
 T0 = 1_700_000_000_000_000
 

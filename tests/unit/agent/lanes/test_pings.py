@@ -20,7 +20,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import PING_PATHS
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
 
 T0 = 1_700_000_000_000_000
 

@@ -12,7 +12,7 @@ from iort_agent.lanes.record import RecordLane
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.spool.memory import MemorySpool
-from tests.agent_fakes import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock
 from tests.examples import examples
 
 

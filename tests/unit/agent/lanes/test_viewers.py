@@ -12,7 +12,7 @@ from iort_contract.limits import LIVE_MIN_RATE_HZ
 from iort_contract.messages.control.settings import ALWAYS, WATCHED
 from iort_contract.messages.live import LiveSample, decode_live
 from iort_contract.messages.viewing import MAX_VIEWERS, Lease, encode_lease, lease_topic
-from tests.agent_fakes import Loopback, ManualClock, link_of
+from testkit.agent import Loopback, ManualClock, link_of
 
 BROKER, DIRECT = "live/iort/car1/vesc", "$aws/rules/iort_live/live/iort/car1/vesc"
 LEASES = lease_topic("car1", "iort")

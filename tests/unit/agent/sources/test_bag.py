@@ -22,7 +22,7 @@ from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.message_type import message_type
 from iort_contract.ros1.message import type_id
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.recordings import recording
 
 NOW = 1_700_000_000_000_000

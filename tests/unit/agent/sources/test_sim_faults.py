@@ -14,7 +14,7 @@ from iort_agent.sources.sim import Sensors, SimConfig
 from iort_agent.sources.sim.driver import Wish
 from iort_agent.sources.sim.faults import KINDS, STRENGTHS, FaultConfig
 from iort_agent.sources.sim.vehicle import G_MPS2, Vehicle
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.unit.agent.sources.test_sim_physics import CAR, steps
 
 

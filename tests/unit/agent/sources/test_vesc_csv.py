@@ -17,7 +17,7 @@ from iort_agent.errors import SourceError
 from iort_agent.sources.recording import BagConfig
 from iort_contract.catalog.vesc import VESC_FIELDS, absent
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.recordings import recording
 
 NOW = 1_700_000_000_000_000

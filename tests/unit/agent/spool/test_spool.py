@@ -11,7 +11,7 @@ import pytest
 from iort_agent.spool import OVERWRITE_OLDEST, REJECT_NEW, Spool
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 
 if TYPE_CHECKING:
     MakeSpool = Callable[..., Spool]

@@ -20,7 +20,7 @@ from iort_agent.errors import AgentError
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
 from iort_contract.messages.batch import Batch, encode_batch
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.unit.agent.spool.test_spool import BOOT, fill, following, kept
 from tests.unit.agent.spool.test_sqlite_spool import MB, ROOT, RUNS, all_kept, crash, running, spool_at
 

@@ -24,7 +24,7 @@ from iort_agent.spool import FULL, PROCESS, REJECT_NEW, Entry, QueueConfig
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool, make_spool
-from tests.agent_fakes import ManualClock
+from testkit.agent import ManualClock
 from tests.examples import examples
 from tests.unit.agent.spool.test_spool import BOOT, fill, following, kept
 

@@ -22,7 +22,7 @@ from iort_contract.dynamodb import plain, starting_between
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.ros1.message import Messages, RosType
 from iort_contract.tables import BATCH
-from tests.fakes import TOPIC_OF_CAR, item_of, item_of_message
+from testkit.dynamodb import TOPIC_OF_CAR, item_of, item_of_message
 from tests.ros1_strategies import definitions, messages
 from tests.unit.contract.contract_values import BOOT, batches, same
 

@@ -17,8 +17,8 @@ from iort_analysis.samples.steps import decoded, integers, written
 from iort_contract.codec.columns import DICTIONARY
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, read_envelope
+from testkit.dynamodb import item_of_message
 from tests.examples import examples
-from tests.fakes import item_of_message
 
 NUMBER = st.integers(-(10**16) + 1, 10**16 - 1)
 LISTS = st.lists(st.lists(NUMBER, min_size=1, max_size=4), min_size=1, max_size=3)

@@ -15,8 +15,8 @@ import pytest
 from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
+from testkit.ros1_types import Message
 from tests.messages_page import EXAMPLES, PAGE
-from tests.ros1_types import Message
 
 TIMES_US = [1_700_000_000_000_000, 1_700_000_000_020_000, 1_700_000_000_040_001]
 NUMBERS, BREAK = "<dI?", b"\n"

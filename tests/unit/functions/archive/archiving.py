@@ -17,7 +17,7 @@ from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
 from iort_contract.topics import parse_topic
-from tests.fakes import FILES, TELEMETRY, TOPIC_OF_CAR, item_of
+from testkit.dynamodb import FILES, TELEMETRY, TOPIC_OF_CAR, item_of
 from tests.unit.contract.contract_values import BOOT
 
 DAY_S = 86_400

@@ -6,7 +6,7 @@ import boto3
 import pytest
 
 from iort_contract.catalog.environments import ArchiveEnvironment
-from tests.fakes import FILES, ROBOTS, TELEMETRY
+from testkit.dynamodb import FILES, ROBOTS, TELEMETRY
 from tests.unit.functions.archive.archiving import RETENTION_S, Cloud
 
 

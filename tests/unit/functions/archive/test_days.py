@@ -11,7 +11,7 @@ from functions import archive as function
 from functions.shared.archive_writer import WRITING_MS, BeingWrittenError
 from iort_contract.archive import HOUR, JOIN, TASK, day_key, hour_key
 from iort_contract.tables import TOPIC
-from tests.fakes import TOPIC_OF_CAR
+from testkit.dynamodb import TOPIC_OF_CAR
 from tests.unit.functions.archive.archiving import CAR, DAY, HOUR_0, HOUR_1, LATER_MS, Killed, kill
 
 OBJECT_OF_DAY = day_key(CAR, HOUR_0)

@@ -13,7 +13,7 @@ from functions.archive import PUT_OFF_S, margin_s, put_off
 from functions.shared.summary import decode_records
 from iort_contract.archive import ARCHIVE, DUE, HOUR, PUT_OFF, TASK
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
-from tests.fakes import TELEMETRY, TOPIC_OF_CAR, record_of
+from testkit.dynamodb import TELEMETRY, TOPIC_OF_CAR, record_of
 from tests.unit.functions.archive.archiving import HOUR_0, NOW_MS, PENDING, RETENTION_S
 
 

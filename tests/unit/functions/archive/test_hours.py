@@ -11,7 +11,7 @@ from botocore.exceptions import ClientError
 from functions.shared import archive_writer
 from iort_contract.archive import HOUR_REST_MS, content_hash, hour_key, item_hash, refused_key
 from iort_contract.tables import BATCH, EXPIRES_S
-from tests.fakes import FILES, TELEMETRY, item_of_message
+from testkit.dynamodb import FILES, TELEMETRY, item_of_message
 from tests.unit.functions.archive.archiving import (
     CAR,
     DAY,

@@ -11,7 +11,7 @@ from functions.shared.archive import MARKS, MARKS_A_DAY, Marks
 from iort_contract.archive import ARCHIVE, DUE, HOUR, HOUR_REST_MS, TASK, Hour, Pending
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, build_topic
-from tests.fakes import TOPIC_OF_CAR
+from testkit.dynamodb import TOPIC_OF_CAR
 from tests.unit.functions.archive.archiving import HOUR_0, NOW_MS, PENDING, kill
 
 TOPIC_OF_OTHER = build_topic(RECORD, "other", "vesc")

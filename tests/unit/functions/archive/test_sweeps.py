@@ -10,7 +10,7 @@ from functions import archive as function
 from functions.archive import margin_s
 from iort_contract.archive import ALL, HOUR, HOUR_REST_MS, SWEEP, TASK, Hour, Pending
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
-from tests.fakes import ROBOTS, TELEMETRY, TOPIC_OF_CAR
+from testkit.dynamodb import ROBOTS, TELEMETRY, TOPIC_OF_CAR
 from tests.unit.functions.archive.archiving import (
     DAY_S,
     HOUR_0,

@@ -8,15 +8,7 @@ from collections import defaultdict
 from functions.shared.summary import process
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.batch import Batch
-from tests.fakes import (
-    TELEMETRY,
-    TOPIC_OF_CAR,
-    FakeDynamoDB,
-    item_of,
-    record_of,
-    summary_of,
-    tables,
-)
+from testkit.dynamodb import TELEMETRY, TOPIC_OF_CAR, FakeDynamoDB, item_of, record_of, summary_of, tables
 
 S = 1_000_000
 SECOND = 1_700_000_000

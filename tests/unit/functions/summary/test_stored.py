@@ -7,7 +7,7 @@ import pytest
 from functions.shared.seconds import SECOND_BATCHES, Reader
 from functions.shared.summary import process
 from iort_contract.messages.batch import Batch
-from tests.fakes import TOPIC_OF_CAR
+from testkit.dynamodb import TOPIC_OF_CAR
 from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch
 
 MANY = 3 * SECOND_BATCHES

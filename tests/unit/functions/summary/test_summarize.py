@@ -10,12 +10,7 @@ import pytest
 
 from functions.shared.summary import process
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS
-from tests.fakes import (
-    EXPIRES,
-    ROBOTS,
-    item_of,
-    record_of,
-)
+from testkit.dynamodb import EXPIRES, ROBOTS, item_of, record_of
 from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, clean, counted
 
 

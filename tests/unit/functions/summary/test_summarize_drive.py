@@ -11,13 +11,7 @@ from functions.summarize import size_of
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
-from tests.fakes import (
-    ARCHIVE,
-    NAMES,
-    ROBOTS,
-    SUMMARY,
-    TELEMETRY,
-)
+from testkit.dynamodb import ARCHIVE, NAMES, ROBOTS, SUMMARY, TELEMETRY
 from tests.recordings import recording
 from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, counted, drive_of
 

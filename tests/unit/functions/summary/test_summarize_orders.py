@@ -11,11 +11,8 @@ from hypothesis import strategies as st
 
 from iort_contract.messages.batch import split_batch
 from iort_contract.statistics import missing_before
+from testkit.dynamodb import ROBOTS, FakeDynamoDB
 from tests.examples import examples
-from tests.fakes import (
-    ROBOTS,
-    FakeDynamoDB,
-)
 from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, clean
 
 

@@ -15,11 +15,7 @@ from iort_contract.codec.columns import DICTIONARY
 from iort_contract.dynamodb import TableError
 from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES
 from iort_contract.messages.batch import BatchId, encode_batch
-from tests.fakes import (
-    ROBOTS,
-    FakeDynamoDB,
-    item_of_message,
-)
+from testkit.dynamodb import ROBOTS, FakeDynamoDB, item_of_message
 from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, clean, counted
 
 

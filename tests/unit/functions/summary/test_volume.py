@@ -6,7 +6,7 @@ import pytest
 
 from functions.summarize import EVERY_S, PARTS, Volume, size_of
 from iort_contract.tables import BATCH, PUT_OFF_TO_S, RECORD_BYTES, RECORD_DAY, ROBOT, TOPIC
-from tests.fakes import ROBOTS
+from testkit.dynamodb import ROBOTS
 from tests.unit.functions.summary.summarizing import counted
 
 MOST, NOON_S = 1_000_000, 1_700_049_600.0

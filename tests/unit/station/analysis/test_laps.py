@@ -13,7 +13,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from tests.fakes import TELEMETRY, item_of
+from testkit.dynamodb import TELEMETRY, item_of
 from tests.unit.analysis.drives import driven
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
 

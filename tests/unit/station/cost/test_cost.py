@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from bench.load.simulated import simulated_drive
 from bench.meters import message_sizes
 from functions.shared.metrics import Gathered, emit
 from functions.shared.summary import measure
@@ -30,6 +29,7 @@ from iort_station.cost.prices import PRICES
 from iort_station.cost.usage import CLOCK_PING_S, Usage
 from iort_station.errors import StationError
 from scripts.docs_parts import ROOT
+from testkit.car import simulated_drive
 
 # By PubNub, which uses every part of the model.
 _ONE = Usage(live_transport=PUBNUB)

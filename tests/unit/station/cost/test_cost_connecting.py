@@ -20,7 +20,7 @@ from iort_station.cost import scale
 from iort_station.cost.bill import model
 from iort_station.cost.prices import QUOTAS
 from iort_station.cost.usage import Usage
-from tests.agent_fakes import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock
 
 _ONE = Usage()
 # AWS IoT Core, "Additional metering details".

@@ -6,10 +6,10 @@ from dataclasses import asdict
 
 import pytest
 
-from bench.load.simulated import simulated_drive
 from bench.meters import message_sizes
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_station.cost import sizes
+from testkit.car import simulated_drive
 
 
 def test_each_item_of_a_second_fits_in_one_write_unit():

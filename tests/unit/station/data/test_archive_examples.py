@@ -9,8 +9,8 @@ import pytest
 
 from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
+from testkit.dynamodb import TELEMETRY, FakeDynamoDB, item_of
 from tests.archived import FakeS3, archive, compact
-from tests.fakes import TELEMETRY, FakeDynamoDB, item_of
 
 EXAMPLES = Path(__file__).parents[4] / "docs" / "examples"
 DAY_US, HOUR_US, S = 86_400_000_000, 3_600_000_000, 1_000_000

@@ -22,8 +22,8 @@ from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
 from iort_station.data.recorded import Recorded
+from testkit.dynamodb import TELEMETRY, item_of_message
 from tests.examples import examples
-from tests.fakes import TELEMETRY, item_of_message
 from tests.recordings import recording
 from tests.unit.contract.codec.test_columns import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.contract.ros1.ros1_messages import text, u32

@@ -26,7 +26,7 @@ from iort_station.cli.verbs.data import query
 from iort_station.data import select
 from iort_station.data import selection as conditions
 from iort_station.errors import StationError
-from tests.fakes import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
+from testkit.dynamodb import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
 
 TOPIC = build_topic("dt", "car", "vesc")
 START = 1_700_000_000_000_000

@@ -13,7 +13,7 @@ from iort_contract.ros1.decode import Large
 from iort_contract.ros1.message import Messages, RosType, cut
 from iort_station.data.export import Export
 from iort_station.data.selection import select
-from tests.fakes import TELEMETRY, item_of, serialize
+from testkit.dynamodb import TELEMETRY, item_of, serialize
 from tests.unit.contract.ros1.ros1_messages import LINE, text, u32
 from tests.unit.station.data.test_data import START, cloud_of
 

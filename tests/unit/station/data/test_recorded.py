@@ -37,9 +37,9 @@ from iort_station.page.answers import answers
 from iort_station.page.history import downloads
 from iort_station.upkeep import deep
 from iort_station.upkeep.finding import FAIL
+from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_message
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
-from tests.fakes import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_message
 from tests.unit.contract.ros1.ros1_messages import text, u32
 from tests.unit.functions.summary.summarizing import Stream
 from tests.unit.station.data.test_data import FakeCloud, cloud_of

@@ -13,7 +13,7 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.page.answers import answers
-from tests.fakes import TELEMETRY, item_of
+from testkit.dynamodb import TELEMETRY, item_of
 from tests.unit.station.data.test_data import START, cloud_of
 
 SECOND = 1_000_000

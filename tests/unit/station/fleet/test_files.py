@@ -15,7 +15,7 @@ from iort_station.cli.main import app
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files
-from tests.fakes import FILES
+from testkit.dynamodb import FILES
 
 # 2023-11-14T22:13:20Z
 NOON = 1_700_000_000

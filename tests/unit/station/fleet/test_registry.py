@@ -12,7 +12,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.identity import Bundle, write_bundle
-from tests.fakes import ROBOTS, serialize
+from testkit.dynamodb import ROBOTS, serialize
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
 
 

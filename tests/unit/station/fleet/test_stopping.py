@@ -22,7 +22,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import stopping
 from iort_station.operations.monitoring.alarms import user
 from iort_station.page import answers, motion
-from tests.waiting import GUARD_S
+from testkit.waiting import GUARD_S
 
 # A page that shows every stop.
 NOW = {"seen_ms": str(10**15)}

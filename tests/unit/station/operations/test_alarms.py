@@ -11,7 +11,7 @@ import pytest
 from iort_contract.catalog.metrics import METRICS
 from iort_station.errors import StationError
 from iort_station.operations.monitoring import alarms
-from tests.fakes import ROBOTS, serialize
+from testkit.dynamodb import ROBOTS, serialize
 from tests.unit.station.data.test_data import FakeCloud, cloud_of
 
 

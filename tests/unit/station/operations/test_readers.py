@@ -22,7 +22,7 @@ from iort_contract.messages.control.commands import (
 )
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
 from iort_station.operations.delivery.audit import audit
-from tests.fakes import item_of, serialize
+from testkit.dynamodb import item_of, serialize
 
 T_US = 1_700_000_000_000_000
 RUN = "0badcafe"

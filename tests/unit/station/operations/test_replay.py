@@ -12,7 +12,7 @@ from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate, replay
-from tests.fakes import item_of
+from testkit.dynamodb import item_of
 
 TOPIC = build_topic(RECORD, "car", "vesc")
 NOW_MS = 1_700_000_000_000

@@ -14,7 +14,7 @@ from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.topics import build_topic
 from iort_station.data.ros_messages import Maker, made_of, types
 from iort_station.errors import StationError
-from tests.fakes import TELEMETRY, item_of
+from testkit.dynamodb import TELEMETRY, item_of
 from tests.flatten import flatten
 from tests.unit.station.data.test_data import cloud_of
 

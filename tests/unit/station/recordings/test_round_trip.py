@@ -25,11 +25,10 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import write
 from iort_station.data.selection import select
-from tests.agent_fakes import ManualClock
-from tests.fakes import TELEMETRY, item_of_message
-from tests.ros.mixed.robot import MESSAGES
+from testkit.agent import ManualClock
+from testkit.dynamodb import TELEMETRY, item_of_message
+from testkit.ros1_types import HEADER, MESSAGES, Message, fields, header
 from tests.ros1_strategies import definitions, messages
-from tests.ros1_types import HEADER, Message, fields, header
 from tests.unit.agent.sources.test_bag import write_mcap, write_ros2
 from tests.unit.station.data.test_data import cloud_of
 

@@ -138,3 +138,12 @@ def temporary_function(
         yield whole
     finally:
         client.delete_function(FunctionName=whole)
+
+
+def configure(client: Any, function: str, **change: Any) -> None:
+    """Change the function's configuration, and wait until it is in force."""
+    updated = client.get_waiter("function_updated_v2")
+    # An interrupt may have left the change before under way, and AWS refuses one meanwhile.
+    updated.wait(FunctionName=function)
+    client.update_function_configuration(FunctionName=function, **change)
+    updated.wait(FunctionName=function)

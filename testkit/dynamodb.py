@@ -155,6 +155,7 @@ class _Scans:
 
 
 def tables(client: Any) -> Tables:
+    """The tables by their usual names."""
     return Tables(client, **NAMES)
 
 
@@ -164,6 +165,7 @@ def item_of(batch: Batch, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -
 
 
 def item_of_message(message: bytes, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
+    """Return the telemetry item that the record rule makes of a message."""
     envelope = json_object(message, "envelope")
     envelope.update({TOPIC: topic, RECEIVED_MS: 1_700_000_000_000, EXPIRES_S: expires_s})
     return {name: serialize(value) for name, value in envelope.items()}

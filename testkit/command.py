@@ -6,12 +6,15 @@ import argparse
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import rich.table
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -22,8 +25,9 @@ from rich.progress import (
 )
 from rich.prompt import Confirm
 
-from bench.report import machine
+from testkit import machine
 
+Row = Sequence[str]
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -94,3 +98,28 @@ def wound_up(console: Console) -> Iterator[Callable[[], None]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: cells are text. ``**text**`` is bold in Markdown, and makes a row red on a terminal."""
+
+    title: str
+    head: Row
+    rows: Sequence[Row]
+
+    def as_markdown(self) -> str:
+        """Return the table without its title."""
+        lines = [self.head, ["---", *["---:"] * (len(self.head) - 1)], *self.rows]
+        return "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+
+    def show(self, console: Console) -> None:
+        shown = rich.table.Table(title=self.title, title_justify="left", title_style="bold")
+        for i, name in enumerate(self.head):
+            shown.add_column(name, justify="right" if i else "left")
+        for row in self.rows:
+            cells = [escape(cell.replace("**", "")) for cell in row]
+            shown.add_row(*cells, style="red" if any(cell.startswith("**") for cell in row) else "")
+        console.print(shown)

@@ -1,33 +1,25 @@
 """The most expensive batches for Lambda 2. A hostile robot may send a hundred of them a second.
 
-    python -m bench.load.worst_case
+    python -m testkit.worst_case
 
 Each batch fits into a message. The command measures the processor time to decode and summarise it, without
-any table, and the memory that the decoded batch holds. For a refused batch it prints the reason.
-"""
+any table, and the memory that the decoded batch holds. For a refused batch it prints the reason."""
 
 from __future__ import annotations
 
 import base64
 import json
 import random
-import time
-import tracemalloc
 import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from rich.console import Console
-
-from bench.report.result import Table
 from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
-from iort_contract.limits import MAX_BATCH_VALUES, ContractError
-from iort_contract.messages.batch import Batch, BatchId, decode_batch, encode_batch
-from iort_contract.statistics import summarize_second
+from iort_contract.limits import MAX_BATCH_VALUES
+from iort_contract.messages.batch import Batch, BatchId, encode_batch
 from iort_contract.tables import BATCH
 
 _BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
-_TIMES = 5
 # The most expensive case in the current codec.
 _WORST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
 
@@ -37,14 +29,6 @@ class Case(NamedTuple):
 
     what: str
     message: bytes
-
-
-class Cost(NamedTuple):
-    """The least processor time of a few runs in ms, the memory held in MB, and why it was refused, if so."""
-
-    ms: float
-    held_mb: float
-    refused: str
 
 
 def worst_batches(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
@@ -81,31 +65,6 @@ def cases() -> Iterator[Case]:
     yield Case(f"the agent's own largest: {n} samples of 46 fields", encode_batch(batch))
 
 
-def measure(message: bytes) -> Cost:
-    """Measure Lambda 2's work on a message, without its tables."""
-    refused, spent_ms = "", []
-    for _ in range(_TIMES):
-        began = time.process_time()
-        try:
-            batch = decode_batch(message)
-            summarize_second(batch.t_us // 1_000_000, [batch], None)
-        except ContractError as error:
-            refused = str(error)
-        spent_ms.append((time.process_time() - began) * 1000)
-    return Cost(min(spent_ms), 0.0 if refused else _held_mb(message), refused)
-
-
-def _held_mb(message: bytes) -> float:
-    tracemalloc.start()
-    try:
-        batch = decode_batch(message)
-        held, _ = tracemalloc.get_traced_memory()
-        del batch
-    finally:
-        tracemalloc.stop()
-    return held / 1e6
-
-
 def _columns(n: int, columns: list[bytes]) -> bytes:
     named = b",".join(b'"f%d":%s' % each for each in enumerate(columns))
     return b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (n - 1), named)
@@ -116,17 +75,3 @@ def _message(codec: str, n: int, body: bytes) -> bytes:
     samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
     head = json.loads(encode_batch(Batch(_BOOT, 0, [_T_US], {})))
     return json.dumps({**head, "n": n, "codec": codec, "samples": samples}).encode()
-
-
-def main() -> None:
-    """Measure and print."""
-    rows = []
-    for case in cases():
-        cost, size = measure(case.message), len(case.message) / 1024
-        figures = f"{size:.1f} KB", f"{cost.ms:.0f} ms", f"{cost.held_mb:.1f} MB", cost.refused[:40]
-        rows.append([case.what, *figures])
-    Table("", ["batch", "on the wire", "processor time", "held", "refused"], rows).show(Console())
-
-
-if __name__ == "__main__":
-    main()

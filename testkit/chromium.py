@@ -1,21 +1,61 @@
-"""A Chromium whose tabs are really hidden: playwright keeps every page visible that it holds."""
+"""Opens the machine's Chromium; the installed playwright brings no browser."""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from typing_extensions import Self
 
-from bench.errors import BenchError
-from bench.meters import chromium, usage
-from bench.meters.waiting import reached
+from testkit import machine
+from testkit.waiting import InstrumentError, reached
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+# It opens only our own page on loopback, so it needs no sandbox, GPU or background network.
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+def found() -> str | None:
+    """Return the program in the variable CHROMIUM, or the installed one."""
+    return os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@contextmanager
+def opened() -> Iterator[Browser]:
+    """Yield a browser. Raises `InstrumentError` without one."""
+    try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only who has a browser needs it
+    except ImportError as error:
+        raise InstrumentError("playwright is not installed: run `make setup`") from error
+    program = found()
+    if program is None:
+        raise InstrumentError("there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=program, args=list(FLAGS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
 
 _START_S = 30.0
 
@@ -29,17 +69,19 @@ class Tabs:
         self.url = ""
 
     def __enter__(self) -> Self:
-        program = chromium.found()
+        program = found()
         if program is None:
-            raise BenchError("there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+            raise InstrumentError(
+                "there is no chromium here: apt-get install chromium, or name it in CHROMIUM"
+            )
         own = ("--headless=new", "--remote-debugging-port=0", f"--user-data-dir={self._profile}")
         self._process = subprocess.Popen(
-            [program, *chromium.FLAGS, *own, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+            [program, *FLAGS, *own, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
         )
         told = self._profile / "DevToolsActivePort"
         if not reached(lambda: told.exists() and told.read_text(), within_s=_START_S):
             self._process.kill()
-            raise BenchError("chromium does not start")
+            raise InstrumentError("chromium does not start")
         self.url = f"http://127.0.0.1:{told.read_text().split()[0]}"
         return self
 
@@ -61,7 +103,7 @@ class Tabs:
         self._ask("GET", f"/json/close/{tab}")
 
     def processes(self) -> list[int]:
-        return [self._process.pid, *usage.descendants(self._process.pid)]
+        return [self._process.pid, *machine.descendants(self._process.pid)]
 
     def signal(self, number: int) -> None:
         for pid in self.processes():

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from typing_extensions import Self
 
-from bench import ROOT
-from bench.errors import BenchError
+from testkit import ROOT
+from testkit.waiting import InstrumentError
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 # The packages of the checkout that a node imports; the Python with rospy has none of them installed.
@@ -23,7 +23,7 @@ PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
 _START_S = 120.0
 
 
-class RosError(BenchError):
+class RosError(InstrumentError):
     """ROS 1 is not installed or does not start; the text says how to fix it."""
 
 

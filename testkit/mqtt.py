@@ -21,8 +21,7 @@ from typing_extensions import Self
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE
 from iort_station.cloud import Cloud
-from verify.errors import VerifyError
-from verify.tools.waiting import until
+from testkit.waiting import InstrumentError, until
 
 WAIT_S = 60.0
 # AWS accepts one CONNECT a second per client id ("Connect requests per second per client ID").
@@ -69,16 +68,16 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self._client.stop()
         if not self._stopped.wait(WAIT_S):
-            raise VerifyError(f"{self.name}: the client did not stop")
+            raise InstrumentError(f"{self.name}: the client did not stop")
 
     def online(self) -> Self:
-        """Wait until the broker has accepted the connection; raises `VerifyError` if it does not."""
+        """Wait until the broker has accepted the connection; raises `InstrumentError` if it does not."""
         if not self.connected.wait(WAIT_S):
-            raise VerifyError(f"{self.name}: the broker did not accept the connection")
+            raise InstrumentError(f"{self.name}: the broker did not accept the connection")
         return self
 
     def publish(self, topic: str, payload: bytes) -> str:
-        """Publish at QoS 1; return the broker's reason code. Raises `VerifyError` if none comes."""
+        """Publish at QoS 1; return the broker's reason code. Raises `InstrumentError` if none comes."""
         answer = self._answer(self.send(topic, payload))
         return str(answer.puback.reason_code.name)
 
@@ -98,24 +97,24 @@ class Client:
         return "DISCONNECTED" if self.lost.is_set() else "NOT_SENT"
 
     def subscribe(self, topic_filter: str) -> str:
-        """Subscribe at QoS 1; return the broker's reason code. Raises `VerifyError` if none comes."""
+        """Subscribe at QoS 1; return the broker's reason code. Raises `InstrumentError` if none comes."""
         subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
         packet = mqtt5.SubscribePacket(subscriptions=[subscription])
         answer = self._answer(self._client.subscribe(packet))
         return str(answer.reason_codes[0].name)
 
     def next_message(self, within_s: float = WAIT_S) -> tuple[str, bytes]:
-        """The next incoming message. Raises `VerifyError` if none comes in time."""
+        """The next incoming message. Raises `InstrumentError` if none comes in time."""
         try:
             return self.messages.get(timeout=within_s)
         except queue.Empty:
-            raise VerifyError(f"{self.name}: no message within {within_s:g} s") from None
+            raise InstrumentError(f"{self.name}: no message within {within_s:g} s") from None
 
     def _answer(self, asked: Future[Any]) -> Any:
         try:
             return asked.result(WAIT_S)
         except Exception as error:  # AwsCrtError, CancelledError, TimeoutError and others
-            raise VerifyError(f"{self.name}: the broker did not answer: {error!r}") from error
+            raise InstrumentError(f"{self.name}: the broker did not answer: {error!r}") from error
 
     def _ended(self, packet: Any, what: threading.Event) -> None:
         if packet is not None:
@@ -190,5 +189,5 @@ def soon_refused(folder: Path) -> str | None:
 
     try:
         return until(refused, "a refusal of the certificate", within_s=50)[0]
-    except VerifyError:
+    except InstrumentError:
         return None

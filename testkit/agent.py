@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import partial
-from typing import Callable, NamedTuple, Optional
+from typing import NamedTuple
 
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Clock
@@ -59,7 +60,7 @@ class Published(NamedTuple):
 
 
 # The broker's reason to reject a publish; None to accept it.
-Verdict = Callable[[Published], Optional[str]]
+Verdict = Callable[[Published], str | None]
 
 
 class Loopback:

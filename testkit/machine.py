@@ -1,0 +1,197 @@
+"""Describes the machine and the versions behind a report, without names of hosts, people or folders."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import Self
+
+from testkit import ROOT
+from testkit.waiting import InstrumentError
+
+_PACKAGES = ("aws-cdk-lib", "boto3", "awsiotsdk", "awscrt", "ministack", "pubnub", "numpy", "playwright")
+
+
+def describe() -> dict[str, Any]:
+    """Cores, processor, memory, kernel, Python, packages, commit, load and date."""
+    return {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "cores": os.cpu_count(),
+        "cpu": _line("/proc/cpuinfo", "model name"),
+        "memory": _line("/proc/meminfo", "MemTotal"),
+        "kernel": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "packages": {name: found for name in _PACKAGES if (found := _version(name))},
+        "commit": _commit(),
+        "load_1min": round(os.getloadavg()[0], 2),
+    }
+
+
+def _line(path: str, name: str) -> str:
+    try:
+        lines = Path(path).read_text().splitlines()
+    except OSError:
+        return "unknown"
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "unknown")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+_TICKS = os.sysconf("SC_CLK_TCK")
+_PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Processor seconds since the start, and memory in use now."""
+
+    cpu_s: float
+    rss_mb: float
+
+    def __add__(self, other: Usage) -> Usage:
+        return Usage(self.cpu_s + other.cpu_s, self.rss_mb + other.rss_mb)
+
+
+def usage_of(pid: int) -> Usage:
+    """Return the usage of one process with its ended children; 0 for an ended process."""
+    fields = _stat(pid)
+    if not fields:
+        return Usage(0.0, 0.0)
+    # proc(5): utime, stime, cutime and cstime are fields 14 to 17, rss is 24; the state is 3.
+    return Usage(sum(map(int, fields[11:15])) / _TICKS, int(fields[21]) * _PAGE_MB)
+
+
+def usage_below(pid: int) -> Usage:
+    """Return the usage of all descendants of ``pid`` together."""
+    return sum(map(usage_of, descendants(pid)), Usage(0.0, 0.0))
+
+
+def descendants(pid: int) -> list[int]:
+    """Return every process below ``pid``, without ``pid``."""
+    parents: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal() and (fields := _stat(int(entry.name))):
+            parents.setdefault(int(fields[1]), []).append(int(entry.name))
+    found, todo = [], [pid]
+    while todo:
+        children = parents.get(todo.pop(), [])
+        found += children
+        todo += children
+    return found
+
+
+def threads_ns(pids: Iterable[int]) -> dict[int, int]:
+    """Return the processor time so far of every thread of the processes, in ns by Linux' scheduler."""
+    found: dict[int, int] = {}
+    for file in (file for pid in pids for file in Path(f"/proc/{pid}/task").glob("*/schedstat")):
+        # A thread may end meanwhile.
+        with suppress(OSError, IndexError):
+            found[int(file.parent.name)] = int(file.read_text().split()[0])
+    return found
+
+
+def spent_ms(before: dict[int, int], after: dict[int, int]) -> float:
+    """Return the ms between two readings; a new thread counts whole, an ended one not at all."""
+    return sum(now - before.get(thread, 0) for thread, now in after.items()) / 1e6
+
+
+def _stat(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
+
+
+_INSIDE = "BENCH_OWN_MOUNTS"
+_UNSHARE = ("unshare", "--user", "--map-root-user", "--mount")
+# It takes memory for what is in it only.
+_BYTES = 4 * 2**30
+_TRIES = 100
+
+
+def possible() -> bool:
+    """Whether this process may mount: see `enter`."""
+    return _INSIDE in os.environ
+
+
+def enter(module: str) -> None:
+    """Run this command again, as the module that it is, where it may mount; returns if that is done, or where
+    the machine does not allow it."""
+    if possible() or shutil.which(_UNSHARE[0]) is None:
+        return
+    if subprocess.run([*_UNSHARE, "true"], capture_output=True, check=False).returncode == 0:
+        os.environ[_INSIDE] = "1"
+        command = [*_UNSHARE, sys.executable, "-m", module, *sys.argv[1:]]
+        os.execvp(command[0], command)  # noqa: S606 - it needs no shell
+
+
+class Disk:
+    """The disk at an empty folder, from `__enter__` to `__exit__`.
+
+    ``within`` is what a command begins with to run where the disk is mounted, if that is not here.
+    """
+
+    def __init__(self, folder: Path, *, within: Sequence[str] = ()) -> None:
+        self.folder, self._within = folder, within
+
+    def __enter__(self) -> Self:
+        self.folder.mkdir(parents=True)
+        self._run("mount", "-t", "tmpfs", "-o", f"size={_BYTES},mode=700", "tmpfs")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._run("umount", "--lazy")
+
+    @contextmanager
+    def full(self) -> Iterator[None]:
+        """No byte is free."""
+        self._fill()
+        try:
+            yield
+        finally:
+            self._resize(_BYTES)
+
+    def _fill(self) -> None:
+        for last in (*[False] * _TRIES, True):
+            blocks, free, size = self._run("stat", "--file-system", "--format=%b %f %S").split()
+            try:
+                self._resize((int(blocks) - int(free)) * int(size))
+            except InstrumentError:
+                # It cannot be smaller than what is in it, and somebody may have written meanwhile.
+                if last:
+                    raise
+            else:
+                return
+
+    def _resize(self, size: int) -> None:
+        self._run("mount", "-o", f"remount,size={size}")
+
+    def _run(self, *command: str) -> str:
+        """Run a command about the folder, and return its output."""
+        whole = [*self._within, *command, str(self.folder)]
+        done = subprocess.run(whole, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InstrumentError(f"`{' '.join(whole)}` failed: {done.stderr.strip()}")
+        return done.stdout
