@@ -28,7 +28,7 @@ from iort_agent.common.threads import WATCH, Clock
 from iort_agent.config import Config
 from iort_agent.control.commands import Operator, refuse_commands
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.guard import KeptStop
+from iort_agent.control.guard import StopFile
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
@@ -77,8 +77,8 @@ class Agent:
             live_when=config.live.when,
             motion_stopped=config.motion.stopped,
         )
-        self.kept_stop = KeptStop(config.queue.path if config.downlink.moves() else None)
-        in_force = replace(base, motion_stopped=base.motion_stopped or self.kept_stop.stopped)
+        self.stop_file = StopFile(config.queue.path if config.downlink.moves() else None)
+        in_force = replace(base, motion_stopped=base.motion_stopped or self.stop_file.stopped)
         self.record = RecordLane(
             robot=config.robot,
             namespace=config.namespace,
@@ -158,7 +158,7 @@ class Agent:
         # First, because nothing may delay or prevent it.
         if self.downlink is not None:
             self.downlink.set_stopped(settings.motion_stopped)
-            self.kept_stop.keep(stopped=settings.motion_stopped)
+            self.stop_file.write(stopped=settings.motion_stopped)
         if settings.log_level != self.streams.settings.log_level:
             set_level(settings.log_level)
         self.live.enabled = settings.live_enabled
@@ -272,6 +272,6 @@ def _alarms(agent: Agent) -> list[str]:
     if agent.downlink is not None:
         waits.append(agent.downlink.waits())
         alarms += agent.downlink.alarms()
-        alarms += [agent.kept_stop.alarm] if agent.kept_stop.alarm is not None else []
+        alarms += [agent.stop_file.alarm] if agent.stop_file.alarm is not None else []
     # Without repetitions: sources and commands may share a ROS node.
     return alarms + [f"source waits: {why}" for why in dict.fromkeys(waits) if why]

@@ -125,7 +125,7 @@ class Runtime:
         self.agent.live.tick()
         self.agent.pings.tick()
         self.agent.shadow.tick()
-        self.agent.kept_stop.tick()
+        self.agent.stop_file.tick()
 
     def _tick_until_stop(self) -> None:
         agent, metrics = self.agent, self.agent.config.metrics

@@ -25,6 +25,7 @@ import time
 from typing import Callable, NamedTuple, Protocol
 
 _log = logging.getLogger(__name__)
+
 RESTART, END = "restart", "end"
 FIRST_S, SHOWN_S = 0.1, 600.0
 # A thread that ran for longer has recovered: its next wait is short again.

@@ -15,7 +15,7 @@ from iort_agent.control.config import CommandConfig, DownlinkConfig
 from iort_agent.control.guard import Guard
 from iort_agent.control.leases import STOP_AHEAD_MS, Leases, Limits
 from iort_agent.errors import ConfigError
-from iort_agent.mqtt.uplink import Link, MqttMessage
+from iort_agent.mqtt.uplink import Link, MqttMessage, OnMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.control.commands import Command, decode_command
@@ -31,6 +31,7 @@ from iort_contract.ros1.definition import Definition
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)
+
 # Between two samples of refused motions: others drive meanwhile.
 _REFUSED_S = 0.1
 # rospy hands a stop to threads of its own. An agent that is killed before it is written must leave it to the
@@ -49,29 +50,6 @@ def limited(message: Mapping[str, Any], limits: DriveLimits) -> tuple[Mapping[st
         if value is not None and not -most <= value <= most:
             message, beyond = _with(message, path.split("."), max(-most, min(most, value))), True
     return message, beyond
-
-
-def drive_sample(
-    command: Command, outcome: str, driver: Command | None, left_s: float, limits: DriveLimits | None
-) -> dict[str, Value]:
-    """A sample of the stream `DRIVE_STREAM`; speed and steering are what the robot was told."""
-    speed = steering = None
-    if limits is not None and outcome in (ACCEPTED, STOPPED):
-        # A field that the message leaves out is zero; a stop is.
-        told = {} if outcome == STOPPED else command.message
-        speed, steering = (_number_at(told, path) or 0.0 for path in (limits.speed, limits.steering))
-    return {
-        "session": command.session,
-        "by": command.by,
-        "seq": command.seq,
-        "sent_us": command.sent_us,
-        "outcome": outcome,
-        "driver": driver.session if driver is not None else None,
-        "driver_by": driver.by if driver is not None else None,
-        "lease_left_ms": round(left_s * 1000),
-        "speed": speed,
-        "steering": steering,
-    }
 
 
 def _number_at(message: Any, path: str) -> float | None:
@@ -155,8 +133,25 @@ class Named:
         return encode(self.definition, message, now_us=now_us, partial=self.config.partial)
 
     def sample(self, command: Command, outcome: str, now: float) -> Mapping[str, Value]:
-        left_s = self.leases.left_s(now)
-        return drive_sample(command, outcome, self.leases.driver(now), left_s, self.limits)
+        """A sample of the stream `DRIVE_STREAM`; speed and steering are what the robot was told."""
+        driver, limits = self.leases.driver(now), self.limits
+        speed = steering = None
+        if limits is not None and outcome in (ACCEPTED, STOPPED):
+            # A field that the message leaves out is zero; a stop is.
+            message = {} if outcome == STOPPED else command.message
+            speed, steering = (_number_at(message, path) or 0.0 for path in (limits.speed, limits.steering))
+        return {
+            "session": command.session,
+            "by": command.by,
+            "seq": command.seq,
+            "sent_us": command.sent_us,
+            "outcome": outcome,
+            "driver": driver.session if driver is not None else None,
+            "driver_by": driver.by if driver is not None else None,
+            "lease_left_ms": round(self.leases.left_s(now) * 1000),
+            "speed": speed,
+            "steering": steering,
+        }
 
     def report(self) -> dict[str, int]:
         counts = {"passed": self.passed, "stops": self.motion.stops if self.motion is not None else 0}
@@ -177,34 +172,30 @@ class Operator:
     settings_known: Callable[[], bool]
 
 
-class Unknown:
-    """Answers commands that a robot does not have: who sent one need not wait. ``known`` are the others."""
+def refuser(
+    known: Sequence[str], rejections: ThrottledLog, answer: Callable[[str, Command, str | None], None]
+) -> OnMessage:
+    """Answers commands that a robot does not have, so that who sent one need not wait."""
+    names = f"known: {', '.join(known)}" if known else "car.yaml has no downlink.cmd"
 
-    def __init__(
-        self,
-        known: Sequence[str],
-        rejections: ThrottledLog,
-        answer: Callable[[str, Command, str | None], None],
-    ) -> None:
-        self._known, self._rejections, self._answer = known, rejections, answer
-
-    def refuse(self, message: MqttMessage) -> None:
+    def refuse(message: MqttMessage) -> None:
         name = message.topic.rsplit("/", 1)[-1]
-        known = f"known: {', '.join(self._known)}" if self._known else "car.yaml has no downlink.cmd"
-        reason = f"{NO_COMMAND.replace('_', ' ')}{did_you_mean(name, self._known)}; {known}"
+        reason = f"{NO_COMMAND.replace('_', ' ')}{did_you_mean(name, known)}; {names}"
         try:
-            offered = decode_command(message.payload)
+            command = decode_command(message.payload)
         except ContractError as error:
-            self._rejections.warn(f"{CMD} malformed", f"{message.topic}: rejected: {error}")
+            rejections.warn(f"{CMD} malformed", f"{message.topic}: rejected: {error}")
             return
-        self._rejections.warn(f"{CMD} {NO_COMMAND}", f"{message.topic}: rejected: {reason}")
-        if offered.answer:
-            self._answer(name, offered, reason)
+        rejections.warn(f"{CMD} {NO_COMMAND}", f"{message.topic}: rejected: {reason}")
+        if command.answer:
+            answer(name, command, reason)
+
+    return refuse
 
 
 def refuse_commands(link: Link, answer: Callable[[str, Command, str | None], None]) -> None:
     """Answer every command to a robot that takes none."""
-    link.uplink.subscribe(_all(link), Unknown((), ThrottledLog(_log, link.clock), answer).refuse)
+    link.uplink.subscribe(_all(link), refuser((), ThrottledLog(_log, link.clock), answer))
 
 
 def _all(link: Link) -> str:
@@ -247,7 +238,7 @@ class Commands:
             command.check(self._clock.now_us())
             self._commands[bridge.link.topic(CMD, name)] = command
             self._graph.advertise(settings.topic, settings.type)
-        self._unknown = Unknown([name for name, _ in config.cmd], bridge.rejections, operator.answer)
+        self._refuse = refuser([name for name, _ in config.cmd], bridge.rejections, operator.answer)
         bridge.link.uplink.subscribe(_all(bridge.link), self._on_message)
         bridge.link.uplink.on_connection(self._on_connection)
 
@@ -289,13 +280,13 @@ class Commands:
                 # A lease whose stop nobody hears ends for the guard, too, which then publishes its own.
                 if not motion.unheard and now >= motion.written:
                     self._tell_guard(motion)
-            found = [motion.next_due(now) for motion in self._motions.values()]
+            due = [motion.next_due(now) for motion in self._motions.values()]
             # After the stops, since it may have to start a process.
             if self._guard is not None:
                 self._guard.tick(stops=not any(motion.unheard for motion in self._motions.values()))
         for sample in stopped:
             self._operator.drove(sample)
-        return min((at for at in found if at is not None), default=None)
+        return min((at for at in due if at is not None), default=None)
 
     def report(self) -> dict[str, Any]:
         """The passed and the limited commands and the published stops, by name."""
@@ -303,12 +294,12 @@ class Commands:
 
     def alarms(self) -> list[str]:
         """Why no motion may pass."""
-        found = []
+        alarms = []
         if self.held():
-            found.append("emergency stop: no motion until an operator releases it")
+            alarms.append("emergency stop: no motion until an operator releases it")
         if self.guarded() is False:
-            found.append("the guard does not run yet: no motion until it does")
-        return found
+            alarms.append("the guard does not run yet: no motion until it does")
+        return alarms
 
     def held(self) -> bool:
         """Whether an emergency stop holds."""
@@ -368,7 +359,7 @@ class Commands:
     def _on_message(self, message: MqttMessage) -> None:
         command = self._commands.get(message.topic)
         if command is None:
-            self._unknown.refuse(message)
+            self._refuse(message)
             return
         try:
             offered = decode_command(message.payload)

@@ -31,6 +31,7 @@ from iort_agent.ros1.json_message import encode
 from iort_agent.ros1.node import Node, shared
 
 _log = logging.getLogger("iort_agent.guard")
+
 PROCESS = "iort_agent.control.guard"
 # The guard answers each line with one byte. If it does not within this time, it is frozen.
 _ANSWER_S = 1.0
@@ -50,31 +51,34 @@ _BUFFER = 65_536
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class KeptStop:
-    """`stopped` is what is in force, at first what the last run kept. Without a queue in a file the stop is
-    known again once the agent is connected."""
+class StopFile:
+    """The emergency stop over a restart of the agent: a file beside the queue's, while it holds.
+
+    `stopped` is what is in force, at first what the last run wrote. Without a queue in a file the stop is
+    known again once the agent is connected.
+    """
 
     def __init__(self, queue: Path | None) -> None:
         self._file = queue.with_name(f"{queue.name}.stopped") if queue is not None else None
-        self.stopped = self._kept = self._file is not None and self._file.exists()
+        self.stopped = self._written = self._file is not None and self._file.exists()
         # Why the next run would not know it.
         self.alarm: str | None = None
 
-    def keep(self, *, stopped: bool) -> None:
-        """Keep it for the next run. A disk that does not work is no reason not to stop."""
+    def write(self, *, stopped: bool) -> None:
+        """Write it for the next run. A disk that does not work is no reason not to stop."""
         self.stopped = stopped
         self.tick()
 
     def tick(self) -> None:
         """Try again what the disk did not do."""
-        if self._file is None or self.stopped == self._kept:
+        if self._file is None or self.stopped == self._written:
             return
         stopped = self.stopped
         try:
             if stopped:
                 self._file.touch(mode=0o600)
-            elif self._file.exists():
-                self._file.unlink()
+            else:
+                self._file.unlink(missing_ok=True)
             folder = os.open(self._file.parent, os.O_RDONLY)
             try:
                 os.fsync(folder)
@@ -85,7 +89,7 @@ class KeptStop:
                 _log.error("%s: the emergency stop cannot be kept over a restart: %s", self._file, error)
             self.alarm = f"{self._file}: a restart would not know the emergency stop or its end: {error}"
         else:
-            self._kept, self.alarm = stopped, None
+            self._written, self.alarm = stopped, None
 
 
 class Guard:
@@ -283,7 +287,7 @@ class _Guard:
         """Keep an emergency stop for the next agent, and set ``over`` once its node is in the graph."""
         if self._queue is not None and any(motion.stops.held for motion in self._motions.values()):
             # The agent may have died before it did. A slow disk delays no stop here.
-            KeptStop(Path(self._queue)).keep(stopped=True)
+            StopFile(Path(self._queue)).write(stopped=True)
         seen = 0
         while not over.wait(_LOOK_S):
             seen = seen + 1 if self.node.lives(self._agent) else 0

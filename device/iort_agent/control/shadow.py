@@ -35,6 +35,7 @@ from iort_contract.topics import ACCEPTED, SHADOW, check_stream
 _PLACE = Place(Path("shadow agent"))
 _FIELD_LIST = items(text(check_field), what=FIELD_LIST)
 _log = logging.getLogger(__name__)
+
 # Between two reports, and between two fetches: no motion passes before the first has been answered.
 _AGAIN_S, _FETCH_AGAIN_S = 30.0, 5.0
 # AWS limits a shadow document to 8 KB. A rejected value is quoted up to this length.

@@ -20,7 +20,7 @@ from iort_agent.config import Config, load_config
 from iort_agent.errors import BusyError, ConfigError, IdentityError, NotRunningError
 from iort_agent.identity import parse_certificate
 from iort_agent.status import ask
-from iort_agent.verbs.registration import SEAMS, Seams, forget, load_claim, register
+from iort_agent.verbs.registration import PENDING, SEAMS, Seams, load_claim, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
@@ -63,7 +63,7 @@ def provision(file: Path, *, robot: str | None, seams: Seams = SEAMS) -> Path:
     if claim.root_ca is not None:
         settings["root_ca"] = os.path.relpath(claim.root_ca, folder)
     _update_config(config_file, settings)
-    forget(folder)
+    (folder / PENDING).unlink(missing_ok=True)
     load_config(config_file)
     return config_file
 
@@ -83,11 +83,11 @@ def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = S
     try:
         _wait_connected(config, parse_certificate(issued.certificate).id, status_socket)
     except BaseException:
-        forget(folder)
+        (folder / PENDING).unlink(missing_ok=True)
         for path in files:
             _previous(path).replace(path)
         raise
-    forget(folder)
+    (folder / PENDING).unlink(missing_ok=True)
     for path in files:
         _previous(path).unlink()
 

@@ -25,17 +25,16 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import check_namespace, check_robot
 
+_log = logging.getLogger(__name__)
+
 _WAIT_S = 30.0
-
-
-# Place Linux tells the machine's serial number; the first file that exists counts.
+# Where Linux tells the machine's serial number; the first file that exists counts.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
-_NAME = PurePath(".provisioning.json")
+PENDING = PurePath(".provisioning.json")
 _MAX_BYTES = 64 * 1024
 # "The certificateOwnershipToken expires after one hour", and the certificate is deleted then if it was not
 # registered ("Device provisioning MQTT API").
 TOKEN_S = 3600.0
-_log = logging.getLogger(__name__)
 # Waits before each further try to register.
 _AGAIN_S = (1.0, 4.0)
 # How AWS IoT's error codes begin for a token or a certificate that is no longer valid.
@@ -115,31 +114,24 @@ class Pending:
         """Whether the token may still be valid. A request from the future means that the clock was set."""
         return 0 <= now_s - self.asked_s < TOKEN_S
 
+    def write(self, folder: Path) -> None:
+        """Write it to the disk, readable by its owner only. Raises `OSError`."""
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        write_below(folder, PENDING, json.dumps(asdict(self)).encode(), sync=True)
 
-def keep(folder: Path, pending: Pending) -> None:
-    """Write it to the disk, readable by its owner only. Raises `OSError`."""
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    write_below(folder, _NAME, json.dumps(asdict(pending)).encode(), sync=True)
 
-
-def kept(folder: Path) -> Pending | None:
+def read_pending(folder: Path) -> Pending | None:
     """What an earlier run left; None if it left nothing readable."""
     try:
-        with open_below(folder, _NAME) as file:
-            said = json.loads(file.read(_MAX_BYTES))
-        asked_s = float(said.pop("asked_s"))
-        return Pending(asked_s=asked_s, **{name: str(value) for name, value in said.items()})
+        with open_below(folder, PENDING) as file:
+            content = json.loads(file.read(_MAX_BYTES))
+        asked_s = float(content.pop("asked_s"))
+        return Pending(asked_s=asked_s, **{name: str(value) for name, value in content.items()})
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        _log.warning("%s is ignored: %s", folder / _NAME, error)
+        _log.warning("%s is ignored: %s", folder / PENDING, error)
         return None
-
-
-def forget(folder: Path) -> None:
-    """Delete it."""
-    with contextlib.suppress(FileNotFoundError):
-        (folder / _NAME).unlink()
 
 
 class _Connection:
@@ -287,11 +279,11 @@ SEAMS = Seams()
 
 def register(claim: Claim, robot: str, folder: Path, seams: Seams) -> Pending:
     """A key and its certificate, registered for the robot's thing: those of an earlier run that was stopped,
-    or new ones. `pending` keeps them in the folder until `forget`."""
+    or new ones. `PENDING` keeps them in the folder until it is deleted."""
     serial = claim.serial or machine_serial()
     if not _SERIAL.fullmatch(serial):
         raise IdentityError(f"serial must be of A-Z a-z 0-9 _ . , @ / : # -, got {serial!r}")
-    earlier = kept(folder)
+    earlier = read_pending(folder)
     if earlier is not None and earlier.is_for(robot, serial, claim.endpoint, claim.namespace):
         if _finish(claim, earlier, seams):
             return earlier
@@ -301,7 +293,7 @@ def register(claim: Claim, robot: str, folder: Path, seams: Seams) -> Pending:
         certificate, token = connection.certify(request)
         asked_s = time.time()
         issued = Pending(robot, serial, claim.endpoint, claim.namespace, key, certificate, token, asked_s)
-        keep(folder, issued)
+        issued.write(folder)
         _ask(connection, issued, seams)
     return issued
 

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from iort_agent.control.guard import KeptStop
+from iort_agent.control.guard import StopFile
 from iort_agent.errors import ConfigError
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import T0, FakeGuard, Rig, doubles
@@ -181,15 +181,15 @@ def test_an_emergency_stop_is_kept_once_the_disk_works_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue = tmp_path / "queue.db"
-    kept = KeptStop(queue)
+    kept = StopFile(queue)
     with monkeypatch.context() as full:
         full.setattr(Path, "touch", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
-        kept.keep(stopped=True)
+        kept.write(stopped=True)
         kept.tick()
         assert "No space left" in (kept.alarm or "")
-        assert not KeptStop(queue).stopped
+        assert not StopFile(queue).stopped
     kept.tick()
     assert kept.alarm is None
-    assert KeptStop(queue).stopped
-    kept.keep(stopped=False)
-    assert not KeptStop(queue).stopped
+    assert StopFile(queue).stopped
+    kept.write(stopped=False)
+    assert not StopFile(queue).stopped

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from iort_agent.control import guard as guard_process
-from iort_agent.control.guard import Guard, KeptStop
+from iort_agent.control.guard import Guard, StopFile
 from iort_contract.ros1.definition import parse
 from testkit.agent import ManualClock
 
@@ -120,7 +120,7 @@ def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
     queue = tmp_path / "queue.db"
     guarded(node, monkeypatch, ["/speed", None, True], queue=queue)
     assert next(looks, None) is None
-    assert KeptStop(queue).stopped, "the agent had no time to keep it"
+    assert StopFile(queue).stopped, "the agent had no time to keep it"
 
 
 def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:

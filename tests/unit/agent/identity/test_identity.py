@@ -13,7 +13,7 @@ from iort_agent.config import load_config
 from iort_agent.errors import BusyError, IdentityError, RefusedError
 from iort_agent.verbs import provision as provision_module
 from iort_agent.verbs.provision import provision
-from iort_agent.verbs.registration import TOKEN_S, Pending, Seams, keep, kept, register_again
+from iort_agent.verbs.registration import TOKEN_S, Pending, Seams, read_pending, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.control.driving import DRIVE_LEASE_MS
 
@@ -117,7 +117,7 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
         "token": "token 0",
     }
     pending = Pending(**{**values, **other}, asked_s=time.time() if asked_s is None else asked_s)
-    keep(folder, pending)
+    pending.write(folder)
     return pending
 
 
@@ -134,7 +134,7 @@ def test_a_new_configuration_simulates_a_car_that_can_be_driven_and_stopped(
 def taken_up(claim: Path, aws: Exchange) -> str:
     """The certificate that the robot has afterwards."""
     provision(claim, robot="car", seams=aws.seams)
-    assert kept(claim.parent) is None
+    assert read_pending(claim.parent) is None
     return (claim.parent / "certificate.pem").read_text()
 
 
@@ -193,7 +193,7 @@ def test_an_expired_token_is_kept_without_a_network(claim: Path, aws: Exchange) 
     aws.claim_is_good = False
     with pytest.raises(IdentityError, match="does not connect"):
         provision(claim, robot="car", seams=aws.seams)
-    assert kept(claim.parent) == left
+    assert read_pending(claim.parent) == left
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_a_certificate_that_may_be_admitted_later_is_kept(
     aws.refusal = refusal
     with pytest.raises(IdentityError, match=str(refusal)):
         provision(claim, robot="car", seams=aws.seams)
-    assert kept(claim.parent) == left
+    assert read_pending(claim.parent) == left
     assert not aws.issued
 
 
