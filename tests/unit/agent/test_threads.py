@@ -34,10 +34,9 @@ from iort_contract.messages.batch import decode_batch
 from testkit.agent import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
 from tests.unit.agent.control.downlink_rig import FakeGraph
-from tests.unit.agent.control.test_asks import ANSWERS, NAME, TOPIC, string
-from tests.unit.agent.control.test_asks import Rig as AskingRig
-from tests.unit.agent.identity.test_certificate import made, text
+from tests.unit.agent.control.test_peers import ANSWERS, NAME, TOPIC, AskingRig, string
 from tests.unit.agent.test_agent import DOWNLINK
+from tests.unit.agent.test_identity import made, text
 
 SOON_S = 30.0
 WHY = "Surprise: of a kind that nobody handles"
@@ -156,7 +155,7 @@ def guard(_kind: str, folder: Path, patch: pytest.MonkeyPatch) -> None:
     """It still notices that the agent is back, and ends."""
     node, looks = test_guard.Node(), iter([surprise, *[lambda: True] * 3])
     patch.setattr(node, "lives", lambda _name: next(looks)())
-    patch.setattr(test_guard.guard_process, "_LOOK_S", 0.01)
+    patch.setattr(test_guard.guard_module, "_LOOK_S", 0.01)
     test_guard.guarded(node, patch, ["/speed", None, True], queue=folder / "queue.db")
     assert next(looks, None) is None
 

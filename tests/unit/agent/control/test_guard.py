@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import select
@@ -12,13 +13,16 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from iort_agent.control import guard as guard_process
+from iort_agent.control import guard as guard_module
 from iort_agent.control.guard import Guard, StopFile
+from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_contract.ros1.definition import parse
 from testkit.agent import ManualClock
+from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles
 
 
 def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
@@ -94,12 +98,12 @@ def guarded(node: Node, monkeypatch: pytest.MonkeyPatch, *told: Any, queue: Path
     for line in (first, *told):
         os.write(written, json.dumps(line).encode() + b"\n")
     os.close(written)
-    monkeypatch.setattr(guard_process, "shared", lambda _name: node)
+    monkeypatch.setattr(guard_module, "shared", lambda _name: node)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     with os.fdopen(lines) as stdin, os.fdopen(answers, "w") as stdout:
         monkeypatch.setattr(sys, "stdin", stdin)
         monkeypatch.setattr(sys, "stdout", stdout)
-        assert guard_process.main() == 0
+        assert guard_module.main() == 0
         monkeypatch.undo()
 
 
@@ -116,7 +120,7 @@ def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
 ) -> None:
     node, looks = Node(), iter([True, True, False, True, True, True])
     monkeypatch.setattr(node, "lives", lambda _name: next(looks))
-    monkeypatch.setattr(guard_process, "_LOOK_S", 0.01)
+    monkeypatch.setattr(guard_module, "_LOOK_S", 0.01)
     queue = tmp_path / "queue.db"
     guarded(node, monkeypatch, ["/speed", None, True], queue=queue)
     assert next(looks, None) is None
@@ -126,10 +130,111 @@ def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
 def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
     node = Node()
     monkeypatch.setattr(node, "lives", lambda name: name == "car" and len(node.published) > 12)
-    monkeypatch.setattr(guard_process, "_LOOK_S", 0.01)
+    monkeypatch.setattr(guard_module, "_LOOK_S", 0.01)
     guarded(node, monkeypatch, ["/speed", None, True])
     assert len(node.published) > 12, "more than at the end of a lease"
     # The stop was released before the agent died.
     before = len(node.published)
     guarded(node, monkeypatch, ["/speed", None, True], ["/speed", None, False])
     assert len(node.published) == before
+
+
+class DyingError(Exception):
+    """The agent's end."""
+
+
+class DyingGuard(FakeGuard):
+    """The agent dies while it tells."""
+
+    def tell(self, _topic: str, _until: float | None, *, held: bool) -> bool:
+        raise DyingError
+
+
+def test_the_guard_stops_at_the_leases_end_and_the_agent_before_it() -> None:
+    clock = ManualClock(now_us=T0)
+    guard = FakeGuard(clock)
+    rig = Rig(clock=clock, guard=guard)
+    ahead_s = STOP_AHEAD_MS / 1000
+    rig.send({"data": 2.5})
+    rig.send({"data": 2.5}, lease_ms=STOP_AHEAD_MS + 1)
+    clock.advance(0.001)
+    # Not before the stop is written, which takes another thread's time.
+    assert rig.downlink.tick() == pytest.approx(0.02)
+    assert rig.graph.published[-1] == ("/commands/motor/speed", doubles(0.0))
+    assert len(guard.told) == 2
+    clock.advance(0.02)
+    rig.downlink.tick()
+    # A driver lets go: the guard's stop must not overtake the motion before it.
+    rig.send({"data": 1.0})
+    rig.send({"data": 0.0}, ends=True)
+    rig.downlink.tick()
+    rig.downlink.set_stopped(True)
+    at = clock.monotonic()
+    began = at - 0.021
+    assert guard.told == [
+        (began, pytest.approx(began + LEASE_MS / 1000), False),
+        (began, pytest.approx(began + 0.001 + ahead_s), False),
+        (at, None, False),
+        (at, pytest.approx(at + LEASE_MS / 1000), False),
+        (at, pytest.approx(at + ahead_s), False),
+        (at, None, True),
+    ]
+
+
+def test_the_guard_knows_of_an_emergency_stop_before_the_first_stop() -> None:
+    rig = Rig(guard=DyingGuard(ManualClock(now_us=T0)))
+    with pytest.raises(DyingError):
+        rig.downlink.set_stopped(True)
+    assert rig.graph.published == []
+
+
+def test_the_guard_stops_what_an_agent_outside_the_graph_cannot() -> None:
+    clock = ManualClock(now_us=T0)
+    guard = FakeGuard(clock)
+    rig = Rig(clock=clock, guard=guard)
+    rig.send({"data": 2.5})
+    # Another node has taken the agent's name.
+    rig.graph.up = False
+    clock.advance(0.3)
+    rig.downlink.tick()
+    assert guard.told == [(1000.0, pytest.approx(1000 + LEASE_MS / 1000), False)], (
+        "the lease ends for it, too"
+    )
+    rig.downlink.set_stopped(True)
+    assert guard.told[1:] == [(1000.3, None, True)]
+    assert not guard.stops
+    rig.graph.up = True
+    clock.advance(0.1)
+    rig.downlink.tick()
+    assert guard.stops
+    rig.graph.up = False
+    rig.downlink.set_stopped(False)
+    assert guard.told[-1][1:] == (None, False), "it must not hold what was released"
+
+
+def test_an_agent_that_ends_by_itself_leaves_an_emergency_stop_to_the_guard() -> None:
+    guard = FakeGuard(ManualClock(now_us=T0))
+    rig = Rig(guard=guard)
+    rig.downlink.set_stopped(True)
+    rig.downlink.halt(keep_stop=True)
+    rig.downlink.close(keep_stop=True)
+    assert guard.left
+    assert [held for _, _, held in guard.told] == [True]
+
+
+def test_an_emergency_stop_is_kept_once_the_disk_works_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = tmp_path / "queue.db"
+    kept = StopFile(queue)
+    with monkeypatch.context() as full:
+        full.setattr(Path, "touch", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        kept.write(stopped=True)
+        kept.tick()
+        assert "No space left" in (kept.alarm or "")
+        assert not StopFile(queue).stopped
+    kept.tick()
+    assert kept.alarm is None
+    assert StopFile(queue).stopped
+    kept.write(stopped=False)
+    assert not StopFile(queue).stopped

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import example, given
@@ -12,6 +13,7 @@ from iort_agent.control.leases import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S,
 from iort_contract.messages.control.commands import Command
 from iort_contract.messages.control.driving import (
     BEGIN_AGAIN,
+    CLOCK_UNKNOWN,
     CLOSED,
     DRIVEN_BY_ANOTHER,
     EARLY,
@@ -39,114 +41,35 @@ def command(seq: int = 0, **changes: Any) -> Command:
 
 
 @pytest.mark.parametrize(
-    ("changes", "refusal"),
+    ("changes", "uncertainty_us", "refusal", "left_s"),
     [
-        ({}, None),
-        ({"sent_us": T0 - 299_999}, None),
-        ({"sent_us": T0 - 300_000}, LEASE_OVER),
-        ({"sent_us": T0 - 499_999, "lease_ms": 10_000}, None),
-        ({"sent_us": T0 - 500_000, "lease_ms": 10_000}, LEASE_OVER),
-        ({"sent_us": T0 - 800_001}, STALE),
-        ({"sent_us": T0 - 1_000_001, "valid_ms": 60_000}, STALE),
-        ({"sent_us": T0 + 500_000}, None),
-        ({"sent_us": T0 + 500_001}, EARLY),
-        ({"lease_ms": None}, NO_LEASE),
+        ({}, 0, None, 0.3),
+        ({"sent_us": T0 - 299_999}, 0, None, 0.0),
+        ({"sent_us": T0 - 300_000}, 0, LEASE_OVER, None),
+        # The robot's own limit is the shorter one.
+        ({"lease_ms": 10_000}, 0, None, 0.5),
+        ({"sent_us": T0 - 499_999, "lease_ms": 10_000}, 0, None, 0.0),
+        ({"sent_us": T0 - 500_000, "lease_ms": 10_000}, 0, LEASE_OVER, None),
+        ({"sent_us": T0 - 800_001}, 0, STALE, None),
+        ({"sent_us": T0 - 1_000_001, "valid_ms": 60_000}, 0, STALE, None),
+        # A sender whose clock is ahead gets no longer lease.
+        ({"sent_us": T0 + 500_000}, 0, None, 0.3),
+        ({"sent_us": T0 + 500_001}, 0, EARLY, None),
+        ({"lease_ms": None}, 0, NO_LEASE, None),
+        # The lease runs from when the command may have been sent.
+        ({"sent_us": T0 - 200_000}, 0, None, 0.1),
+        ({"sent_us": T0 - 50_000}, 150_000, None, 0.1),
+        ({}, 200_000, None, 0.1),
+        ({}, None, CLOCK_UNKNOWN, None),
     ],
 )
-def test_a_single_command(changes: dict[str, Any], refusal: str | None) -> None:
-    assert Leases().offer(command(**changes), LIMITS, now_us=T0, uncertainty_us=0, now=0) == refusal
-
-
-def test_only_a_later_command_passes() -> None:
+def test_a_single_command(
+    changes: dict[str, Any], uncertainty_us: int | None, refusal: str | None, left_s: float | None
+) -> None:
     leases = Leases()
-    later, earlier = (
-        {"started_us": T0, "session": "1badcafe", "takeover": True},
-        {"started_us": T0 - 1_000_000},
-    )
-    offers: list[tuple[int, dict[str, Any], str | None]] = [
-        (5, earlier, None),
-        (5, earlier, REPEATED),
-        (4, earlier, REPEATED),
-        (7, earlier, None),
-        (0, later, None),
-        (8, earlier, SUPERSEDED),
-        (1, later, None),
-    ]
-    for seq, session, refusal in offers:
-        assert leases.offer(command(seq, **session), LIMITS, now_us=T0, uncertainty_us=0, now=0) == refusal
-
-
-def offered(leases: Leases, session: str, now: float = 0.0, **changes: Any) -> str | None:
-    started_us = T0 - 1_000_000 + int(session[0], 16)
-    one = command(session=session, started_us=started_us, sent_us=T0 + round(now * 1e6), **changes)
-    return leases.offer(one, LIMITS, now_us=T0 + round(now * 1e6), uncertainty_us=0, now=now)
-
-
-A, B, C = "aaaaaaaa", "bbbbbbbb", "cccccccc"
-
-
-def test_one_session_drives_until_another_takes_over() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
-    assert offered(leases, C, seq=0, takeover=True) is None
-    assert offered(leases, A, seq=1) == SUPERSEDED
-    driver = leases.driver(0.2)
-    assert (driver.session if driver else None, leases.left_s(0.2)) == (C, pytest.approx(0.1))
-    assert leases.driver(0.3) is None
-
-
-def test_a_stick_held_while_another_drove_moves_nothing_when_that_one_lets_go() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    assert offered(leases, B, seq=0) == DRIVEN_BY_ANOTHER
-    assert offered(leases, B, 0.4, seq=1) == BEGIN_AGAIN
-    assert offered(leases, B, 0.4, seq=2, takeover=True) == BEGIN_AGAIN
-    assert offered(leases, C, 0.4, seq=0) is None, "the next press of the same driver"
-
-
-def test_a_motion_that_ends_its_lease_stops_the_robot_and_lets_others_drive() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    assert offered(leases, A, 0.1, seq=1, ends=True) is None
-    assert leases.driver(0.1) is None
-    assert offered(leases, B, 0.1, seq=0) is None
-    assert offered(leases, A, 0.1, seq=2, ends=True) == SUPERSEDED
-    assert not leases.stop_due(0.1)
-
-
-def test_an_emergency_stop_holds_until_it_is_released_and_ends_every_session() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    leases.hold(0.1)
-    assert leases.driver(0.1) is None
-    assert len(stops(leases, 0.95)) == pytest.approx(0.85 / STOP_HOLD_S, abs=1)
-    assert offered(leases, A, 1.0, seq=1) == EMERGENCY_STOP
-    assert offered(leases, B, 1.0, seq=0, takeover=True) == EMERGENCY_STOP
-    leases.free()
-    assert offered(leases, A, 1.1, seq=2) == BEGIN_AGAIN
-    assert offered(leases, B, 1.1, seq=1, takeover=True) == BEGIN_AGAIN
-    assert offered(leases, C, 1.2, seq=0) is None
-
-
-def test_a_stick_that_is_held_is_refused_however_many_others_try() -> None:
-    leases = Leases()
-    leases.hold(0.0)
-    for i in range(200):
-        assert offered(leases, A, 0.1, seq=i) == EMERGENCY_STOP
-        assert offered(leases, f"{i:08x}", 0.1, seq=0) == EMERGENCY_STOP
-    leases.free()
-    assert offered(leases, A, 0.2, seq=200) == BEGIN_AGAIN
-
-
-def test_a_released_emergency_stop_ends_after_a_few_stops_and_so_does_a_closed_one() -> None:
-    for end in (Leases.free, lambda leases: leases.close(0.0)):
-        leases = Leases()
-        leases.hold(0.0)
-        assert leases.stop_due(0.0)
-        end(leases)
-        assert len(stops(leases, 10)) == STOP_REPEATS
-        assert leases.next_due() is None
+    offer = leases.offer(command(**changes), LIMITS, now_us=T0, uncertainty_us=uncertainty_us, now=7)
+    assert offer == refusal
+    assert leases.next_due() == (None if left_s is None else pytest.approx(7 + left_s, abs=1e-5))
 
 
 def test_a_command_without_motion_needs_no_lease_and_no_stop() -> None:
@@ -156,87 +79,110 @@ def test_a_command_without_motion_needs_no_lease_and_no_stop() -> None:
     assert not leases.stop_due(1e9)
 
 
-def stops(leases: Leases, until: float, step: float = 0.01) -> list[float]:
-    return [round(i * step, 3) for i in range(round(until / step) + 1) if leases.stop_due(i * step)]
+class Offer(NamedTuple):
+    """A command of a session, offered when it is sent, or later."""
+
+    session: str
+    seq: int
+    changes: dict[str, Any]
 
 
-def test_the_end_of_a_lease_repeats_the_stop_a_few_times() -> None:
-    leases = Leases()
-    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
-    assert stops(leases, 10) == [round(0.3 + i * STOP_REPEAT_S, 3) for i in range(STOP_REPEATS + 1)]
-    assert leases.next_due() is None
+def offer_of(letter: str) -> Callable[..., Offer]:
+    return lambda seq, **changes: Offer(letter * 8, seq, changes)
 
 
-def test_the_robots_own_limit_is_the_shorter_one() -> None:
-    leases = Leases()
-    leases.offer(command(lease_ms=10_000), LIMITS, now_us=T0, uncertainty_us=0, now=0)
-    assert leases.next_due() == pytest.approx(0.5)
+A, B, C = map(offer_of, "abc")
+STOP, STOPS, DRIVER, DUE = "stop", "stops", "driver", "due"
+# Name -> steps: the second, what happens (a command or how all ends) or is asked, and the answer. STOPS asks
+# for the number of stops since the step before.
+SCENARIOS: dict[str, list[tuple[float, Any, Any]]] = {
+    "only a later command passes": [
+        (0, A(5), None), (0, A(5), REPEATED), (0, A(4), REPEATED), (0, A(7), None),
+        (0, B(0, takeover=True), None), (0, A(8), SUPERSEDED), (0, B(1), None),
+    ],
+    "one session drives until another takes over": [
+        (0, A(0), None), (0, B(0), DRIVEN_BY_ANOTHER), (0, C(0, takeover=True), None), (0, A(1), SUPERSEDED),
+        (0.2, DRIVER, ("cccccccc", pytest.approx(0.1))), (0.3, DRIVER, (None, 0)),
+    ],
+    "a stick held while another drove moves nothing when that one lets go; the next press does": [
+        (0, A(0), None), (0, B(0), DRIVEN_BY_ANOTHER), (0.4, B(1), BEGIN_AGAIN),
+        (0.4, B(2, takeover=True), BEGIN_AGAIN), (0.4, C(0), None),
+    ],
+    "a motion that ends its lease lets others drive": [
+        (0, A(0), None), (0.1, A(1, ends=True), None), (0.1, DRIVER, (None, 0)), (0.1, B(0), None),
+        (0.1, A(2, ends=True), SUPERSEDED), (0.1, STOP, False),
+    ],
+    "a motion that ends its lease stops the robot": [
+        (0, A(0), None), (0.1, A(1, ends=True), None), (0.1, STOP, True),
+    ],
+    "an emergency stop holds until it is released, and ends every session": [
+        (0, A(0), None), (0.1, "hold", None), (0.1, DRIVER, (None, 0)),
+        (0.95, STOPS, pytest.approx(0.85 / STOP_HOLD_S, abs=1)), (1, A(1), EMERGENCY_STOP),
+        (1, B(0, takeover=True), EMERGENCY_STOP), (1, "free", None), (1.1, A(2), BEGIN_AGAIN),
+        (1.1, B(1, takeover=True), BEGIN_AGAIN), (1.2, C(0), None),
+    ],
+    "a stick that is held is refused however many others try": [
+        (0, "hold", None),
+        *[(0.1, one, EMERGENCY_STOP) for i in range(200) for one in (A(i), Offer(f"{i:08x}", 0, {}))],
+        (0.1, "free", None), (0.2, A(200), BEGIN_AGAIN),
+    ],
+    "a released emergency stop ends after a few stops": [
+        (0, "hold", None), (0, STOP, True), (0, "free", None), (10, STOPS, STOP_REPEATS), (10, DUE, None),
+    ],
+    "so does that of an agent that ends": [
+        (0, "hold", None), (0, STOP, True), (0, "close", None), (10, STOPS, STOP_REPEATS), (10, DUE, None),
+    ],
+    "the end of a lease repeats the stop a few times": [
+        (0, A(0), None), (0.29, STOPS, 0), (0.3, STOPS, 1), (0.3 + STOP_REPEAT_S - 0.01, STOPS, 0),
+        (10, STOPS, STOP_REPEATS), (10, DUE, None),
+    ],
+    "a renewed lease has no stop": [
+        step for i in range(10) for step in ((i * 0.29, A(i), None), (i * 0.29 + 0.28, STOP, False))
+    ],
+    "a newer command ends the stops": [
+        (0, A(0), None), (0.3, STOP, True), (0.4, A(1), None), (0.6, STOP, False),
+    ],
+    "what a session sent before the stop moves nothing after it": [
+        (0, A(0), None), (0.3, STOP, True), (0.35, A(1, sent_us=T0 + 150_000), LEASE_OVER),
+        (0.35, A(2, sent_us=T0 + 300_000), None),
+    ],
+    "a command that waited in a frozen agent beside the stop moves nothing": [
+        (0, A(0), None), (0.35, A(1, sent_us=T0 + 150_000), LEASE_OVER), (0.35, STOP, True),
+    ],
+    "cut and closed": [
+        (0, "cut", None), (0, DUE, None), (0, A(0), None), (0.1, "cut", None), (0.1, STOP, True),
+        (0.2, A(1), None), (0.25, "close", None), (0.25, STOP, True), (0.3, A(2), CLOSED),
+    ],
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("age_us", "uncertainty_us"), [(200_000, 0), (50_000, 150_000), (0, 200_000)])
-def test_the_lease_runs_from_when_the_command_may_have_been_sent(age_us: int, uncertainty_us: int) -> None:
-    leases = Leases()
-    assert (
-        leases.offer(command(sent_us=T0 - age_us), LIMITS, now_us=T0, uncertainty_us=uncertainty_us, now=7)
-        is None
-    )
-    assert leases.next_due() == pytest.approx(7.1)
-
-
-def test_a_sender_whose_clock_is_ahead_gets_no_longer_lease() -> None:
-    leases = Leases()
-    assert leases.offer(command(sent_us=T0 + 500_000), LIMITS, now_us=T0, uncertainty_us=0, now=7) is None
-    assert leases.next_due() == pytest.approx(7.3)
-
-
-def test_a_renewed_lease_has_no_stop() -> None:
-    leases = Leases()
-    for i in range(10):
-        assert leases.offer(command(i), LIMITS, now_us=T0, uncertainty_us=0, now=i * 0.29) is None
-        assert not leases.stop_due(i * 0.29 + 0.28)
-
-
-def test_a_newer_command_ends_the_stops() -> None:
-    leases = Leases()
-    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
-    assert leases.stop_due(0.3)
-    assert leases.offer(command(1), LIMITS, now_us=T0, uncertainty_us=0, now=0.4) is None
-    assert not leases.stop_due(0.6)
-
-
-def test_what_a_session_sent_before_the_stop_moves_nothing_after_it() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    assert leases.stop_due(0.3)
-    # It was long on its way: for 0.2 s, and for 0.05 s.
-    late, soon = (
-        command(seq, session=A, started_us=T0, sent_us=T0 + at) for seq, at in ((1, 150_000), (2, 300_000))
-    )
-    times = {"now_us": T0 + 350_000, "uncertainty_us": 0, "now": 0.35}
-    assert leases.offer(late, LIMITS, **times) == LEASE_OVER
-    assert leases.offer(soon, LIMITS, **times) is None
-
-
-def test_a_command_that_waited_in_a_frozen_agent_beside_the_stop_moves_nothing() -> None:
-    leases = Leases()
-    assert offered(leases, A, seq=0) is None
-    waited = command(1, session=A, started_us=T0, sent_us=T0 + 150_000)
-    times = {"now_us": T0 + 350_000, "uncertainty_us": 0, "now": 0.35}
-    assert leases.offer(waited, LIMITS, **times) == LEASE_OVER
-    assert leases.stop_due(0.35)
-
-
-def test_cut_and_closed() -> None:
-    leases = Leases()
-    leases.cut(0)
-    assert leases.next_due() is None, "nothing moved"
-    leases.offer(command(), LIMITS, now_us=T0, uncertainty_us=0, now=0)
-    leases.cut(0.1)
-    assert leases.stop_due(0.1)
-    leases.offer(command(1), LIMITS, now_us=T0, uncertainty_us=0, now=0.2)
-    leases.close(0.25)
-    assert leases.stop_due(0.25)
-    assert leases.offer(command(2), LIMITS, now_us=T0, uncertainty_us=0, now=0.3) == CLOSED
+@pytest.mark.parametrize("steps", SCENARIOS.values(), ids=list(SCENARIOS))
+def test_a_scenario(steps: list[tuple[float, Any, Any]]) -> None:
+    leases, before = Leases(), 0.0
+    for number, (now, what, expected) in enumerate(steps):
+        answer: Any = None
+        if isinstance(what, Offer):
+            now_us = T0 + round(now * 1e6)
+            started_us = T0 - 1_000_000 + int(what.session[0], 16)
+            settings = {"session": what.session, "started_us": started_us, "sent_us": now_us, **what.changes}
+            answer = leases.offer(
+                command(what.seq, **settings), LIMITS, now_us=now_us, uncertainty_us=0, now=now
+            )
+        elif what == STOP:
+            answer = leases.stop_due(now)
+        elif what == STOPS:
+            answer = sum(leases.stop_due(i / 100) for i in range(round(before * 100), round(now * 100) + 1))
+        elif what == DRIVER:
+            driver = leases.driver(now)
+            answer = driver.session if driver is not None else None, leases.left_s(now)
+        elif what == DUE:
+            answer = leases.next_due()
+        elif what == "free":
+            leases.free()
+        else:
+            getattr(leases, what)(now)
+        assert answer == expected, f"step {number}: {what}"
+        before = now
 
 
 # Any sequence of events of an operator, a network and a clock.

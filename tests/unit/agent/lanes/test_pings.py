@@ -1,8 +1,9 @@
-"""Pings: round trips, losses, and round trips as samples."""
+"""Pings: round trips, losses, round trips as samples, and the clock's offset."""
 
 from __future__ import annotations
 
 import json
+import random
 import threading
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,16 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.state import RoundTrips
 from iort_agent.errors import ConfigError
 from iort_agent.lanes import PingConfig
-from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
+from iort_agent.lanes.pings import (
+    CLOCK_EVERY_S,
+    CLOCK_FIRST_EVERY_S,
+    TIMEOUT_S,
+    OffsetEstimator,
+    Pings,
+    percentile,
+)
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_contract.limits import MAX_MESSAGE_BYTES
+from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS, MAX_MESSAGE_BYTES
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import PING_PATHS
 from testkit.agent import Loopback, ManualClock, link_of
@@ -216,3 +224,87 @@ def test_the_rate_can_be_changed_while_it_runs() -> None:
 
 def test_percentile_of_nothing() -> None:
     assert percentile([], 50) is None
+
+
+@given(
+    st.floats(-1e7, 1e7), st.lists(st.tuples(st.floats(0.2, 500), st.floats(0, 1)), min_size=1), st.randoms()
+)
+def test_the_offset_is_within_its_uncertainty(
+    true_ms: float, trips: list[tuple[float, float]], chance: random.Random
+) -> None:
+    clock = ManualClock()
+    offset = OffsetEstimator(clock)
+    for trip_ms, share in trips:
+        sent = clock.monotonic()
+        # The cloud stamps in whole milliseconds, at any time on the way.
+        stamp_ms = int(clock.now_us() / 1000 + trip_ms * share + true_ms)
+        clock.advance(trip_ms / 1000)
+        offset.add(sent, clock.monotonic(), stamp_ms)
+        clock.advance(chance.random())
+    found = offset.estimate()
+    assert found is not None
+    assert abs(found.offset_ms - true_ms) <= found.uncertainty_ms + 0.51
+    assert found.uncertainty_ms >= min(trip_ms for trip_ms, _ in trips) / 2
+
+
+def test_the_offset_is_right_at_once_after_the_clock_is_set() -> None:
+    clock = ManualClock()
+    offset = OffsetEstimator(clock)
+    assert offset.estimate() is None
+    sent = clock.monotonic()
+    clock.advance(0.01)
+    offset.add(sent, clock.monotonic(), clock.now_us() // 1000 - 5)
+    before = offset.estimate()
+    clock.set_wall(clock.now_us() - 3_600_000_000)
+    after = offset.estimate()
+    assert before is not None
+    assert after is not None
+    assert after.offset_ms - before.offset_ms == pytest.approx(3_600_000)
+
+
+def test_the_shortest_round_trip_is_used_until_it_is_old() -> None:
+    clock = ManualClock()
+    offset = OffsetEstimator(clock)
+    for trip_ms in (10, 2, 200):
+        sent = clock.monotonic()
+        clock.advance(trip_ms / 1000)
+        offset.add(sent, clock.monotonic(), clock.now_us() // 1000)
+    found = offset.estimate()
+    assert found is not None
+    assert found.uncertainty_ms == pytest.approx(1.5, abs=0.02)
+    clock.advance(60)
+    aged = offset.estimate()
+    assert aged is not None
+    assert aged.uncertainty_ms == pytest.approx(4.5, abs=0.02), "the clocks may have drifted by 3 ms"
+
+
+def test_an_uncertain_offset_is_not_used() -> None:
+    clock = ManualClock()
+    offset = OffsetEstimator(clock)
+    assert offset.known_us() is None
+    for trip_s, known in ((1.5, False), (0.9, True), (8, True)):
+        sent = clock.monotonic()
+        stamp_ms = clock.now_us() // 1000 + 60_000
+        clock.advance(trip_s)
+        offset.add(sent, clock.monotonic(), stamp_ms)
+        assert (offset.known_us() is not None) == known
+    known_us = offset.known_us()
+    assert known_us is not None
+    assert abs(known_us - 60_000_000) <= CLOCK_MAX_UNCERTAINTY_MS * 1000
+    clock.advance(86_400)
+    assert offset.known_us() is None, "two oscillators drift apart"
+
+
+def test_a_contradicting_round_trip_replaces_the_best_one() -> None:
+    """While a computer sleeps, its monotonic clock stops and its wall clock goes on."""
+    clock = ManualClock()
+    offset = OffsetEstimator(clock)
+    slept_us = 0
+    for trip_s in (0.002, 0.3):
+        sent = clock.monotonic()
+        clock.advance(trip_s)
+        offset.add(sent, clock.monotonic(), (clock.now_us() + slept_us) // 1000)
+        slept_us += 600_000_000
+    found = offset.estimate()
+    assert found is not None
+    assert found.offset_ms == pytest.approx(600_000, abs=found.uncertainty_ms)
