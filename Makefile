@@ -47,7 +47,7 @@ test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS
 	@build/oldest/bin/python -m pytest -W "ignore:Python 3.8 is no longer supported" \
 		tests/device tests/unit/agent tests/unit/contract
 
-mutants: setup ## count how many of 300 fixed small faults the unit tests notice: an hour on two quiet cores
+mutants: setup ## count how many of 300 fixed small faults the fast unit tests notice, in an hour
 	@$(BIN)/python scripts/mutants.py run
 
 check: setup ## run the linters, the type checkers, the links of docs/, and cfn-lint, cdk-nag and checkov over the stacks

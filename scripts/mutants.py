@@ -1,4 +1,4 @@
-"""Count how many of a fixed sample of 300 small faults the unit tests notice.
+"""Count how many of a fixed sample of 300 small faults the fast unit tests notice.
 
     python scripts/mutants.py draw     # from SEED, into scripts/mutants.json; done once
     make mutants                       # traces the unit tests, tries each mutant on those that reach it
@@ -30,6 +30,7 @@ SAMPLE = Path(__file__).with_suffix(".json")
 SEED, SIZE = 2026, 300
 AREAS = ("contract/iort_contract", "device/iort_agent", "functions", "station/iort_station")
 TESTS = ("tests/unit", "tests/device")
+FAST = ("-m", "not slow", "--hypothesis-profile", "fast", "--hypothesis-seed=0", "-p", "no:cacheprovider")
 MOST_TESTS = 100  # of those that reach a mutant: the ones that reach least else
 TIMEOUT_S = 180
 TRACE = ROOT / "build" / "mutants"
@@ -135,8 +136,7 @@ def _mutated(source: bytes, site: Site) -> bytes:
 
 
 def _pytest(*arguments: str) -> int:
-    options = ("-q", "-p", "no:cacheprovider", "--hypothesis-seed=0")
-    command = [sys.executable, "-m", "pytest", *options, *arguments]
+    command = [sys.executable, "-m", "pytest", "-q", *FAST, *arguments]
     quiet = subprocess.DEVNULL
     done = subprocess.run(command, cwd=ROOT, stdout=quiet, stderr=quiet, timeout=TIMEOUT_S, check=False)
     return done.returncode
@@ -151,7 +151,9 @@ def _trace() -> dict[tuple[str, int], list[str]]:
         settings.write_text(f"[run]\nsource = {','.join(AREAS)}\ndata_file = {data_file}\n")
         command = [sys.executable, "-m", "coverage", "run", f"--rcfile={settings}", "-m", "pytest", "-q"]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        subprocess.run([*command, "-p", "scripts.mutants", *TESTS], cwd=ROOT, env=environment, check=False)
+        subprocess.run(
+            [*command, *FAST, "-p", "scripts.mutants", *TESTS], cwd=ROOT, env=environment, check=False
+        )
     data = coverage.CoverageData(str(data_file))
     data.read()
     reach: dict[tuple[str, int], list[str]] = {}
