@@ -19,7 +19,7 @@ from tests.local.conftest import run_agent
 from tests.local.data.drives import Agent
 from tests.ros.mixed.compare import compare, read
 from tests.ros.mixed.robot import TOPICS, Maker, Topic
-from tests.unit.station.recordings.test_round_trip import KNOWN
+from tests.unit.station.data.test_export import KNOWN
 
 COUNT, RATE_HZ = 500, 50
 Recorded = Mapping[str, tuple[Message, Sequence[bytes]]]

@@ -31,7 +31,7 @@ from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of
 from tests.archived import FakeS3, archive, expire
 from tests.mutation import ODD_ATTRIBUTES, mutated_item
 from tests.unit.functions.summary.summarizing import Stream
-from tests.unit.station.data.test_data import FakeCloud, cloud_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 COUNT = int(os.environ.get("IORT_MUTATED", "600"))
 S = 1_000_000

@@ -22,7 +22,7 @@ from testkit.dynamodb import TELEMETRY, item_of
 from testkit.waiting import until
 from tests.archived import FakeS3, archive, expire
 from tests.browser import plain
-from tests.unit.station.data.test_data import START, cloud_of
+from tests.unit.station.data.test_queries import START, cloud_of
 from tests.web.cars import GAIN, SUBSCRIBE_KEY
 from tests.web.lab import VIEWS, Lab
 

@@ -24,7 +24,7 @@ from iort_station.cli.main import app
 from iort_station.cli.words import say
 from iort_station.errors import StationError
 from iort_station.texts import visible
-from tests.unit.station.data.test_data import FakeCloud, cloud_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 # Write the clipboard; the same with C1; move the cursor and ring the bell; reverse a line.
 HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]

@@ -42,7 +42,7 @@ from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
 from tests.unit.contract.ros1.ros1_messages import text, u32
 from tests.unit.functions.summary.summarizing import Stream
-from tests.unit.station.data.test_data import FakeCloud, cloud_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 HOUR = 3_600_000_000
 # Three minutes before a full hour, so that runs and batches cross it.

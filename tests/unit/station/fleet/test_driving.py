@@ -1,4 +1,4 @@
-"""A driver's hold: when the car may move, and what ends it; and the keys of a terminal as a stick."""
+"""A driver's hold of the stick: the table of vectors that the page has too, and `iort drive`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ from iort_contract.messages.control.commands import Command, decode_command, enc
 from iort_contract.messages.control.driving import DriveLimits
 from iort_contract.messages.live import LiveSample
 from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
+from iort_station.cli.verbs.fleet.drive import _Seat
+from iort_station.errors import StationError
+from iort_station.fleet import stopping
 from iort_station.fleet.driving import Driver, Phase, Stick
+from iort_station.fleet.driving import Driver as TerminalDriver
+from tests.unit.agent.sources.test_sim import CAR_LIMITS, Commanded
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
 CLOUD_US = 1_700_000_000_000_000
@@ -286,3 +291,56 @@ def test_the_speed_stays_while_another_key_steers() -> None:
     keys.let_go()
     assert keys.stick(now_us + NEXT_US) == Stick()
     assert not keys.press("x", now_us)
+
+
+class Cloud:
+    namespace = "iort"
+
+    def urgent(self) -> Cloud:
+        return self
+
+
+def test_the_emergency_stop_ends_the_hold_at_once_and_is_not_taken_for_done_if_it_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driver = Driver(LIMITS, "anna", 1.0)
+    seat: Any = _Seat(Cloud(), "car7", driver)  # type: ignore[arg-type]  # a fake
+    sent: list[Any] = []
+    seat.broker.publish = lambda topic, message: sent.append((topic, message))
+    driver.phase, driver._held, driver._session = Phase.STARTING, True, "0badcafe"
+
+    def stop(_cloud: Any, robots: list[str], *, by: str) -> dict[str, str]:
+        assert by == "anna"
+        assert decode_command(sent[-1][1]).ends
+        return {robots[0]: "Throttling"}
+
+    monkeypatch.setattr(stopping, "stop", stop)
+    with pytest.raises(StationError, match="emergency stop of car7 has failed: Throttling"):
+        seat._press("e", 1_000_000)
+
+
+def test_a_driver_who_has_let_go_holds_the_car_and_leaves_it_to_its_own_driver_with_the_wheel() -> None:
+    car, driver = Commanded(), TerminalDriver(CAR_LIMITS, "anna", 1.0)
+    speeds: list[float] = []
+
+    def drive(seconds: float) -> list[float]:
+        """The car hears the driver's commands, and its answers come back at once."""
+        before = len(speeds)
+        for _ in range(round(seconds * 20)):
+            now_us = car.rig.clock.now_us()
+            heard = LiveSample("0badcafe", 0, now_us, now_us, {}, offset_us=0)
+            driver.hear("vesc", heard, now_us)
+            if (command := driver.tick(now_us)) is not None:
+                car.rig.send(None, name="drive", raw=encode_command(command))
+                driver.hear("drive", replace(heard, sample=dict(car.rig.drove[-1])), now_us)
+            speeds.extend(speed for speed, _ in car.drive(0.06))
+        return speeds[before:]
+
+    drive(2)
+    driver.stick = Stick(1.0, 0.0)
+    driver.hold(held=True, now_us=car.rig.clock.now_us())
+    assert drive(3)[-1] == pytest.approx(1.0, abs=0.03)
+    driver.hold(held=False, now_us=car.rig.clock.now_us())
+    assert set(drive(30)[150:]) == {0.0}, "it stands as long as the driver has the wheel"
+    driver.leave()
+    assert drive(10)[-1] > 1, "its own driver drives again"

@@ -12,7 +12,7 @@ from iort_contract.catalog.metrics import METRICS
 from iort_station.errors import StationError
 from iort_station.operations.monitoring import alarms
 from testkit.dynamodb import ROBOTS, serialize
-from tests.unit.station.data.test_data import FakeCloud, cloud_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 
 class Watched(FakeCloud):

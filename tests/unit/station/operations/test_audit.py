@@ -12,7 +12,7 @@ from iort_contract.messages.batch import Batch, BatchId
 from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.delivery.audit import audit, last_figures
 from testkit.dynamodb import TELEMETRY, item_of
-from tests.unit.station.data.test_data import cloud_of
+from tests.unit.station.data.test_queries import cloud_of
 
 T_US = 1_750_000_000_000_000
 

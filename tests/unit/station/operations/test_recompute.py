@@ -15,7 +15,7 @@ from iort_station.fleet import robots
 from iort_station.operations import recompute
 from iort_station.operations.recompute import Recomputed
 from testkit.dynamodb import ROBOTS, TELEMETRY, item_of, record_of, serialize, summary_of, tables
-from tests.unit.station.data.test_data import START, FakeCloud, cloud_of, ride
+from tests.unit.station.data.test_queries import START, FakeCloud, cloud_of, ride
 
 SECOND = START // 1_000_000
 

@@ -21,7 +21,7 @@ from iort_station.errors import StationError
 from iort_station.upkeep import deployment, doctor, machine
 from iort_station.upkeep.finding import FAIL, OK, WARN
 from iort_station.upkeep.state import LAST_BACKUP, held
-from tests.unit.station.data.test_data import FakeCloud, cloud_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 DAY_S = 86_400
 

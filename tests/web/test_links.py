@@ -1,18 +1,130 @@
-"""What the page asks of the cars: leases on what is on the screen, and nothing while nobody looks."""
+"""The page's ways to the broker: limits of a request, the relay, and who is kept awake by looking."""
 
 from __future__ import annotations
 
+import http.client
 import threading
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from aiohttp import web
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S
+from iort_station.page.background import BackgroundServer
 from iort_station.page.server import PageServer
+from local.network.certificates import Authority
+from local.network.relay import Relay
 from testkit.waiting import GUARD_S, until
 from tests.browser import show
 from tests.web.cars import SUBSCRIBE_KEY, Car
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from playwright.sync_api import Page
+
+# Of one request to subscribe.
+MOST_FILTERS = 8
+CONNECT, SUBSCRIBE = 1, 8
+CONNACK, SUBACK = bytes([0x20, 3, 0, 0, 0]), 0x90
+CREDENTIALS = {"AccessKeyId": "ASIA", "SecretKey": "s", "SessionToken": "t"}
+
+
+class Broker(BackgroundServer):
+    """Gives anybody an identity, and ends a connection that subscribes to too much at once."""
+
+    def __init__(self) -> None:
+        super().__init__("127.0.0.1", 0)
+        self.asked: list[int] = []
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        if request.path != "/mqtt":
+            cors = {"Access-Control-Allow-Origin": "*", "Access-Control-Allow-Headers": "*"}
+            return web.json_response({"IdentityId": "i", "Credentials": CREDENTIALS}, headers=cors)
+        socket = web.WebSocketResponse(protocols=["mqtt"])
+        await socket.prepare(request)
+        async for message in socket:
+            for kind, body in packets(message.data):
+                if kind == CONNECT:
+                    await socket.send_bytes(CONNACK)
+                elif kind == SUBSCRIBE:
+                    count = body.count(b"live/iort/")
+                    self.asked.append(count)
+                    if count > MOST_FILTERS:
+                        return socket
+                    # The packet's number, no properties, and QoS 0 for each.
+                    granted = body[:2] + bytes(1 + count)
+                    await socket.send_bytes(bytes([SUBACK, len(granted)]) + granted)
+        return socket
+
+
+def packets(sent: bytes) -> Iterator[tuple[int, bytes]]:
+    """The MQTT packets of a WebSocket's message: kind and body."""
+    while sent:
+        # The length in groups of seven bits; the last group has no high bit.
+        ends = next(i for i in range(1, 5) if sent[i] < 0x80)
+        length = sum((sent[i] & 0x7F) << 7 * (i - 1) for i in range(1, ends + 1))
+        yield sent[0] >> 4, sent[ends + 1 : ends + 1 + length]
+        sent = sent[ends + 1 + length :]
+
+
+def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(open_page: Callable[..., Page]) -> None:
+    with Broker() as broker:
+        socket = f"ws://127.0.0.1:{broker.port}"
+        with PageServer(
+            namespace="iort",
+            live="iot",
+            broker=socket,
+            identity={
+                "pool": "eu-west-1:1",
+                "region": "eu-west-1",
+                "endpoint": f"http://127.0.0.1:{broker.port}",
+                "socket": f"{socket}/mqtt",
+                "client_prefix": "iort-viewer-",
+                "robots": [f"car{i}" for i in range(MOST_FILTERS + 1)],
+            },
+        ) as site:
+            page = open_page(site.url)
+            until(lambda: page.inner_text("#link") == "Connected", "the page to connect", 15)
+    assert broker.asked == [MOST_FILTERS, 1]
+
+
+REFUSED, NO_GATEWAY = 403, 502
+
+
+@pytest.fixture
+def relay(tmp_path: Path) -> Iterator[Relay]:
+    Authority().write_own(tmp_path / "ca.pem")
+    # Nothing listens on port 9.
+    with Relay("127.0.0.1", 0, gateway="https://127.0.0.1:9", authority=str(tmp_path / "ca.pem")) as relay:
+        yield relay
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        ("http://127.0.0.1:8080", NO_GATEWAY),
+        ("http://localhost:8080", NO_GATEWAY),
+        ("http://[::1]:8080", NO_GATEWAY),
+        (None, NO_GATEWAY),
+        ("https://elsewhere.example", REFUSED),
+        ("http://127.0.0.1.elsewhere.example", REFUSED),
+        ("http://192.0.2.1", REFUSED),
+        ("null", REFUSED),
+    ],
+)
+def test_only_a_page_of_this_machine_gets_through(relay: Relay, origin: str | None, status: int) -> None:
+    socket = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Protocol": "mqtt"}
+    call = {"Content-Type": "application/x-amz-json-1.1", "X-Amz-Target": "AWSCognitoIdentityService.GetId"}
+    for method, path, headers in (("GET", "/mqtt", socket), ("POST", "/", call)):
+        connection = http.client.HTTPConnection(relay.host, relay.port, timeout=30)
+        connection.request(method, path, headers=headers | ({"Origin": origin} if origin else {}))
+        assert connection.getresponse().status == status
+        connection.close()
+
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
