@@ -20,7 +20,7 @@ from iort_agent.identity import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status import ask
-from iort_agent.verbs.connectivity import way
+from iort_agent.verbs.connectivity import check_connection
 from iort_contract.messages.control.driving import NO_MOTION
 
 _EXPIRES_SOON_S = 30 * 86_400
@@ -31,7 +31,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     """Check everything that the configuration names, one finding after another."""
     running = _running(status_socket)
     yield from _identity(config)
-    yield from way(config, running)
+    yield from check_connection(config, running)
     for i, source in enumerate(config.sources):
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)

@@ -165,8 +165,8 @@ class _Offset(NamedTuple):
     by: str
 
 
-def way(config: Config, running: Status | None = None) -> Iterator[Finding]:
-    """Go the way to the broker. Without ``running``, this ends a running agent's connection."""
+def check_connection(config: Config, running: Status | None = None) -> Iterator[Finding]:
+    """Check each step to the broker. Without ``running``, this ends a running agent's connection."""
     offset: _Offset | None = None
     try:
         addresses = _addresses(config.endpoint, config.port)

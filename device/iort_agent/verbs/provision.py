@@ -116,9 +116,9 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
 
 def _try_alone(config: Config) -> None:
     from iort_agent.sources import FAIL  # noqa: PLC0415 - only this verb needs it
-    from iort_agent.verbs.connectivity import way  # noqa: PLC0415 - it loads TLS and more
+    from iort_agent.verbs.connectivity import check_connection  # noqa: PLC0415 - it loads TLS and more
 
-    for finding in way(config):
+    for finding in check_connection(config):
         if finding.level == FAIL:
             raise IdentityError(f"the new certificate does not connect: {finding.what}: {finding.text}")
 

@@ -24,7 +24,7 @@ def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
 
 def go(bundle: robots.Bundle, proxy: Proxy) -> dict[str, Finding]:
     robots.configure(bundle, {"port": proxy.port})
-    return {one.what: one for one in connectivity.way(load_config(bundle.config))}
+    return {one.what: one for one in connectivity.check_connection(load_config(bundle.config))}
 
 
 def test_the_way_to_a_cloud_that_works(

@@ -33,12 +33,13 @@ from iort_agent.spool.sqlite import make_spool
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.account import lost
-from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.messages.control.driving import DRIVE_TYPE
 from iort_contract.messages.message_type import MessageType, message_type
 from testkit.agent import Loopback, Published
 
 T0 = 1_700_000_000_000_000
+RECORD = "$aws/rules/iort_record/dt/iort/car1"
 
 
 DOWNLINK = {
@@ -120,10 +121,12 @@ class Rig:
         return document(make_status(self.agent))
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
-        topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
-        batches = [decode_batch(m.payload) for m in self.uplink.published if m.topic == topic]
-        self.seqs = [batch.seq for batch in batches]
-        return [value for batch in batches for value in batch.columns["speed"]]
+        self.seqs = [batch.seq for batch in self.batches(stream)]
+        return [value for batch in self.batches(stream) for value in batch.columns["speed"]]
+
+    def batches(self, stream: str) -> list[Batch]:
+        """What the broker has got of a stream."""
+        return [decode_batch(m.payload) for m in self.uplink.published if m.topic == f"{RECORD}/{stream}"]
 
 
 def test_an_emergency_stop_outlives_the_agent_also_without_a_connection(tmp_path: Path) -> None:
@@ -359,8 +362,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
 
     rig.uplink.verdict = count
     assert rig.runtime.run(drain_s=10) == 0
-    batches = [decode_batch(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"]
-    values = [value for batch in batches for value in batch.columns["broker_ms"]]
+    values = [value for batch in rig.batches("rtt") for value in batch.columns["broker_ms"]]
     ping = rig.report()["pings"]["broker"]
     assert len(values) == ping["received"] == ping["sent"] >= 3
     assert ping["lost"] == 0
@@ -393,9 +395,7 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     assert rig.runtime.run(drain_s=10) == 0
     assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
-    topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
-    batches = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
-    assert [sorted(batch.columns) for batch in batches] == [
+    assert [sorted(batch.columns) for batch in rig.batches("vesc")] == [
         ["speed", "voltage_input"], ["speed"], ["speed", "voltage_input"],
     ]  # fmt: skip
 
@@ -411,8 +411,7 @@ def test_types_are_repeated_when_recording_resumes() -> None:
     rig = Rig(late, record=RecordConfig(enabled=False))
     assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == [1]
-    topic = "$aws/rules/iort_record/dt/iort/car1/types"
-    (batch,) = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
+    (batch,) = rig.batches("types")
     sample = {name: column[0] for name, column in batch.columns.items()}
     assert message_type(sample) == said
 
@@ -425,11 +424,9 @@ def test_the_agents_metrics_are_a_stream() -> None:
         assert seen.wait(10)
 
     rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
-    topic = "$aws/rules/iort_record/dt/iort/car1/agent"
-    rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
+    rig.uplink.verdict = lambda message: seen.set() if message.topic == f"{RECORD}/agent" else None
     assert rig.runtime.run(drain_s=10) == 0
-    batch = next(decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic)
-    assert list(batch.columns) == list(AGENT_FIELDS)
+    assert list(rig.batches("agent")[0].columns) == list(AGENT_FIELDS)
     assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]
 
 
@@ -459,9 +456,12 @@ def test_the_account_names_the_topic_of_a_recording_whose_messages_were_not_read
     path = described(write_ros2(tmp_path / "drive", STORAGES[0]), change)
     rig = Rig(sources=(BagConfig(path=path, speed=0.0),))
     assert rig.runtime.run(drain_s=10) == 1
-    topic = "$aws/rules/iort_record/dt/iort/car1/account"
-    batches = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
-    texts = [text for batch in batches for text in batch.columns.get("counts", ()) if isinstance(text, str)]
+    texts = [
+        text
+        for batch in rig.batches("account")
+        for text in batch.columns.get("counts", ())
+        if isinstance(text, str)
+    ]
     assert lost(json.loads(texts[-1])) == {"/sensors/core.unread": 2}
 
 

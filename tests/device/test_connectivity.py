@@ -32,8 +32,7 @@ ROBOTS = trustme.CA()
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (connectivity, connectivity):
-        monkeypatch.setattr(module, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(connectivity, "TIMEOUT_S", 0.5)
 
 
 @contextmanager
@@ -104,7 +103,7 @@ def car(folder: Path, authority: trustme.CA, port: int, endpoint: str, signer: t
 
 
 def go(file: Path) -> list[Finding]:
-    return list(connectivity.way(load_config(file)))
+    return list(connectivity.check_connection(load_config(file)))
 
 
 CLOUD, OTHER = trustme.CA(organization_name="lab"), trustme.CA(organization_name="another")
