@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Callable, NamedTuple, Optional
 
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Clock
@@ -60,7 +59,7 @@ class Published(NamedTuple):
 
 
 # The broker's reason to reject a publish; None to accept it.
-Verdict = Callable[[Published], str | None]
+Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
