@@ -13,6 +13,18 @@ from __future__ import annotations
 
 from iort_analysis.samples.blocks import Block, values
 from iort_station.data.queries import CLIENT, LAMBDA, Result, query, samples
+from iort_station.data.recorded import Reading
 from iort_station.data.selection import Selection, select
 
-__all__ = ["CLIENT", "LAMBDA", "Block", "Result", "Selection", "query", "samples", "select", "values"]
+__all__ = [
+    "CLIENT",
+    "LAMBDA",
+    "Block",
+    "Reading",
+    "Result",
+    "Selection",
+    "query",
+    "samples",
+    "select",
+    "values",
+]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.archive.stored import AUTO, TABLE, Origin, PageProgress, Source
-from iort_analysis.samples.batches import RefusedItems, in_order
+from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import Block, Column, column_of, join, ordered, resample
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
@@ -35,99 +35,17 @@ from iort_contract.tables import STATS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.inventory import unit
-from iort_station.data.recorded import Recorded, in_column_order, seconds
+from iort_station.data.recorded import Reading, in_column_order, seconds
 from iort_station.data.selection import Selection, derive, holds, select
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.times import Time, duration_us, iso_s
 
-_DOWNLOAD_S = 60
-
-
-def _by_function(
-    cloud: Cloud,
-    selection: Selection,
-    *,
-    refused: RefusedItems,
-    absent: Counter[str],
-    scan: bool = False,
-    progress: PageProgress | None = None,
-) -> Iterator[Block]:
-    """The selection's samples, from as many invocations as needed.
-
-    Raises `StationError` if the function fails, and at the end for a field that no sample has.
-    """
-    request = QueryRequest(
-        selection.robot,
-        selection.stream,
-        FIRST_US if selection.start_us is None else selection.start_us,
-        LAST_US if selection.end_us is None else selection.end_us,
-        selection.fields,
-        selection.where,
-        scan,
-    )
-    function = cloud.output("processing", "QueryFunction")
-    parts: list[Block] = []
-    there: set[str] = set()
-    while True:
-        answer = _invoke(cloud, function, request)
-        part = _unpacked(cloud, answer)
-        parts.append(part)
-        there |= set(answer.fields)
-        refused.count += answer.refused
-        refused.named += [answer.reason] if answer.reason else []
-        absent.update(answer.absent)
-        if progress is not None and len(part.times_us):
-            progress(answer.items, int(part.times_us[-1]))
-        if answer.token is None:
-            break
-        request = replace(request, token=answer.token)
-    if there and not selection.named() <= there:
-        raise inventory.unknown_fields(cloud, selection, there)
-    # A batch may overlap the next one, which another invocation may have read.
-    block = ordered(join(parts))
-    if len(block.times_us):
-        names = selection.fields or tuple(block.columns)
-        yield Block(block.times_us, {name: block.columns[name] for name in names})
-
-
-def _invoke(cloud: Cloud, function: str, request: QueryRequest) -> QueryAnswer:
-    reply = cloud.client("lambda").invoke(FunctionName=function, Payload=encode_query_request(request))
-    text = reply["Payload"].read()
-    if "FunctionError" in reply:
-        message = json.loads(text).get("errorMessage", text[:500])
-        raise StationError(f"the query function failed: {message}")
-    try:
-        answer = decode_query_answer(text)
-    except ContractError as error:
-        raise StationError(f"{error}: deploy the current stacks") from error
-    if answer.error:
-        raise StationError(f"the query function refused: {answer.error}")
-    return answer
-
-
-def _unpacked(cloud: Cloud, answer: QueryAnswer) -> Block:
-    packed = _download(cloud, str(answer.url)) if answer.samples is None else answer.samples
-    times_us, columns = unpacked_samples(packed)
-    times = np.array(times_us, dtype=np.int64)
-    return Block(times, {name: column_of(column) for name, column in columns.items()})
-
-
-def _download(cloud: Cloud, url: str) -> bytes:
-    context = ssl.create_default_context(cafile=cloud.ca_bundle)
-    try:
-        with urllib.request.urlopen(  # noqa: S310 - signed by our own function
-            url, timeout=_DOWNLOAD_S, context=context
-        ) as response:
-            return bytes(response.read())
-    except OSError as error:
-        raise StationError(f"the result cannot be downloaded: {error}") from error
-
-
 # Where samples are selected: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
 _BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
 _MEAN = f"_{STATS[1]}"
+_DOWNLOAD_S = 60
 
 
 @dataclass(frozen=True)
@@ -201,35 +119,20 @@ def query(
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
-    refused, absent_values, origin = RefusedItems(), Counter[str](), Origin()
+    reading = Reading(source, scan, progress, absent=Counter())
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; query the summary without --on lambda")
-        _check_in_table(cloud, selection, source)
-        found = _by_function(
-            cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress
-        )
-    elif summary:
-        found = seconds(
-            cloud, selection, source=source, origin=origin, refused=refused, scan=scan, progress=progress
-        )
+        _check_in_table(cloud, selection, reading)
+        blocks = _by_function(cloud, selection, reading)
     else:
-        found = samples(
-            cloud,
-            selection,
-            refused=refused,
-            absent=absent_values,
-            source=source,
-            origin=origin,
-            scan=scan,
-            progress=progress,
-        )
+        blocks = (seconds if summary else samples)(cloud, selection, reading)
     ros2 = False
 
     def watched() -> Iterator[Block]:
         nonlocal ros2
         read = 0
-        for block in found:
+        for block in blocks:
             read += len(block.times_us) * len(block.columns)
             if most is not None and read > most:
                 raise StationError(
@@ -241,60 +144,47 @@ def query(
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
     if summary and fields is None:
         block = in_column_order(block)
-    if not len(block.times_us) and not refused.count:
+    if not len(block.times_us) and not reading.refused.count:
         inventory.check_there(cloud, robot, stream)
     return Result(
         robot,
         stream,
         block.times_us,
         block.columns,
-        refused.count,
-        refused.reason,
+        reading.refused.count,
+        reading.refused.reason,
         ros2,
-        absent_values,
-        origin.within(selection.start_us, selection.end_us),
+        reading.absent or {},
+        reading.origin.within(selection.start_us, selection.end_us),
         cache(partial(inventory.kind_of, cloud, selection)),
     )
 
 
 def samples(
-    cloud: Cloud,
-    selection: Selection,
-    *,
-    refused: RefusedItems | None = None,
-    absent: Counter[str] | None = None,
-    source: Source = AUTO,
-    origin: Origin | None = None,
-    scan: bool = False,
-    progress: PageProgress | None = None,
-    messages: bool = True,
+    cloud: Cloud, selection: Selection, reading: Reading, *, messages: bool = True
 ) -> Iterator[Block]:
     """The selection's samples block by block, for ranges that do not fit in memory.
 
-    ``absent`` counts values of sensors that are not fitted, which become null; without it they stay as
-    recorded. Without ``messages``, samples of ROS messages are skipped. ``origin`` grows by what comes from
-    the archive. Raises `StationError` at the end for a named field that no sample has.
+    Without ``messages``, samples of ROS messages are skipped. Raises `StationError` at the end for a named
+    field that no sample has.
     """
-    recorded = Recorded(
-        cloud, selection.robot, selection.stream, source=source, origin=origin, refused=refused
-    )
     keys = with_samples_between(selection.start_us, selection.end_us)
-    parts = recorded.parts(keys, selection.needs, messages=messages, scan=scan, progress=progress)
-    found = in_order(parts)
+    parts = reading.recorded(cloud, selection).parts(
+        keys, selection.wanted(), messages=messages, scan=reading.scan, progress=reading.progress
+    )
     named = selection.named()
-    derived = sorted(named & DERIVED.keys())
+    derived = named & DERIVED.keys()
     vehicle = registry.vehicle_of(cloud, selection.robot) if derived else None
     there: set[str] = set()
     some = False
-    for whole in found:
+    for whole in in_order(parts):
         block = _within(whole, selection)
-        block = block if absent is None else _without_absent(block, absent)
+        block = block if reading.absent is None else _without_absent(block, reading.absent)
         n = len(block.times_us)
         some = some or n > 0
         columns = dict(block.columns)
         if derived:
-            made = derive(columns, vehicle)
-            columns |= {name: made[name] for name in derived if name in made}
+            columns |= {name: made for name, made in derive(columns, vehicle).items() if name in derived}
         there |= columns.keys()
         names = block.columns if selection.fields is None else selection.fields
         null = np.full(n, np.nan)
@@ -307,16 +197,16 @@ def samples(
         raise inventory.unknown_fields(cloud, selection, there)
 
 
-def _check_in_table(cloud: Cloud, selection: Selection, source: Source) -> None:
+def _check_in_table(cloud: Cloud, selection: Selection, reading: Reading) -> None:
     """Raise `StationError` if the query function, which reads the table only, would leave something out."""
-    if source == TABLE:
+    if reading.source == TABLE:
         return
-    recorded = Recorded(cloud, selection.robot, selection.stream, source=source)
-    hours = recorded.archived(with_samples_between(selection.start_us, selection.end_us))
-    if told := Origin(hours).within(selection.start_us, selection.end_us).told():
+    keys = with_samples_between(selection.start_us, selection.end_us)
+    hours = reading.recorded(cloud, selection).archived(keys)
+    if archived := Origin(hours).within(selection.start_us, selection.end_us).told():
         raise StationError(
-            f"the query function reads the table only, from which {told['hours']:,} hours of this range have "
-            f"expired, or soon will: leave out --on lambda, or start at {iso_s(told['to_us'])}"
+            f"the query function reads the table only, from which {archived['hours']:,} hours of this range "
+            f"have expired, or soon will: leave out --on lambda, or start at {iso_s(archived['to_us'])}"
         )
 
 
@@ -352,3 +242,76 @@ def _without_absent(block: Block, counts: Counter[str]) -> Block:
             found[name][mask] = np.nan if numbers else None
             counts[name] += int(mask.sum())
     return Block(block.times_us, {**block.columns, **found}) if found else block
+
+
+def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
+    """The selection's samples, from as many invocations of the query function as needed.
+
+    Raises `StationError` if the function fails, and at the end for a field that no sample has.
+    """
+    request = QueryRequest(
+        selection.robot,
+        selection.stream,
+        FIRST_US if selection.start_us is None else selection.start_us,
+        LAST_US if selection.end_us is None else selection.end_us,
+        selection.fields,
+        selection.where,
+        reading.scan,
+    )
+    function = cloud.output("processing", "QueryFunction")
+    parts: list[Block] = []
+    there: set[str] = set()
+    while True:
+        answer = _invoke(cloud, function, request)
+        part = _unpacked(cloud, answer)
+        parts.append(part)
+        there |= set(answer.fields)
+        reading.refused.count += answer.refused
+        reading.refused.named += [answer.reason] if answer.reason else []
+        if reading.absent is not None:
+            reading.absent.update(answer.absent)
+        if reading.progress is not None and len(part.times_us):
+            reading.progress(answer.items, int(part.times_us[-1]))
+        if answer.token is None:
+            break
+        request = replace(request, token=answer.token)
+    if there and not selection.named() <= there:
+        raise inventory.unknown_fields(cloud, selection, there)
+    # A batch may overlap the next one, which another invocation may have read.
+    block = ordered(join(parts))
+    if len(block.times_us):
+        names = selection.fields or tuple(block.columns)
+        yield Block(block.times_us, {name: block.columns[name] for name in names})
+
+
+def _invoke(cloud: Cloud, function: str, request: QueryRequest) -> QueryAnswer:
+    reply = cloud.client("lambda").invoke(FunctionName=function, Payload=encode_query_request(request))
+    text = reply["Payload"].read()
+    if "FunctionError" in reply:
+        message = json.loads(text).get("errorMessage", text[:500])
+        raise StationError(f"the query function failed: {message}")
+    try:
+        answer = decode_query_answer(text)
+    except ContractError as error:
+        raise StationError(f"{error}: deploy the current stacks") from error
+    if answer.error:
+        raise StationError(f"the query function refused: {answer.error}")
+    return answer
+
+
+def _unpacked(cloud: Cloud, answer: QueryAnswer) -> Block:
+    packed = _download(cloud, str(answer.url)) if answer.samples is None else answer.samples
+    times_us, columns = unpacked_samples(packed)
+    times = np.array(times_us, dtype=np.int64)
+    return Block(times, {name: column_of(column) for name, column in columns.items()})
+
+
+def _download(cloud: Cloud, url: str) -> bytes:
+    context = ssl.create_default_context(cafile=cloud.ca_bundle)
+    try:
+        with urllib.request.urlopen(  # noqa: S310 - signed by our own function
+            url, timeout=_DOWNLOAD_S, context=context
+        ) as response:
+            return bytes(response.read())
+    except OSError as error:
+        raise StationError(f"the result cannot be downloaded: {error}") from error

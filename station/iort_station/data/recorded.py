@@ -6,9 +6,10 @@ read as the summary has them, or computed from the archive once they have expire
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
@@ -123,29 +124,44 @@ _SECOND_US = 1_000_000
 _COUNTS = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
 
 
-def seconds(
-    cloud: Cloud,
-    selection: Selection,
-    *,
-    source: Source = AUTO,
-    origin: Origin | None = None,
-    refused: RefusedItems | None = None,
-    scan: bool = False,
-    progress: PageProgress | None = None,
-) -> Iterator[Block]:
+@dataclass
+class Reading:
+    """How a query reads, and what it learns. ``progress`` is called for each page, ``scan`` reads by Scan.
+
+    ``refused`` counts what cannot be read, ``origin`` what comes from the archive, and ``absent`` the values
+    by field that became null because their sensor is not fitted; with None they stay as recorded.
+    """
+
+    source: Source = AUTO
+    scan: bool = False
+    progress: PageProgress | None = None
+    refused: RefusedItems = field(default_factory=RefusedItems)
+    origin: Origin = field(default_factory=Origin)
+    absent: Counter[str] | None = None
+
+    def recorded(self, cloud: Cloud, selection: Selection) -> Recorded:
+        """The stream's batches, for this reading."""
+        return Recorded(
+            cloud,
+            selection.robot,
+            selection.stream,
+            source=self.source,
+            origin=self.origin,
+            refused=self.refused,
+        )
+
+
+def seconds(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
     """The seconds that start in the selection's range, some at a time; times are their starts.
 
     Seconds expire with their batches. They are then computed from the archive. A field stands for its
     ``_min``, ``_mean``, ``_max`` and ``_last``. Raises `StationError` for a field that no second has.
     """
     there: dict[str, None] = {}
-    recorded = Recorded(
-        cloud, selection.robot, selection.stream, source=source, origin=origin, refused=refused
-    )
-    for whole in _blocks(cloud, selection, recorded, scan=scan):
+    for whole in _blocks(cloud, selection, reading):
         block = whole
-        if progress is not None:
-            progress(len(block.times_us), int(block.times_us[-1]))
+        if reading.progress is not None:
+            reading.progress(len(block.times_us), int(block.times_us[-1]))
         there |= dict.fromkeys(block.columns)
         if selection.condition is not None:
             block = block.take(holds(selection.condition, block.columns, len(block.times_us)))
@@ -164,9 +180,11 @@ def seconds(
         raise unknown(problem, missing, there, f"iort streams {selection.robot}")
 
 
-def _blocks(cloud: Cloud, selection: Selection, recorded: Recorded, *, scan: bool) -> Iterator[Block]:
+def _blocks(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
     """The seconds as they are stored or computed, in order of time."""
-    table = Pages(stored_seconds(cloud, selection, scan=scan) if recorded.reads_table else iter(()), _second)
+    recorded = reading.recorded(cloud, selection)
+    stored = stored_seconds(cloud, selection, scan=reading.scan) if recorded.reads_table else iter(())
+    table = Pages(stored, _second)
     first, last = _range_s(selection)
     keys = with_samples_between(selection.start_us, selection.end_us)
     for start_s, end_s in _spans(recorded.archived(keys)):

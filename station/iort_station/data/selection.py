@@ -7,7 +7,7 @@ Conditions and derived fields are evaluated over numpy columns, with the same re
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -58,12 +58,12 @@ class Selection:
         deciding = expression.names(self.condition) if self.condition is not None else frozenset()
         return deciding.union(self.fields or ())
 
-    def needs(self, name: str) -> bool:
-        """Whether the answer needs this stored field."""
+    def wanted(self) -> Callable[[str], bool]:
+        """Which stored fields the answer needs."""
         if self.fields is None:
-            return True
+            return lambda _name: True
         named = self.named()
-        return name in named or any(name in sources for made, sources in SOURCES.items() if made in named)
+        return named.union(*(SOURCES[name] for name in named & SOURCES.keys())).__contains__
 
     def holds_time(self, t_us: int) -> bool:
         """Whether the range includes a time."""

@@ -10,7 +10,6 @@ import zlib
 import pytest
 
 from functions.query import answer
-from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import values
 from iort_contract.messages.batch import Batch
 from iort_station import data
@@ -206,7 +205,7 @@ def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
 def test_exported_messages_have_the_recorded_values():
     columns = {"temp_motor": COLD}
     cloud = Cloud(table(Batch("0badcafe", 0, [START + i for i in range(4)], columns)))
-    blocks = data.samples(cloud, data.select("car", "vesc"), refused=RefusedItems())
+    blocks = data.samples(cloud, data.select("car", "vesc"), data.Reading())
     assert [value for block in blocks for value in block.columns["temp_motor"].tolist()] == COLD
 
 

@@ -177,7 +177,7 @@ def test_the_way_to_add_a_derived_field_works(deployed: Deployed) -> None:
         "from iort_station.data.selection import derive, values",
     )
     assert found == [60.0, None]
-    needs = "select('car', 'vesc', where='motor_power_w > 5').needs('duty_cycle')"
+    needs = "select('car', 'vesc', where='motor_power_w > 5').wanted()('duty_cycle')"
     assert copy.show(needs, "from iort_station.data.selection import select") is True
     formula = "`duty_cycle * voltage_input * current_motor`"
     assert f"| {formula} |" in (copy.root / "docs/reference/fields.md").read_text()

@@ -253,7 +253,7 @@ def test_a_mistake_is_answered_with_the_available_names(question, answer):
 def test_a_selection_reads_only_the_needed_fields():
     selection = select("car", "vesc", fields=["speed_mps"], where="duty_cycle > 0")
     names = ["speed", "duty_cycle", "voltage_input", "speed_mps"]
-    assert [name for name in names if selection.needs(name)] == ["speed", "duty_cycle", "speed_mps"]
+    assert list(filter(selection.wanted(), names)) == ["speed", "duty_cycle", "speed_mps"]
 
 
 # --- units from a stream's message types ------------------------------------------------------------------
