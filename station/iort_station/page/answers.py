@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
+from iort_contract.cloud import DRIVER, VIEWER
 from iort_contract.messages.control.commands import MAX_LEASE_MS
 from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, SettingKind, SettingsAnswer
@@ -19,16 +20,16 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.errors import StationError
 from iort_station.fleet import control, registry, robots
-from iort_station.fleet import control as fleet_settings
 from iort_station.fleet.control import Shadow, State
+from iort_station.fleet.roles import has_drivers
 from iort_station.operations.monitoring import alarms, cloudwatch, cloudwatch_logs
 from iort_station.page import history, insights, motion
-from iort_station.page import insights as laps
-from iort_station.page import insights as notes
-from iort_station.page import motion as socket
-from iort_station.page import motion as viewing
+from iort_station.page.page import DRIVE
 from iort_station.page.requests import text, whole
 from iort_station.page.server import Handler
+
+# A viewer waits for a robot's answer.
+_ANSWER_S = 10.0
 
 
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
@@ -54,25 +55,22 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "rejected": lambda _asked: alarms.rejected(cloud),
         "insights": lambda asked: insights.insights(cloud, asked),
         "analysis": lambda asked: insights.progress(cloud, asked),
-        **laps.laps_answers(cloud),
-        **socket.socket_answers(cloud),
-        **notes.notes_answers(cloud),
-        **motion.motion_answers(cloud),
+        "laps": lambda asked: insights.laps(cloud, asked),
+        "delta": lambda asked: insights.delta(cloud, asked),
+        "notes": lambda asked: insights.notes(cloud, asked),
+        "motion": motion.fleet(cloud).motion,
+        "socket": lambda _asked: motion.address(cloud, VIEWER),
     }
 
 
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
     """What everybody who reaches the page may do, by its name."""
     return {
-        "view": lambda asked: viewing.view(socket.prompt(cloud), asked),
+        "view": lambda asked: motion.view(motion.prompt(cloud), asked),
         "acknowledge": lambda asked: alarms.acknowledge(
             cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
         ),
     }
-
-
-# A viewer waits for it.
-_ANSWER_S = 10.0
 
 
 def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
@@ -82,9 +80,10 @@ def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
         "settings": lambda asked: settings(cloud, asked),
         "set": lambda asked: change(cloud, asked),
         "analyse": lambda asked: insights.analyse(cloud, asked),
-        **socket.socket_actions(cloud),
-        **notes.notes_actions(cloud),
-        **motion.motion_actions(cloud),
+        "note": lambda asked: insights.write_note(cloud, asked),
+        "delete_note": lambda asked: insights.remove_note(cloud, asked),
+        "stop": motion.fleet(cloud).stop,
+        **({DRIVE: lambda _asked: motion.address(cloud, DRIVER)} if has_drivers(cloud) else {}),
     }
 
 
@@ -120,8 +119,8 @@ def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
     robot, name = text(asked, "robot"), text(asked, "name")
     if name == MOTION_STOPPED:
         raise StationError("the emergency stop has a button of its own")
-    value = fleet_settings.parse_setting(name, asked["value"]) if "value" in asked else None
-    changed = fleet_settings.change_settings(cloud, robot, {name: value}, _ANSWER_S)
+    value = control.parse_setting(name, asked["value"]) if "value" in asked else None
+    changed = control.change_settings(cloud, robot, {name: value}, _ANSWER_S)
     reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
     return {"settings": _entries(changed.state, reasons), "online": changed.online}
 
@@ -157,4 +156,4 @@ def _kind(setting: Flag | Number | Choice | None) -> SettingKind:
 
 
 def _written(value: Any) -> str:
-    return "" if value is None else fleet_settings.setting_text(value)
+    return "" if value is None else control.setting_text(value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import islice
@@ -29,7 +29,6 @@ from iort_contract.messages.analysis.insights import (
     NotesAnswer,
 )
 from iort_contract.messages.analysis.run import AnalysedDrive, AnalysisRequest
-from iort_contract.messages.page import Answer
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored
@@ -157,26 +156,19 @@ _MOST_VALUES = 10_000_000
 _KEPT_LAPS = 8
 
 
-def laps_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """The answers about laps, by their names."""
-
-    @lru_cache(_KEPT_LAPS)
-    def found(robot: str, start_us: int, end_us: int) -> Mined:
-        return laps_within(cloud, robot, start_us, end_us, most=_MOST_VALUES)
-
-    def of(asked: Mapping[str, str]) -> Mined:
-        start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
-        return found(check_robot(text(asked, "robot")), start_us, end_us)
-
-    return {
-        "laps": lambda asked: _laps(of(asked)),
-        "delta": lambda asked: _delta(
-            of(asked), whole(asked, "one", 1, 10**6), whole(asked, "other", 1, 10**6)
-        ),
-    }
+@lru_cache(_KEPT_LAPS)
+def _mined(cloud: Cloud, robot: str, start_us: int, end_us: int) -> Mined:
+    return laps_within(cloud, robot, start_us, end_us, most=_MOST_VALUES)
 
 
-def _laps(mined: Mined) -> LapsAnswer:
+def _mined_of(cloud: Cloud, asked: Mapping[str, str]) -> Mined:
+    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    return _mined(cloud, check_robot(text(asked, "robot")), start_us, end_us)
+
+
+def laps(cloud: Cloud, asked: Mapping[str, str]) -> LapsAnswer:
+    """The laps of ``robot`` from ``from_us`` to ``to_us``."""
+    mined = _mined_of(cloud, asked)
     table = mined.tables.get(LAPS_TABLE)
     estimates = {name: estimate(one) for name, one in mined.estimates.items()}
     if table is None:
@@ -207,7 +199,10 @@ def _laps(mined: Mined) -> LapsAnswer:
     }
 
 
-def _delta(mined: Mined, one: int, other: int) -> DeltaAnswer:
+def delta(cloud: Cloud, asked: Mapping[str, str]) -> DeltaAnswer:
+    """How far the lap ``other`` is behind the lap ``one``, at each place of the track."""
+    mined = _mined_of(cloud, asked)
+    one, other = (whole(asked, name, 1, 10**6) for name in ("one", "other"))
     if PLACES_TABLE not in mined.tables:
         raise StationError(next(iter(mined.missing.values()), "no laps"))
     try:
@@ -232,30 +227,17 @@ def _known(column: Column) -> list[float | None]:
 _NOTES = 200
 
 
-def notes_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """The answer ``notes``."""
-    return {"notes": lambda asked: notes(cloud, asked)}
-
-
-def notes_actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """What writes and deletes notes, by its name."""
-    return {
-        "note": lambda asked: write_note(cloud, asked),
-        "delete_note": lambda asked: remove_note(cloud, asked),
-    }
-
-
 def notes(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
     """The newest notes about ``robot``, or about the fleet; those from ``from_us`` to ``to_us``, if given."""
     robot = check_robot(asked["robot"]) if asked.get("robot") else None
     start_us, end_us = (
         whole(asked, name, 0, 2**53) if name in asked else None for name in ("from_us", "to_us")
     )
-    found = stored.notes(cloud, robot, start_us, end_us, most=_NOTES)
+    newest = stored.notes(cloud, robot, start_us, end_us, most=_NOTES)
     return {
         "notes": [
-            {"id": one.id, "robot": one.robot, "t_us": one.t_us, "text": one.text, "by": one.by}
-            for one in found
+            {"id": note.id, "robot": note.robot, "t_us": note.t_us, "text": note.text, "by": note.by}
+            for note in newest
         ]
     }
 

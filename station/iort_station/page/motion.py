@@ -8,15 +8,15 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.cloud import DRIVER, IOT, PUBNUB, VIEWER, client_prefix
-from iort_contract.messages.page import Answer, Identity, MotionAnswer, MotionEntry, SocketAnswer, ViewAnswer
+from iort_contract.cloud import IOT, PUBNUB, VIEWER, client_prefix
+from iort_contract.messages.page import Identity, MotionAnswer, MotionEntry, SocketAnswer, ViewAnswer
 from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
@@ -24,19 +24,8 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry, stopping, viewing
 from iort_station.fleet.roles import Role, has_drivers, transport
 from iort_station.operations.monitoring.alarms import user
-from iort_station.page.page import DRIVE, load_keys
+from iort_station.page.page import load_keys
 from iort_station.page.requests import number, text, whole
-from iort_station.page.server import Handler
-
-
-def socket_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], SocketAnswer]]:
-    """The answer ``socket``: a viewer's address."""
-    return {"socket": _addresses(cloud, VIEWER)}
-
-
-def socket_actions(cloud: Cloud) -> dict[str, Handler]:
-    """The action ``drive``: a driver's address, if the deployment has drivers."""
-    return {DRIVE: _addresses(cloud, DRIVER)} if has_drivers(cloud) else {}
 
 
 def reaching(cloud: Cloud, live: str) -> dict[str, Any]:
@@ -97,14 +86,15 @@ def _origin(cloud: Cloud) -> str:
     return f"{address.scheme}://{address.netloc}"
 
 
-def _addresses(cloud: Cloud, name: str) -> Callable[[Mapping[str, str]], SocketAnswer]:
-    role = Role(prompt(cloud), name)
+@functools.cache
+def _role(cloud: Cloud, name: str) -> Role:
+    return Role(prompt(cloud), name)
 
-    def answer(_asked: Mapping[str, str]) -> SocketAnswer:
-        signed = role.signed()
-        return {"url": signed.url, "client_id": signed.client_id}
 
-    return answer
+def address(cloud: Cloud, name: str) -> SocketAnswer:
+    """A signed address of the broker for a viewer or a driver."""
+    signed = _role(cloud, name).signed()
+    return {"url": signed.url, "client_id": signed.client_id}
 
 
 # Every open page asks for the fleet, and each robot costs a read of its shadow. For a while after a stop or a
@@ -112,103 +102,87 @@ def _addresses(cloud: Cloud, name: str) -> Callable[[Mapping[str, str]], SocketA
 _KEPT_S, _KEPT_WAITING_S, _WAITING_S = 3.0, 0.1, 20.0
 
 
-class _Fleet:
-    """The motion of every robot, read at most every few seconds however many pages ask."""
+class Fleet:
+    """The motion of every robot, read at most every few seconds however many pages ask; and its stop, which
+    shares no connection and no lock with that."""
 
     def __init__(self, cloud: Cloud) -> None:
-        self.cloud = prompt(cloud)
+        self._cloud, self._urgent = prompt(cloud), cloud.urgent()
         self._lock = threading.Lock()
         self._read_s = self._changed_s = float("-inf")
-        self._found: dict[str, stopping.Motion] = {}
+        self._robots: dict[str, stopping.Motion] = {}
 
-    def motion(self) -> dict[str, stopping.Motion]:
-        with self._lock:
-            began_s = time.monotonic()
-            kept_s = _KEPT_WAITING_S if began_s - self._changed_s < _WAITING_S else _KEPT_S
-            # What was read while somebody changed it may be from before.
-            if began_s - self._read_s >= kept_s or self._read_s <= self._changed_s:
-                self._found = stopping.motion(self.cloud, registry.presence(self.cloud))
-                self._read_s = began_s
-            return self._found
-
-    def names(self) -> list[str]:
-        """The robots as they were last read, if they ever were."""
-        return list(self._found)
-
-    def changed(self) -> None:
-        """A stop or a release was asked for: read again when asked next, and often. Waits for no reading."""
-        self._changed_s = time.monotonic()
-
-
-@functools.cache
-def _fleet(cloud: Cloud) -> _Fleet:
-    """One for what asks and for what stops."""
-    return _Fleet(cloud)
-
-
-def motion_answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """The answer ``motion``: of ``robot``, as it is now; without one, of the fleet."""
-    fleet = _fleet(cloud)
-
-    def listed(asked: Mapping[str, str]) -> MotionAnswer:
+    def motion(self, asked: Mapping[str, str]) -> MotionAnswer:
+        """Of ``robot``, as it is now; without one, of the fleet."""
         robot = asked.get("robot")
-        return _told(stopping.motion(fleet.cloud, [check_robot(robot)]) if robot else fleet.motion(), {})
+        return _motion(stopping.motion(self._cloud, [check_robot(robot)]) if robot else self._all(), {})
 
-    return {"motion": listed}
+    def stop(self, asked: Mapping[str, str]) -> MotionAnswer:
+        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
+        ``seen_ms`` is the newest stop that the page shows: a release ends no stop after it."""
+        stops = {"true": True, "false": False}.get(text(asked, "stopped"))
+        if stops is None:
+            raise StationError("stopped must be true or false")
+        one = [check_robot(asked["robot"])] if asked.get("robot") else None
+        # As they were last read, if they ever were.
+        known = list(self._robots)
+        cloud, fleet = self._urgent, one is None
+        if stops:
+            # Nothing is looked up before it.
+            failed = stopping.stop(cloud, one or known, by=user(), fleet=fleet)
+            robots = one or self._names(known)
+            failed |= stopping.stop(cloud, set(robots) - set(one or known), by=user(), fleet=fleet)
+            failed |= stopping.take_back(cloud, set(one) - set(known) if one else set(known) - set(robots))
+        else:
+            robots = one or self._names(known)
+            seen_ms = whole(asked, "seen_ms", 0, 10**15)
+            failed = stopping.release(cloud, robots, by=user(), fleet=fleet, seen_ms=seen_ms)
+        # Read again when asked next, and often.
+        self._changed_s = time.monotonic()
+        return _motion(stopping.motion(cloud, [robot for robot in robots if robot not in failed]), failed)
 
-
-def motion_actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """The action ``stop``. It shares no connection with what is read."""
-    fleet, urgent = _fleet(cloud), cloud.urgent()
-
-    def everyone(known: list[str]) -> list[str]:
+    def _names(self, known: list[str]) -> list[str]:
         try:
-            return list(registry.presence(urgent))
+            return list(registry.presence(self._urgent))
         except (BotoCoreError, ClientError):
             if not known:
                 raise
             return known
 
-    def stop(asked: Mapping[str, str]) -> MotionAnswer:
-        """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
-        ``seen_ms`` is the newest stop that the page shows: a release ends no stop after it."""
-        wanted = {"true": True, "false": False}.get(text(asked, "stopped"))
-        if wanted is None:
-            raise StationError("stopped must be true or false")
-        one = [check_robot(asked["robot"])] if asked.get("robot") else None
-        known = fleet.names()
-        if wanted:
-            # Nothing is looked up before it.
-            failed = stopping.stop(urgent, one or known, by=user(), fleet=one is None)
-            robots = one or everyone(known)
-            failed |= stopping.stop(urgent, set(robots) - set(one or known), by=user(), fleet=one is None)
-            failed |= stopping.take_back(urgent, set(one) - set(known) if one else set(known) - set(robots))
-        else:
-            robots = one or everyone(known)
-            seen_ms = whole(asked, "seen_ms", 0, 10**15)
-            failed = stopping.release(urgent, robots, by=user(), fleet=one is None, seen_ms=seen_ms)
-        fleet.changed()
-        return _told(stopping.motion(urgent, [robot for robot in robots if robot not in failed]), failed)
-
-    return {"stop": stop}
+    def _all(self) -> dict[str, stopping.Motion]:
+        with self._lock:
+            began_s = time.monotonic()
+            kept_s = _KEPT_WAITING_S if began_s - self._changed_s < _WAITING_S else _KEPT_S
+            # What was read while somebody changed it may be from before.
+            if began_s - self._read_s >= kept_s or self._read_s <= self._changed_s:
+                self._robots = stopping.motion(self._cloud, registry.presence(self._cloud))
+                self._read_s = began_s
+            return self._robots
 
 
-def _told(found: Mapping[str, stopping.Motion], failed: dict[str, str]) -> MotionAnswer:
-    return {"robots": {robot: _entry(one) for robot, one in found.items()}, "user": user(), "failed": failed}
+@functools.cache
+def fleet(cloud: Cloud) -> Fleet:
+    """One for what asks and for what stops."""
+    return Fleet(cloud)
 
 
-def _entry(one: stopping.Motion) -> MotionEntry:
+def _motion(robots: Mapping[str, stopping.Motion], failed: dict[str, str]) -> MotionAnswer:
+    entries = {robot: _entry(motion) for robot, motion in robots.items()}
+    return {"robots": entries, "user": user(), "failed": failed}
+
+
+def _entry(motion: stopping.Motion) -> MotionEntry:
     return {
-        "asked": one.asked,
-        "stopped": one.stopped,
-        "reason": one.reason,
-        "stands": one.stands,
-        "stoppable": one.stoppable,
-        "why_not": one.why_not,
-        "alone": one.alone,
-        "by": one.by.by if one.by is not None else "",
-        "at_ms": one.by.t_ms if one.by is not None else 0,
-        "drive": None if one.drive is None else {**asdict(one.drive)},  # type: ignore[typeddict-item]  # its fields
+        "asked": motion.asked,
+        "stopped": motion.stopped,
+        "reason": motion.reason,
+        "stands": motion.stands,
+        "stoppable": motion.stoppable,
+        "why_not": motion.why_not,
+        "alone": motion.alone,
+        "by": motion.by.by if motion.by is not None else "",
+        "at_ms": motion.by.t_ms if motion.by is not None else 0,
+        "drive": None if motion.drive is None else {**asdict(motion.drive)},  # type: ignore[typeddict-item]  # its fields
     }
 
 

@@ -16,7 +16,6 @@ from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
 from iort_station.page import insights
-from iort_station.page import insights as laps
 from iort_station.page.answers import answers
 from iort_station.page.history import MAX_ROWS, history
 from iort_station.page.page import config, site_files, upload
@@ -207,20 +206,21 @@ def test_the_fleets_insights_are_of_all_robots():
 
 
 def test_laps_and_their_delta_are_answered_from_the_samples():
-    answers = laps.laps_answers(driven_cloud())
-    told = json.loads(json.dumps(answers["laps"](WHOLE), allow_nan=False))
+    cloud = driven_cloud()
+    told = json.loads(json.dumps(insights.laps(cloud, WHOLE), allow_nan=False))
     assert told["method"] == "gate"
     assert len(told["laps"]) >= 6
-    delta = json.loads(json.dumps(answers["delta"]({**WHOLE, "one": "2", "other": "3"}), allow_nan=False))
+    compared = {**WHOLE, "one": "2", "other": "3"}
+    delta = json.loads(json.dumps(insights.delta(cloud, compared), allow_nan=False))
     behind = told["laps"][2]["time_s"] - told["laps"][1]["time_s"]
     assert delta["unit"] == "m"
     assert delta["delta_s"][-1] == pytest.approx(behind, abs=0.001)
     with pytest.raises(StationError, match="lap must be from 1 to"):
-        answers["delta"]({**WHOLE, "one": "2", "other": "99"})
+        insights.delta(cloud, {**compared, "other": "99"})
 
 
 def test_a_range_without_laps_says_why():
-    told = laps.laps_answers(driven_cloud())["laps"]({**WHOLE, "to_us": str(START + 10_000_000)})
+    told = insights.laps(driven_cloud(), {**WHOLE, "to_us": str(START + 10_000_000)})
     assert told["laps"] == []
     assert told["reason"].startswith("no laps: ")
 

@@ -106,27 +106,25 @@ def cloud():
 
 
 def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
-    told = motion.motion_actions(cloud)["stop"]({"robot": "car7", "stopped": "true"})["robots"]
+    told = motion.fleet(cloud).stop({"robot": "car7", "stopped": "true"})["robots"]
     assert (told["car7"]["asked"], told["car7"]["stopped"]) == (True, None)
     cloud.confirm("car7", stopped=True)
-    told = motion.motion_answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
+    told = motion.fleet(cloud).motion({"robot": "car7"})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (True, True)
     assert told["drive"] == vars(LIMITS)
-    told = motion.motion_actions(cloud)["stop"]({"robot": "car7", "stopped": "false", **NOW})["robots"][
-        "car7"
-    ]
+    told = motion.fleet(cloud).stop({"robot": "car7", "stopped": "false", **NOW})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (False, True)
 
 
 def test_a_stop_of_the_fleet_is_seen_at_once(cloud):
-    ask, act = motion.motion_answers(cloud)["motion"], motion.motion_actions(cloud)["stop"]
+    ask, act = motion.fleet(cloud).motion, motion.fleet(cloud).stop
     assert not ask({})["robots"]["car8"]["asked"]
     act({"stopped": "true"})
     assert ask({})["robots"]["car8"]["asked"]
 
 
 def test_a_stop_waits_for_no_reading_of_the_fleet(cloud):
-    ask, act = motion.motion_answers(cloud)["motion"], motion.motion_actions(cloud)["stop"]
+    ask, act = motion.fleet(cloud).motion, motion.fleet(cloud).stop
     reading, go = threading.Event(), threading.Event()
 
     def held() -> None:
@@ -147,7 +145,7 @@ def test_a_stop_waits_for_no_reading_of_the_fleet(cloud):
 
 def test_a_robot_with_impossible_limits_keeps_no_other_from_its_stop(cloud):
     cloud.states["car7"]["reported"]["drive"]["max_speed_mps"] = 10**400
-    told = motion.motion_actions(cloud)["stop"]({"stopped": "true"})["robots"]
+    told = motion.fleet(cloud).stop({"stopped": "true"})["robots"]
     assert told["car8"]["asked"]
     assert told["car7"]["drive"] is None
 
@@ -161,7 +159,7 @@ def rejects(cloud: Shadows, robot: str) -> None:
 
 def test_a_robot_that_cannot_be_stopped_says_so_before_and_after_a_stop(cloud):
     cloud.states = {"car7": {"reported": {"moves": True}}, "car8": {"reported": {"moves": False}}}
-    ask, act = motion.motion_answers(cloud)["motion"], motion.motion_actions(cloud)["stop"]
+    ask, act = motion.fleet(cloud).motion, motion.fleet(cloud).stop
     before = ask({})["robots"]
     assert {robot: one["stoppable"] for robot, one in before.items()} == {"car7": True, "car8": False}
     assert NO_MOTION in before["car8"]["why_not"]
@@ -177,13 +175,13 @@ def test_a_robot_that_cannot_be_stopped_says_so_before_and_after_a_stop(cloud):
 
 
 def test_a_robot_that_has_not_said_whether_it_can_be_stopped_is_no_stopped_one(cloud):
-    told = motion.motion_answers(cloud)["motion"]({"robot": "car8"})["robots"]["car8"]
+    told = motion.fleet(cloud).motion({"robot": "car8"})["robots"]["car8"]
     assert (told["stoppable"], told["stands"]) == (None, False)
     assert "has not said" in told["why_not"]
 
 
 def test_a_rejected_stop_is_over_with_the_release_of_the_fleet(cloud):
-    act = motion.motion_actions(cloud)["stop"]
+    act = motion.fleet(cloud).stop
     act({"robot": "car8", "stopped": "true"})
     rejects(cloud, "car8")
     act({"stopped": "true"})
@@ -194,12 +192,12 @@ def test_a_rejected_stop_is_over_with_the_release_of_the_fleet(cloud):
 
 def test_a_robot_that_stands_without_having_been_asked_is_no_unconfirmed_release(cloud):
     cloud.confirm("car7", stopped=True)
-    told = motion.motion_answers(cloud)["motion"]({"robot": "car7"})["robots"]["car7"]
+    told = motion.fleet(cloud).motion({"robot": "car7"})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (True, True)
 
 
 def test_the_release_of_the_fleet_leaves_a_robot_that_was_stopped_alone(cloud):
-    act = motion.motion_actions(cloud)["stop"]
+    act = motion.fleet(cloud).stop
     act({"robot": "car7", "stopped": "true"})
     told = act({"stopped": "true"})["robots"]
     assert {robot: one["alone"] for robot, one in told.items()} == {"car7": True, "car8": False}
@@ -215,7 +213,7 @@ def test_the_release_of_the_fleet_leaves_a_robot_that_was_stopped_alone(cloud):
 
 
 def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
-    act = motion.motion_actions(cloud)["stop"]
+    act = motion.fleet(cloud).stop
     act({"stopped": "true"})
 
     def somebody_stops() -> None:
@@ -228,7 +226,7 @@ def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
 
 @pytest.mark.parametrize("whom", [{}, {"robot": "car7"}])
 def test_a_release_ends_no_stop_that_the_page_does_not_show(cloud, whom):
-    act = motion.motion_actions(cloud)["stop"]
+    act = motion.fleet(cloud).stop
     seen = act({"stopped": "true", **whom})["robots"]["car7"]["at_ms"]
     newer = stopping.encode_stop(stopping.Pressed("anna", seen + 1), fleet=not whom)
     cloud.states["car7"] = _merged(cloud.states["car7"], {"desired": newer})
@@ -241,7 +239,7 @@ def test_a_release_ends_no_stop_that_the_page_does_not_show(cloud, whom):
 
 def test_every_robot_of_a_fleet_is_tried_also_after_one_that_fails(cloud):
     cloud.broken = "car7"
-    told = motion.motion_actions(cloud)["stop"]({"stopped": "true"})
+    told = motion.fleet(cloud).stop({"stopped": "true"})
     assert "Throttling" in told["failed"]["car7"]
     assert told["robots"]["car8"]["asked"]
 
@@ -253,13 +251,13 @@ def test_the_pages_settings_release_nothing(cloud):
 
 
 def test_a_stranger_or_an_unclear_wish_changes_nothing(cloud):
-    told = motion.motion_actions(cloud)["stop"]({"robot": "car9", "stopped": "true"})
+    told = motion.fleet(cloud).stop({"robot": "car9", "stopped": "true"})
     assert "robot car9 is not registered; the nearest: car" in told["failed"]["car9"]
     assert "car9" not in cloud.states
     with pytest.raises(StationError, match="not registered: car9; nothing is changed"):
-        motion.motion_actions(cloud)["stop"]({"robot": "car9", "stopped": "false", **NOW})
+        motion.fleet(cloud).stop({"robot": "car9", "stopped": "false", **NOW})
     with pytest.raises(StationError, match="stopped must be true or false"):
-        motion.motion_actions(cloud)["stop"]({"robot": "car7", "stopped": "yes"})
+        motion.fleet(cloud).stop({"robot": "car7", "stopped": "yes"})
     assert "desired" not in cloud.states["car7"]
 
 
