@@ -32,7 +32,7 @@ from bench.ros.mixed_robot import CORE
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from testkit import machine
@@ -128,7 +128,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         publisher.finish()
 
         def stored() -> int:
-            return sum(len(batch.times_us) for batch in counts.batches(cloud, robot, VESC_STREAM))
+            return sum(len(batch.times_us) for batch in audit.batches(cloud, robot, VESC_STREAM))
 
         reached(lambda: stored() >= count, within_s=_CATCH_UP_S, poll_s=0.5)
         lost = count - stored()

@@ -10,7 +10,7 @@ from typing import Any
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
-from iort_station.operations.delivery import accounts, audit, counts
+from iort_station.operations import accounts, audit
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def count(cloud: Cloud, robot: str) -> Counted:
         lost=sum(one.missing for one in audits) + short,
         incomplete=tuple(one.stream for one in known if not one.complete),
         killed_runs=len(killed),
-        summarized=counts.samples_summarized(cloud, robot, VESC_STREAM),
+        summarized=audit.samples_summarized(cloud, robot, VESC_STREAM),
         expected=sum(run.samples for one in audits if one.stream == VESC_STREAM for run in one.runs),
     )
 

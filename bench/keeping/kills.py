@@ -17,7 +17,7 @@ from bench.keeping.up import Up
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
-from iort_station.operations.delivery import audit, counts
+from iort_station.operations import audit
 from local.figures import Spread
 from testkit import machine
 from testkit.car import AgentProcess
@@ -191,7 +191,7 @@ def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[fl
     """How long before each kill of an agent the last stored sample of that run was taken: see `Kills`."""
     found: dict[str, list[float | None]] = defaultdict(list)
     for robot in dict.fromkeys(one.robot for one in agent_kills):
-        batches = counts.batches(cloud, robot, VESC_STREAM)
+        batches = audit.batches(cloud, robot, VESC_STREAM)
         times_us = [time_us for batch in batches for time_us in batch.times_us]
         for one in agent_kills:
             of_run = [time_us for time_us in times_us if one.started_us <= time_us <= one.killed_us]

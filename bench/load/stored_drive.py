@@ -14,7 +14,7 @@ from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from testkit.car import RATE_HZ, simulated_drive
 from testkit.target import Target
 from testkit.waiting import until
@@ -46,7 +46,7 @@ def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[st
         items.append({name: serialize(value) for name, value in item.items()})
         client.put_item(TableName=table, Item=items[-1])
     until(
-        lambda: counts.samples_summarized(target.cloud, robot, VESC_STREAM) >= len(samples),
+        lambda: audit.samples_summarized(target.cloud, robot, VESC_STREAM) >= len(samples),
         "Lambda 2 to summarise what was stored",
         _CATCH_UP_S,
     )

@@ -10,7 +10,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 
 WRITERS = 8
 
@@ -53,10 +53,10 @@ def range_of_time(fixture: ProbeFixture) -> str:
 
 def stream_of_changes(fixture: ProbeFixture) -> str:
     """The function behind the stream summarises the stored batches."""
-    before = counts.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM)
+    before = audit.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM)
     fixture.drive()
     until(
-        lambda: counts.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM) >= before + 150,
+        lambda: audit.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM) >= before + 150,
         "the stream's function to write the other table",
     )
     return "batches of one table arrived summarised in the other"

@@ -16,7 +16,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.topics import LIVE, PING, PONG, build_topic, record_topic
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from testkit.target import Target, temporary_function
 from testkit.waiting import InstrumentError, reached
 
@@ -104,7 +104,7 @@ class ProbeFixture:
 
     def stored(self) -> list[Batch]:
         """Return the first robot's batches in the telemetry table."""
-        return list(counts.batches(self.cloud, self.a, VESC_STREAM))
+        return list(audit.batches(self.cloud, self.a, VESC_STREAM))
 
     def live_until(self, client: RawClient, true: Callable[[], object], what: str) -> None:
         """Publish live samples until ``true``; the first may be stale before a cold function starts."""

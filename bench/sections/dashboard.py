@@ -14,7 +14,7 @@ from bench.report.result import Section
 from bench.report.spread import spread, text
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_station.operations.delivery import audit, trace
+from iort_station.operations import audit, trace
 from iort_station.page.page import BUILT, load_keys
 from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer

@@ -23,7 +23,7 @@ from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
-from iort_station.operations.delivery import audit, counts
+from iort_station.operations import audit
 from local.network.proxy import PASS, REFUSE, Proxy
 from testkit.car import AgentProcess
 from testkit.target import Say, Target
@@ -78,7 +78,7 @@ def run(target: Target, say: Say) -> Section:
     sent = sum(s["samples"] for name, s in told["streams"].items() if name not in OWN_STREAMS)
 
     def summarized() -> int:
-        return counts.samples_summarized(target.cloud, bundle.robot, VESC_STREAM)
+        return audit.samples_summarized(target.cloud, bundle.robot, VESC_STREAM)
 
     # Lost samples never arrive: they are counted after the wait.
     reached(lambda: summarized() >= sent, within_s=_SUMMARY_S)

@@ -31,7 +31,7 @@ from iort_station import kept
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from iort_station.page import answers as control
 from iort_station.page.answers import actions, answers
 from iort_station.page.history import downloads
@@ -182,7 +182,7 @@ class _Demo:
         return agent.wait(_STATUS_S) is None
 
     def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
-        stored = sum(len(b.times_us) for b in counts.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        stored = sum(len(b.times_us) for b in audit.batches(embedded.cloud, ROBOT, VESC_STREAM))
         heard = list(listener.heard)
         delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
         return (
@@ -196,7 +196,7 @@ class _Demo:
         sent = sum(report["streams"][name]["samples"] for name in streams)
         before, deadline = -1, 0.0
         while True:
-            found = [counts.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            found = [audit.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
             summarized = sum(one.samples_summarized for one in found)
             stored = sum(one.samples_stored for one in found)
             if summarized > before:
@@ -211,7 +211,7 @@ class _Demo:
             samples_summarized=summarized,
             live_published=report["live_published"],
             live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
-            rtt_ms=round_trips(counts.batches(embedded.cloud, ROBOT, RTT_STREAM)),
+            rtt_ms=round_trips(audit.batches(embedded.cloud, ROBOT, RTT_STREAM)),
             car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),
         )
 

@@ -21,7 +21,7 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.pubnub.standin import PubNubStandIn
@@ -101,7 +101,7 @@ def fire(embedded: EmbeddedCloud, name: str) -> None:
 
 def recorded(embedded: EmbeddedCloud, robot: str, stream: str) -> data.Result:
     """The stream's samples, as soon as there are some: a query of an unknown stream is an error."""
-    until(lambda: list(counts.batches(embedded.cloud, robot, stream)))
+    until(lambda: list(audit.batches(embedded.cloud, robot, stream)))
     return data.query(embedded.cloud, robot, stream, "-1h", "now")
 
 

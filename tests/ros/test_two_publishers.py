@@ -12,7 +12,7 @@ import pytest
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from testkit.waiting import until
 from tests.local.conftest import embedded  # noqa: F401 - a fixture
@@ -32,7 +32,7 @@ def stored(
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[dict[str, counts.Delivery], float]:
+) -> tuple[dict[str, audit.Delivery], float]:
     """Return the stored batches of either stream, and the seconds that the publishers took."""
     folder = tmp_path_factory.mktemp("two")
     topics = {name: {"stream": TOPICS[name].stream, "time": "header"} for name in NAMES}
@@ -64,7 +64,7 @@ def stored(
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()
-    return {name: counts.delivery(embedded.cloud, car.robot, name) for name in SENT}, took_s
+    return {name: audit.delivery(embedded.cloud, car.robot, name) for name in SENT}, took_s
 
 
 def _publisher(graph: Graph, node: str, folder: Path):
@@ -75,13 +75,13 @@ def _publisher(graph: Graph, node: str, folder: Path):
 
 
 @pytest.mark.parametrize("stream", SENT)
-def test_every_message_is_stored(stored: tuple[dict[str, counts.Delivery], float], stream: str) -> None:
+def test_every_message_is_stored(stored: tuple[dict[str, audit.Delivery], float], stream: str) -> None:
     assert stored[0][stream].samples_stored == SENT[stream]
 
 
 @pytest.mark.parametrize("stream", SENT)
 def test_batches_per_second_stay_within_the_number_of_clocks(
-    stored: tuple[dict[str, counts.Delivery], float], stream: str
+    stored: tuple[dict[str, audit.Delivery], float], stream: str
 ) -> None:
     found, took_s = stored
     assert found[stream].batches_stored <= MOST_PER_S * (took_s + 2)

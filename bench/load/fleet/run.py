@@ -24,8 +24,8 @@ from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
-from iort_station.operations.delivery.audit import headers
+from iort_station.operations import audit
+from iort_station.operations.audit import headers
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
 from testkit import ROOT, machine
@@ -181,7 +181,7 @@ def _summarized(cloud: Cloud, batches: dict[str, int], rate_hz: int) -> int:
             ends = _ends(cloud, name)
             over = time.monotonic() - since > _CATCH_UP_S
             if over or (ends and ends[1] - ends[0] + 1 >= seconds):
-                counted = counts.samples_summarized(cloud, name, VESC_STREAM)
+                counted = audit.samples_summarized(cloud, name, VESC_STREAM)
             if counted >= seconds * rate_hz or over:
                 break
             if looked_at != (counted, ends):

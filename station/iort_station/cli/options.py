@@ -20,7 +20,7 @@ from iort_station.cli import completion
 from iort_station.cli.words import say
 from iort_station.errors import UsageError
 from iort_station.times import duration_us, has_zone, is_clock, time_us
-from iort_station.upkeep.state import VERSION
+from iort_station.upkeep.snapshot import VERSION
 
 Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
 Stream = Annotated[

@@ -9,7 +9,7 @@ from typing import Any
 from iort_station.cloud import Cloud
 from iort_station.cost.usage import Usage
 from iort_station.fleet.roles import transport
-from iort_station.operations.monitoring import cloudwatch
+from iort_station.operations import cloudwatch
 
 _INSIGHTS = re.compile(r'SELECT SUM\((?P<metric>\w+)\) FROM "(?P<namespace>[\w/]+)"')
 

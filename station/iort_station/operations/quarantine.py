@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from enum import Enum
+from functools import partial
+from typing import Any, NamedTuple
 
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.checks import json_object
 from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, decode_item
 from iort_contract.tables import (
+    BATCH,
+    BY_LATER,
     BY_RULE,
+    BY_STREAM,
     ENTRY,
+    ENVELOPE,
     FIRST_MS,
     LAST_MS,
     PAYLOAD,
     REASON,
+    RECEIVED_MS,
+    REPLAY,
     REPLAYS,
     ROBOT,
     SEEN,
     SOURCE,
     TOPIC,
 )
-from iort_contract.topics import as_subscribed
+from iort_contract.topics import RECORD, as_subscribed
 from iort_station.cloud import Cloud
+from iort_station.data.recorded import telemetry_table
 from iort_station.errors import StationError
 
 _HEADER = (SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)
@@ -141,3 +159,199 @@ def _letter(item: Mapping[str, Any]) -> DeadLetter:
         replays=int(values.get(REPLAYS, 0)),
         payload=bytes(values[PAYLOAD]) if PAYLOAD in values else None,
     )
+
+
+# Replays dead letters from the quarantine, and deletes those that have arrived.
+
+# After this many attempts a person must look at it.
+MAX_REPLAYS = 3
+_AT_ONCE = 8
+_CONFIRM_S = 30.0
+_POLL_S = 0.2
+
+
+class Fate(str, Enum):
+    """The result of a replay."""
+
+    REPLAYED = "replayed"
+    WOULD = "would be replayed"
+    FAILED = "failed again"
+    REFUSED = "still refused"
+    GIVEN_UP = "replayed too often"
+    GONE = "no longer there"
+    NOT_FOR_REPLAY = "not replayable"
+
+
+class Outcome(NamedTuple):
+    """A dead letter, its result, and an explanation."""
+
+    letter: DeadLetter
+    fate: Fate
+    detail: str = ""
+
+
+class _NotForReplayError(StationError):
+    """A dead letter that holds no batch."""
+
+
+def replay(
+    cloud: Cloud, letters: Sequence[DeadLetter], *, dry_run: bool = False, again: bool = False
+) -> Iterator[Outcome]:
+    """Replay dead letters, eight at a time.
+
+    A record message whose rule failed is published to that rule again; it has arrived when the table holds
+    its batch. A batch that Lambda 2 refused is given to Lambda 2 again. Then the dead letter is deleted.
+    Each attempt is counted; after `MAX_REPLAYS` there are no more, unless ``again``. Live messages, pings and
+    events are outdated and are not replayed. Batches that were put off go back to their queue.
+    """
+    one = partial(_outcome, cloud, dry_run=dry_run, again=again)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        yield from pool.map(one, letters)
+
+
+def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) -> Outcome:
+    letter = load(cloud, listed)
+    if letter is None:
+        return Outcome(listed, Fate.GONE)
+    batch = None
+    try:
+        _check_kind(letter)
+        if letter.source != BY_LATER:
+            batch = _batch(letter)
+    except _NotForReplayError as error:
+        return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
+    except ContractError as error:
+        return Outcome(listed, Fate.REFUSED, str(error))
+    if letter.replays >= MAX_REPLAYS and not again:
+        return Outcome(letter, Fate.GIVEN_UP, f"{letter.replays} times")
+    if dry_run:
+        return Outcome(letter, Fate.WOULD)
+    try:
+        _count(cloud, letter)
+        if batch is None:
+            problem = _put_off(cloud, letter)
+        elif _is_rules(letter):
+            problem = _publish(cloud, letter, batch)
+        else:
+            problem = _summarize(cloud, letter)
+        if problem:
+            return Outcome(letter, Fate.FAILED, problem)
+        _delete(cloud, letter)
+    except (BotoCoreError, ClientError) as error:
+        return Outcome(letter, Fate.FAILED, str(error))
+    return Outcome(letter, Fate.REPLAYED)
+
+
+def _is_rules(letter: DeadLetter) -> bool:
+    return letter.source.startswith(f"{BY_RULE} ")
+
+
+def _check_kind(letter: DeadLetter) -> None:
+    if letter.source in (BY_STREAM, BY_LATER) and letter.topic:
+        return
+    if not _is_rules(letter) or not letter.topic.startswith(f"{RECORD}/"):
+        raise _NotForReplayError("only batches of the record lane are replayed")
+
+
+def _batch(letter: DeadLetter) -> Batch:
+    """The batch in a dead letter; raises `ContractError`."""
+    # The quarantine cuts items that are too large for it.
+    value = json_object(letter.payload or b"", "message")
+    if letter.source == BY_STREAM:
+        return decode_item(plain(value))[1]
+    item = {name: value[name] for name in ENVELOPE if name in value}
+    return decode_item({**item, TOPIC: letter.topic, RECEIVED_MS: letter.first_ms})[1]
+
+
+def _count(cloud: Cloud, letter: DeadLetter) -> None:
+    cloud.client("dynamodb").update_item(
+        TableName=cloud.output("storage", "QuarantineTable"),
+        Key=key(letter),
+        UpdateExpression="ADD #replays :one",
+        ConditionExpression="attribute_exists(#last)",
+        ExpressionAttributeNames={"#replays": REPLAYS, "#last": LAST_MS},
+        ExpressionAttributeValues={":one": {"N": "1"}},
+    )
+
+
+def _publish(cloud: Cloud, letter: DeadLetter, batch: Batch) -> str:
+    """Publish to the rule and wait for the stored batch; returns the error, or nothing."""
+    if _stored(cloud, letter.topic, batch):
+        return ""
+    rule = letter.source.removeprefix(f"{BY_RULE} ")
+    topic = f"$aws/rules/{rule}/{letter.topic}"
+    cloud.client("iot-data").publish(topic=topic, qos=1, payload=letter.payload or b"")
+    deadline = time.monotonic() + _CONFIRM_S
+    while time.monotonic() < deadline:
+        if _stored(cloud, letter.topic, batch):
+            return ""
+        now = load(cloud, letter)
+        if now and now.seen > letter.seen:
+            return now.reason
+        threading.Event().wait(_POLL_S)
+    return f"not in the telemetry table after {_CONFIRM_S:.0f} s"
+
+
+def _put_off(cloud: Cloud, letter: DeadLetter) -> str:
+    """Send batches that Lambda 2 put off to their queue again; returns the error, or nothing."""
+    queue = cloud.output("processing", "PutOffQueue")
+    body = (letter.payload or b"").decode()
+    cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=body, MessageGroupId=letter.robot)
+    return ""
+
+
+def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
+    return telemetry_table(cloud).get(topic, str(batch.id), attributes=(BATCH,)) is not None
+
+
+def _summarize(cloud: Cloud, letter: DeadLetter) -> str:
+    """Give the item to Lambda 2; returns the error, or nothing."""
+    image: dict[str, Any] = json.loads(letter.payload or b"{}")
+    try:
+        said = summarize(cloud, [image], {REPLAY: True})
+    except StationError as error:
+        return str(error)
+    return "Lambda 2 refuses it; is the current version deployed?" if said["batchItemFailures"] else ""
+
+
+def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[str, Any]) -> dict[str, Any]:
+    """Invoke Lambda 2 with stored items and the further entries of ``event``; returns its answer.
+
+    Raises `StationError` if it fails.
+    """
+    changes = [
+        {
+            "Keys": {name: item[name] for name in (TOPIC, BATCH)},
+            "NewImage": item,
+            "SequenceNumber": str(number),
+        }
+        for number, item in enumerate(items)
+    ]
+    records = [{"eventID": "replay", "eventName": "INSERT", "dynamodb": change} for change in changes]
+    answer = cloud.client("lambda").invoke(
+        FunctionName=cloud.output("processing", "SummarizeFunction"),
+        Payload=json.dumps({**event, "Records": records}).encode(),
+    )
+    said = json.loads(answer["Payload"].read() or b"null")
+    if "FunctionError" in answer:
+        raise StationError(f"Lambda 2 failed: {said.get('errorMessage', said)}")
+    return {"batchItemFailures": [], **said}
+
+
+def _delete(cloud: Cloud, letter: DeadLetter) -> None:
+    """Delete the dead letter, unless the same message was refused again in the meantime.
+
+    Its id stays until it would have expired: a further move must not bring it back.
+    """
+    dynamodb = cloud.client("dynamodb")
+    try:
+        dynamodb.update_item(
+            TableName=cloud.output("storage", "QuarantineTable"),
+            Key=key(letter),
+            UpdateExpression="REMOVE " + ", ".join(f"#{name}" for name in CONTENTS),
+            ConditionExpression=f"#{LAST_MS} = :last",
+            ExpressionAttributeNames={f"#{name}": name for name in CONTENTS},
+            ExpressionAttributeValues={":last": {"N": str(letter.last_ms)}},
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException:
+        return

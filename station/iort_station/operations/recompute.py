@@ -27,7 +27,7 @@ from iort_station.data import inventory, recorded
 from iort_station.data.recorded import Recorded
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
-from iort_station.operations.replay import summarize
+from iort_station.operations.quarantine import summarize
 
 # Lambda 2 caches the old parameters for this long; the margin is for its running invocations.
 SETTLED_S = VEHICLE_CACHE_S + 5

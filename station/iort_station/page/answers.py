@@ -22,7 +22,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import control, registry, robots
 from iort_station.fleet.control import Shadow, State
 from iort_station.fleet.roles import has_drivers
-from iort_station.operations.monitoring import alarms, cloudwatch, cloudwatch_logs
+from iort_station.operations import alarms, cloudwatch
 from iort_station.page import history, insights, motion
 from iort_station.page.page import DRIVE
 from iort_station.page.requests import text, whole
@@ -45,7 +45,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "dashboard": lambda asked: cloudwatch.dashboard(
             cloud, text(asked, "name"), minutes=whole(asked, "minutes", 1, 14 * 24 * 60)
         ),
-        "log": lambda asked: cloudwatch_logs.rows(
+        "log": lambda asked: cloudwatch.rows(
             cloud,
             text(asked, "name"),
             whole(asked, "widget", 0, 500),

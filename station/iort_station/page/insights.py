@@ -36,7 +36,7 @@ from iort_station.data.runs import laps_within
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
-from iort_station.operations.monitoring.alarms import user
+from iort_station.operations.alarms import user
 from iort_station.page.requests import text, whole
 
 # What is shown of a robot, and of each one of the fleet.

@@ -23,7 +23,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry, stopping, viewing
 from iort_station.fleet.roles import Role, has_drivers, transport
-from iort_station.operations.monitoring.alarms import user
+from iort_station.operations.alarms import user
 from iort_station.page.page import load_keys
 from iort_station.page.requests import number, text, whole
 

@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
 from typing import Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS
 from iort_contract.tables import ONLINE
+from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import registry
-from iort_station.operations.monitoring import alarms
-from iort_station.upkeep.finding import FAIL, OK, Finding, graded
+from iort_station.fleet import files, registry
+from iort_station.fleet.files import StoredFile
+from iort_station.operations import alarms, archive
+from iort_station.times import iso_s
+
+# What the doctor says: one line for each thing that it looked at.
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+
+
+class Finding(NamedTuple):
+    """One line; ``todo`` says what to do unless all is well."""
+
+    what: str
+    level: str
+    text: str
+    todo: str = ""
+
+
+def graded(what: str, text: str, todo: str, *, warn: bool, fail: bool = False) -> Finding:
+    """A finding whose level two conditions decide."""
+    return Finding(what, FAIL if fail else WARN if warn else OK, text, todo if warn or fail else "")
+
 
 _MINUTES = 5
 # Summaries later than this are late; a user sees it, and the stream of a table keeps 24 h.
@@ -130,3 +151,62 @@ def _alarms(cloud: Cloud) -> Iterator[Finding]:
     named = ", ".join(raised[:_NAMED]) + (", ..." if len(raised) > _NAMED else "")
     text = f"{len(raised)} raised: {named}" if raised else "none is raised"
     yield graded("alarms", text, "`iort alarms` says what each means, and what to do", warn=bool(raised))
+
+
+# What the doctor finds in everything that is stored: all of it is read and decoded.
+
+# Receives the number of further items or bytes that were read.
+Progress = Callable[[int], None]
+_LOST = "readers leave it out, and say so; an older backup may have it"
+_ARCHIVE = "readers take what the table still has of this hour; an older backup may have it"
+_FILE = "it cannot be fetched; an older backup may have it, or the robot"
+
+
+def topics(cloud: Cloud) -> list[str]:
+    """The topics of all streams: of registered robots, and of removed ones whose recordings are archived."""
+    return sorted({*archive.topics(cloud, None, None), *archive.archived_topics(cloud)})
+
+
+def of_recordings(cloud: Cloud, names: Sequence[str], progress: Progress) -> Iterator[Finding]:
+    """Read these topics' batches in the table, and the hours in the archive. Each that is damaged is a
+    finding; the first ones of a stream are named."""
+    items = hours = damaged = 0
+    for name in names:
+        found = archive.verify(cloud, name, progress)
+        topic = parse_topic(name)
+        what = f"{topic.robot} {topic.name}"
+        items += found.items
+        hours += found.hours
+        damaged += len(found.damaged) + found.refused.count
+        for hour, count in found.lacking.items():
+            yield Finding(
+                what, WARN, f"{count:,} batches of {hour} are in the table only", "`iort archive run`"
+            )
+        for hour, problem in found.damaged.items():
+            yield Finding(what, FAIL, f"in the archive's hour {hour}: {problem}", _ARCHIVE)
+        for one in found.refused.named:
+            yield Finding(what, FAIL, f"cannot be decoded: {one.removeprefix(f'{name} ')}", _LOST)
+        if (more := found.refused.count - len(found.refused.named)) > 0:
+            yield Finding(what, FAIL, f"{more:,} more cannot be decoded", _LOST)
+    if not damaged:
+        text = f"{items:,} items of the table and {hours:,} hours of the archive can be decoded"
+        yield Finding("recordings", OK, text)
+
+
+def of_files(cloud: Cloud, listed: Sequence[StoredFile], progress: Progress) -> Iterator[Finding]:
+    """Read the robots' files, and compare each with the SHA-256 that the robot gave.
+
+    On AWS they are not read: S3 checks their bytes itself, and fetching them costs money.
+    """
+    size = f"{len(listed):,} files, {sum(one.size for one in listed) / 1e9:,.1f} GB"
+    if cloud.endpoint_url is None:
+        yield Finding("files", OK, f"{size}: S3 checks their bytes itself, so they were not fetched")
+        return
+    damaged = 0
+    for one in listed:
+        if problem := files.damage(cloud, one, progress):
+            damaged += 1
+            at = iso_s(one.second * 1_000_000)
+            yield Finding(f"{one.robot} {one.name}", FAIL, f"of {at}, {one.key}: {problem}", _FILE)
+    if not damaged:
+        yield Finding("files", OK, f"{size}, as the robots sent them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 from cryptography import x509
@@ -20,9 +22,84 @@ from iort_station import kept
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.kept import Up
-from iort_station.upkeep import deployment, machine
-from iort_station.upkeep.finding import FAIL, OK, WARN, Finding, graded
-from iort_station.upkeep.state import LAST_BACKUP
+from iort_station.upkeep import deployment
+from iort_station.upkeep.deployment import FAIL, OK, WARN, Finding, graded
+from iort_station.upkeep.snapshot import LAST_BACKUP
+
+# Facts of the machine that keeps a cloud: memory, processes, whether a time server sets its clock.
+
+_PROC = Path("/proc")
+# adjtimex(2): the clock's state without a server of time, and room for its struct.
+_TIME_ERROR, _TIMEX_BYTES = 5, 512
+
+
+class Memory(NamedTuple):
+    """The machine's memory in bytes."""
+
+    total: int
+    available: int
+
+
+def memory() -> Memory | None:
+    """The machine's memory; None where it cannot be told, which is on systems other than Linux."""
+    found = dict(_lines(_PROC / "meminfo"))
+    return Memory(found["MemTotal"], found["MemAvailable"]) if "MemAvailable" in found else None
+
+
+def runs(pid: int) -> bool:
+    """Whether there is such a process."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def family(pid: int) -> list[int]:
+    """A process and those that it started, as far as they run; empty where that cannot be told."""
+    children: dict[int, list[int]] = {}
+    for status in _PROC.glob("[0-9]*/status"):
+        with suppress(OSError):
+            parent = next(line for line in status.read_text().splitlines() if line.startswith("PPid:"))
+            children.setdefault(int(parent.split()[1]), []).append(int(status.parent.name))
+    found = [pid] if (_PROC / str(pid)).exists() else []
+    for one in found:
+        found += children.get(one, [])
+    return found
+
+
+def resident_bytes(pid: int) -> int:
+    """The memory of a process; 0 if it has ended."""
+    return dict(_lines(_PROC / str(pid) / "status")).get("VmRSS", 0)
+
+
+def processor_s(pid: int) -> float:
+    """The processor time of a process so far; 0 if it has ended."""
+    with suppress(OSError):
+        # Behind the name, which may have spaces: "proc_pid_stat(5)".
+        fields = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
+
+
+def clock_is_set() -> bool | None:
+    """Whether the kernel knows that a server of time sets the clock; None where it cannot be told."""
+    try:
+        return bool(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)) != _TIME_ERROR)
+    except (AttributeError, OSError):
+        return None
+
+
+def _lines(path: Path) -> Iterator[tuple[str, int]]:
+    """The sizes of one of the kernel's files, in bytes."""
+    with suppress(OSError):
+        for line in path.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if value.endswith(" kB"):
+                yield name, int(value.split()[0]) * 1024
+
 
 _CONNECT_S = 3.0
 _LOW_BYTES = 5_000_000_000
@@ -45,10 +122,10 @@ def of_kept(folder: Path) -> Iterator[Finding]:
             yield _disk(folder)
         yield _backup(folder)
         return
-    runs = kept.owner(folder) is not None and all(map(machine.runs, up.pids.values()))
+    running = kept.owner(folder) is not None and all(map(runs, up.pids.values()))
     busy = None
-    yield _processes(folder, up, runs=runs)
-    if runs:
+    yield _processes(folder, up, running=running)
+    if running:
         yield _version(up)
         yield from _addresses(up)
         busy = yield from _emulator(up.pids["emulator"])
@@ -57,7 +134,7 @@ def of_kept(folder: Path) -> Iterator[Finding]:
     yield from _certificates(up)
     yield _clock()
     yield _backup(folder)
-    if not runs:
+    if not running:
         return
     full = shutil.disk_usage(folder).free < kept.FLOOR_BYTES
     yield from map(_on_a_full_disk, _deployment(folder, busy)) if full else _deployment(folder, busy)
@@ -87,8 +164,8 @@ def of_cloud(cloud: Cloud) -> Iterator[Finding]:
     yield from deployment.findings(cloud)
 
 
-def _processes(folder: Path, up: Up, *, runs: bool) -> Finding:
-    if not runs:
+def _processes(folder: Path, up: Up, *, running: bool) -> Finding:
+    if not running:
         # A cloud that is stopped removes this file.
         killed = (folder / kept.CLOUD).exists()
         text = "were killed, or the machine was switched off" if killed else "were stopped: no cloud is up"
@@ -170,11 +247,11 @@ def _disk(folder: Path, safe: str = "") -> Finding:
 
 def _emulator(pid: int) -> Generator[Finding, None, float | None]:
     """Memory and load; returns the share of what the machine takes that it has to do."""
-    processes, whole, cores = machine.family(pid), machine.memory(), os.cpu_count() or 1
+    processes, whole, cores = family(pid), memory(), os.cpu_count() or 1
     if not processes or whole is None:
         yield Finding("memory", OK, "this system does not tell it")
         return None
-    ours = sum(map(machine.resident_bytes, processes))
+    ours = sum(map(resident_bytes, processes))
     yield graded(
         "memory",
         f"the emulator has {ours / 1e6:,.0f} MB; {whole.available / 1e9:,.1f} of {whole.total / 1e9:,.1f} GB "
@@ -182,10 +259,10 @@ def _emulator(pid: int) -> Generator[Finding, None, float | None]:
         "`make down`, then `make up`, gives it back and loses nothing; look at this machine's other programs",
         warn=ours > _MOST_OURS * whole.total or whole.available < _LEAST_AVAILABLE * whole.total,
     )
-    began, before = time.monotonic(), {one: machine.processor_s(one) for one in processes}
+    began, before = time.monotonic(), {one: processor_s(one) for one in processes}
     time.sleep(_MEASURED_S)
     passed_s = time.monotonic() - began
-    busy = {one: max(0.0, machine.processor_s(one) - was) / passed_s for one, was in before.items()}
+    busy = {one: max(0.0, processor_s(one) - was) / passed_s for one, was in before.items()}
     # The emulator computes on one core; its functions are processes of their own.
     taken = max(busy[pid], sum(busy.values()) / cores) / _FULL_BUSY
     yield graded(
@@ -212,7 +289,7 @@ def _certificates(up: Up) -> Iterator[Finding]:
 
 
 def _clock() -> Finding:
-    is_set = machine.clock_is_set()
+    is_set = clock_is_set()
     if is_set is None:
         return Finding("clock", OK, "this system does not tell whether a server of time sets it")
     return graded(

@@ -2,8 +2,7 @@
 
 The ledger is a read transaction. Every other file is a hard link: the cloud replaces files and never changes
 them, so a link keeps what it was. The state has files and ledger of the same moment if no file was replaced
-between the links that were made before the transaction began, and those made after.
-"""
+between the links that were made before the transaction began, and those made after."""
 
 from __future__ import annotations
 
@@ -17,8 +16,36 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import NamedTuple
 
+from iort_station import kept
 from iort_station.errors import StationError
-from iort_station.upkeep.state import MADE_ANEW, UNFINISHED
+
+# The state folder of a kept cloud, for those who copy or replace it.
+
+VERSION, LAST_BACKUP = "VERSION", "last-backup.json"
+# A start makes these anew, so no backup has them: addresses, logs, files in use. A robot's
+# files below s3/ may have such names, too.
+MADE_ANEW = (kept.UP, kept.CLOUD, LAST_BACKUP, "tmp", "*.log", "*.log.*", "*.sock", "*-wal", "*-shm")
+# A file that is being written, in any folder.
+UNFINISHED = ".tmp"
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the state folder, as a running cloud does. Raises `StationError` if another process holds it."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with kept.lock_of(folder).open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            lock.seek(0)
+            raise StationError(
+                f"a cloud runs in {folder} (process {lock.read().strip()}): stop it first, with `make down`"
+            ) from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield
+
 
 _FOLDER = ".backup"
 _ATTEMPTS = 20

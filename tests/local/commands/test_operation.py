@@ -20,7 +20,7 @@ from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_contract.messages.requests.files import File, file_key
 from iort_station.data.recorded import topic_of
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import ROOT
 from testkit.waiting import GUARD_S, until
 from tests.local.faults.test_uplink import self_signed, set_status
@@ -188,5 +188,5 @@ def _state(config: Path) -> Any:
 
 
 def _own_samples(embedded: Any, robot: str) -> dict[str, Any] | None:
-    found = list(counts.batches(embedded.cloud, robot, AGENT_STREAM))
+    found = list(audit.batches(embedded.cloud, robot, AGENT_STREAM))
     return dict(found[-1].columns) if found else None

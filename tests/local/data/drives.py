@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from testkit.waiting import GUARD_S, until
@@ -33,7 +33,7 @@ def counter_log(path: Path, seconds: float) -> Path:
 
 def counted(embedded: EmbeddedCloud, robot: str) -> list[int]:
     """Return the counter from the table in order; batches of a run must be numbered in order, too."""
-    batches = list(counts.batches(embedded.cloud, robot, "vesc"))
+    batches = list(audit.batches(embedded.cloud, robot, "vesc"))
     for boot in {batch.boot for batch in batches}:
         seqs = [batch.seq for batch in batches if batch.boot == boot]
         assert seqs == sorted(set(seqs)), "a batch number is repeated or out of order"

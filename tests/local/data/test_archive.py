@@ -16,8 +16,7 @@ from iort_station.cloud import Cloud
 from iort_station.data import bags, export
 from iort_station.data.recorded import telemetry_table, topic_of
 from iort_station.errors import StationError
-from iort_station.operations import archive
-from iort_station.operations.delivery import audit
+from iort_station.operations import archive, audit
 from local.cloud import EmbeddedCloud
 
 HOUR_US, S = 3_600_000_000, 1_000_000

@@ -18,7 +18,7 @@ from iort_contract.ros1.decode import HEADER
 from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from testkit.mqtt import Robot
 from testkit.waiting import until
 from tests.foxglove import flat, opened
@@ -171,7 +171,7 @@ def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, tmp_p
             times = [t_us + seq * 1_000_000 + i for i in range(len(next(iter(columns.values()))))]
             batch = Batch("0badcafe", seq, times, columns)
             assert robot.publish(record_topic(car.robot, "s"), encode_batch(batch)) == "SUCCESS"
-    until(lambda: len(list(counts.items(embedded.cloud, car.robot, "s"))) == batches + 1)
+    until(lambda: len(list(audit.items(embedded.cloud, car.robot, "s"))) == batches + 1)
     path = tmp_path / "s.bag"
     done = iort("export", car.robot, "s", "--last", "all", "-o", str(path), embedded=embedded)
     assert done.returncode == 0, done.stderr

@@ -21,7 +21,7 @@ from iort_station.fleet import registry, robots
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.fleet.viewing import Viewer
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from iort_station.page.listening import listening
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
@@ -70,11 +70,11 @@ def test_a_simulated_drive_arrives_completely_on_both_lanes(cloud, car):
         until(lambda: len(listener.heard) > 10)
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
-    until(lambda: counts.samples_summarized(cloud.cloud, driven_car.robot, "vesc") == driven)
-    found = counts.delivery(cloud.cloud, driven_car.robot, "vesc")
+    until(lambda: audit.samples_summarized(cloud.cloud, driven_car.robot, "vesc") == driven)
+    found = audit.delivery(cloud.cloud, driven_car.robot, "vesc")
     assert (found.samples_stored, found.batches_missing) == (driven, 0)
     assert {heard.robot for heard in listener.heard} == {driven_car.robot}
-    trips = round_trips(counts.batches(cloud.cloud, driven_car.robot, RTT_STREAM))
+    trips = round_trips(audit.batches(cloud.cloud, driven_car.robot, RTT_STREAM))
     assert all(spread.n >= 1 and spread.p50 is not None for spread in trips.values()), trips
 
 

@@ -42,10 +42,10 @@ from iort_station.data import findings
 from iort_station.data.recorded import archive_of, telemetry_table, topic_of
 from iort_station.errors import StationError
 from iort_station.fleet import control, files, identity, registry, robots
-from iort_station.moving import recorded, stored_files
-from iort_station.moving.stored_files import base64_sha256
-from iort_station.operations import archive, quarantine, replay
-from iort_station.operations.delivery import counts
+from iort_station.migration import files as stored_files
+from iort_station.migration import recordings
+from iort_station.migration.files import base64_sha256
+from iort_station.operations import archive, audit, quarantine
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.network.proxy import REFUSE, Proxy
@@ -164,7 +164,7 @@ def test_a_robot_moves_with_everything_that_it_has_recorded(
     bundles = ("--bundles", str(tmp_path / "new"))
     parts = (
         (robots, "write_bundle", broken),
-        (recorded, "write", broken),
+        (recordings, "write", broken),
         (stored_files, "base64_sha256", hashed),
     )
     for module, name, instead in parts:
@@ -256,7 +256,7 @@ def test_a_robot_moves_with_everything_that_is_known_of_it(
     assert findings.notes(target, robot) == [note]
     kept, replayed = sorted(quarantine.entries(target, robot=robot), key=lambda one: one.id)
     assert quarantine.load(target, kept) == quarantine.load(source, kept)
-    assert [one.fate for one in replay.replay(target, [replayed])] == [replay.Fate.REPLAYED]
+    assert [one.fate for one in quarantine.replay(target, [replayed])] == [quarantine.Fate.REPLAYED]
     assert desired() == {"live.rate_hz": 5.0, "motion.stopped": True}
     # Until the robot is there, changes follow.
     registry.set_vehicle(source, robot, {"speed_to_erpm_gain": 5000.0})
@@ -319,13 +319,13 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
         robots.configure(car, {"port": proxy.port})
         # What is left when it ends stays in the queue.
         with running(car, drain_s=1) as agent:
-            until(lambda: len(list(counts.batches(source, robot, STREAM))) >= 2)
+            until(lambda: len(list(audit.batches(source, robot, STREAM))) >= 2)
             proxy.mode = REFUSE
             # These stay in the queue on the robot's disk.
             until(lambda: agent.told()["spool"]["batches"] >= 6)
             agent.stop()
             agent.process.wait()
-    there = {(batch.boot, batch.seq) for batch in counts.batches(source, robot, STREAM)}
+    there = {(batch.boot, batch.seq) for batch in audit.batches(source, robot, STREAM)}
     boots = {boot for boot, _ in there}
     if way == "bundle":
         done = iort(embedded, *move_, "--bundles", str(tmp_path / "new"))
@@ -343,7 +343,7 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     assert done.exit_code == 0, done.stdout
     with running(car) as agent:
-        until(lambda: {batch.boot for batch in counts.batches(target, robot, STREAM)} - boots)
+        until(lambda: {batch.boot for batch in audit.batches(target, robot, STREAM)} - boots)
         agent.stop()
         agent.report()
     done = iort(embedded, *move_)
@@ -354,7 +354,7 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     # Neither side has a gap, and the target has the whole of both runs.
     old, new = (audited(side, robot) for side in (embedded, other))
     assert (old["missing"], new["missing"], new["complete"]) == (0, 0, True)
-    first = {batch.seq for batch in counts.batches(target, robot, STREAM) if batch.boot in boots}
+    first = {batch.seq for batch in audit.batches(target, robot, STREAM) if batch.boot in boots}
     assert first == set(range(len(first)))
     assert len(first) > len(there)
 

@@ -14,7 +14,7 @@ from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS, LIVE_MAX_AGE_MS
 from iort_contract.tables import STATS
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from iort_station.page.pubnub import Listener
 from local.cloud import EmbeddedCloud
 from testkit.waiting import until
@@ -40,7 +40,7 @@ def test_a_recorded_drive_arrives_completely_and_exactly(embedded, bundle):
         live={"enabled": False},
     )
     run_agent(car)
-    stored = list(counts.batches(embedded.cloud, car.robot, "vesc"))
+    stored = list(audit.batches(embedded.cloud, car.robot, "vesc"))
     assert sum(len(batch.times_us) for batch in stored) == 2244
     with AnyReader([path]) as reader:
         connections = [c for c in reader.connections if c.topic == "/sensors/core"]
@@ -48,13 +48,13 @@ def test_a_recorded_drive_arrives_completely_and_exactly(embedded, bundle):
     for field in (name for name, f in VESC_FIELDS.items() if 1 in f.ros):
         kept = [value for batch in stored for value in batch.columns[field]]
         assert kept == [getattr(state, field) for state in sent], field
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
 
 
 def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20, "duration_s": 2}])
     run_agent(car)
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
     topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
     items = embedded.cloud.client("dynamodb").query(
         TableName=embedded.cloud.output("storage", "SummaryTable"),

@@ -13,8 +13,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.fleet import registry
-from iort_station.operations import recompute
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit, recompute
 from iort_station.operations.recompute import Recomputed
 from testkit.mqtt import Robot
 from testkit.waiting import until
@@ -33,7 +32,7 @@ def drive(embedded, car, stream="vesc"):
             batch = Batch(RUN, i, times, {"speed": [1060.0 * i] * 10, "duty_cycle": [0.1 * i] * 10})
             topic = record_topic(car.robot, stream)
             assert robot.publish(topic, encode_batch(batch)) == "SUCCESS"
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, stream) == 10 * SECONDS)
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, stream) == 10 * SECONDS)
     return start_us
 
 

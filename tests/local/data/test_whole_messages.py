@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from testkit.ros1_types import Message, header
 from tests.local.conftest import run_agent
@@ -59,7 +59,7 @@ def test_a_recording_played_twice_is_stored_twice(
     for _ in range(2):
         assert run_agent(car)["streams"]["count"]["samples"] == COUNT
     runs: Counter[str] = Counter()
-    for batch in counts.batches(embedded.cloud, car.robot, "count"):
+    for batch in audit.batches(embedded.cloud, car.robot, "count"):
         runs[batch.boot] += len(batch.times_us)
     assert sorted(runs.values()) == [COUNT, COUNT]
 

@@ -21,7 +21,7 @@ import pytest
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.fleet import identity, robots
-from iort_station.operations.delivery import accounts, audit, counts
+from iort_station.operations import accounts, audit
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
 from testkit.waiting import GUARD_S, until
@@ -115,7 +115,7 @@ def test_a_network_fault_loses_no_sample(embedded, drives, name):
     assert counted(embedded, robot) == list(range(DRIVE_S * RATE_HZ))
     assert report["spool"]["dropped_samples"] == 0
     assert report["streams"]["vesc"]["samples"] == DRIVE_S * RATE_HZ
-    until(lambda: counts.samples_summarized(embedded.cloud, robot, "vesc") == DRIVE_S * RATE_HZ)
+    until(lambda: audit.samples_summarized(embedded.cloud, robot, "vesc") == DRIVE_S * RATE_HZ)
     if name != "slow":
         assert agent.said("connected to")
 
@@ -217,18 +217,18 @@ def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
         },
     )
-    until(lambda: list(counts.batches(embedded.cloud, car.robot, "vesc")))
+    until(lambda: list(audit.batches(embedded.cloud, car.robot, "vesc")))
     clock.write_text("-1h")
 
     def offsets_ms():
-        own = counts.batches(embedded.cloud, car.robot, AGENT_STREAM)
+        own = audit.batches(embedded.cloud, car.robot, AGENT_STREAM)
         return [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
 
     # The clock is really set, and the car measures the change.
     until(lambda: max(offsets_ms(), default=0) > 3_590_000)
     agent.stop()
     report = agent.report()
-    batches = list(counts.batches(embedded.cloud, car.robot, "vesc"))
+    batches = list(audit.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(report["streams"]["vesc"]["samples"]))
     assert report["spool"]["left_samples"] == 0
@@ -303,7 +303,7 @@ def test_a_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage)
     assert report["spool"]["dropped_samples"] == sum(samples for _, samples, _ in lost[:known])
 
     # The table has everything else in order, and each missing number was lost.
-    batches = list(counts.batches(embedded.cloud, car.robot, "vesc"))
+    batches = list(audit.batches(embedded.cloud, car.robot, "vesc"))
     stored = [(batch.seq, len(batch.times_us)) for batch in batches]
     assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
     found = counted(embedded, car.robot)[sum(samples for _, samples, _ in kept) :]
@@ -321,7 +321,7 @@ def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
     agent = Agent(car)
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, "vesc"))
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, "vesc"))
     # The revocation also ends the session; on AWS, within minutes.
     set_status(embedded, car.robot, "REVOKED")
     until(lambda: agent.said("inactive or revoked"))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from testkit.waiting import until
 from tests.ros.conftest import Graph, graph, ros_python  # noqa: F401 - fixtures
@@ -58,7 +58,7 @@ def test_a_restart_of_the_ros_master_loses_no_sample(
 
     streams = json.loads(written.read_text())["streams"]
     for stream, start in (("wheel", 0), ("other", LATER)):
-        batches = list(counts.batches(embedded.cloud, car.robot, stream))
+        batches = list(audit.batches(embedded.cloud, car.robot, stream))
         assert [batch.seq for batch in batches] == list(range(len(batches)))
         found = [value for batch in batches for value in batch.columns["turns"]]
         assert found == list(range(start, start + streams[stream]["samples"]))

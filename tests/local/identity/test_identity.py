@@ -15,7 +15,7 @@ import yaml
 from iort_contract.cloud import claim_name
 from iort_contract.tables import ROBOT
 from iort_station.fleet import identity, robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import ROOT
 from testkit.mqtt import WAIT_S, Robot
 from testkit.waiting import GUARD_S, until
@@ -48,7 +48,7 @@ def test_a_claim_provisions_a_robot_that_drives(embedded, tmp_path):
     assert any(row[ROBOT] == "claimed" for row in robots.listed(embedded.cloud))
     robots.configure(bundle, {"sources": [{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 1}]})
     run_agent(bundle)
-    until(lambda: counts.delivery(embedded.cloud, "claimed", "vesc").samples_stored == 50)
+    until(lambda: audit.delivery(embedded.cloud, "claimed", "vesc").samples_stored == 50)
     robots.remove(embedded.cloud, "claimed")
 
 
@@ -162,7 +162,7 @@ def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_pat
             agent.terminate()
             assert agent.wait(GUARD_S) == 0
     sent = json.loads(report.read_text())["streams"]["vesc"]["samples"]
-    until(lambda: counts.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
+    until(lambda: audit.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
 
 
 def _connected(config: Path) -> bool:

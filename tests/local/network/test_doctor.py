@@ -9,7 +9,7 @@ import pytest
 from iort_station import kept
 from iort_station.page.background import BackgroundServer
 from iort_station.upkeep import doctor
-from iort_station.upkeep.finding import FAIL, OK, WARN
+from iort_station.upkeep.deployment import FAIL, OK, WARN
 from local.network.certificates import Authority, ServerCertificate
 
 HOST = "127.0.0.1"

@@ -12,7 +12,7 @@ from iort_contract.messages.batch import Batch, batch_id, encode_batch
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cli.main import app
-from iort_station.operations.delivery import audit
+from iort_station.operations import audit
 from testkit.mqtt import Robot
 from testkit.waiting import until
 from tests.local.conftest import run_agent

@@ -11,7 +11,8 @@ from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, ME
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
-from iort_station.operations.monitoring import cloudwatch, cloudwatch_logs
+from iort_station.operations import cloudwatch
+from iort_station.operations import cloudwatch as cloudwatch_logs
 from local.emulator import first_calls
 from testkit.mqtt import Robot
 from testkit.waiting import until

@@ -18,8 +18,7 @@ from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_t
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.data.recorded import summary_table, topic_of
-from iort_station.operations import quarantine
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit, quarantine
 from testkit.mqtt import Robot
 from testkit.waiting import until
 
@@ -117,7 +116,7 @@ def test_a_stored_batch_that_lambda_2_cannot_read_is_kept(bundle, entry_of, chan
 def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, entry_of):
     car = bundle()
     send(car, batch(0), batch(1, samples="AAAA"), batch(2))
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2)
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2)
     assert json.loads(entry_of(car.robot).payload)["batch"]["S"].endswith("-1")
 
 
@@ -181,10 +180,10 @@ def test_a_throttled_batch_is_put_back_once_and_then_deleted(embedded, bundle, i
     entry_of(car.robot)
     dry = iort("replay-errors", "--robot", car.robot, "--dry-run")
     assert "1 would be replayed" in dry.stdout
-    assert counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 0
+    assert audit.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 0
     done = iort("replay-errors", "--robot", car.robot)
     assert (done.exit_code, "1 replayed" in done.stdout) == (0, True), done.output
-    until(lambda: counts.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1)
+    until(lambda: audit.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1)
     assert list(quarantine.entries(embedded.cloud, robot=car.robot)) == []
     assert "nothing in quarantine" in iort("replay-errors", "--robot", car.robot).stdout
 
@@ -215,10 +214,10 @@ def test_a_batch_that_fails_in_lambda_2_is_quarantined_and_put_back(embedded, bu
         assert entry_of(car.robot).replays == 1
     finally:
         client.update_function_configuration(FunctionName=name, Environment={"Variables": right})
-    assert counts.samples_summarized(cloud, car.robot, VESC_STREAM) == 0
+    assert audit.samples_summarized(cloud, car.robot, VESC_STREAM) == 0
     done = iort("replay-errors", "--robot", car.robot)
     assert "1 replayed" in done.stdout, done.output
-    assert counts.samples_summarized(cloud, car.robot, VESC_STREAM) == 1
+    assert audit.samples_summarized(cloud, car.robot, VESC_STREAM) == 1
     assert list(quarantine.entries(cloud, robot=car.robot)) == []
 
 

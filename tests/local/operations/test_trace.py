@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from iort_station.operations.delivery import trace
+from iort_station.operations import trace
 from local.deployment import ROOT
 from testkit.waiting import GUARD_S, until
 from tests.local.data.drives import Agent

@@ -13,7 +13,7 @@ from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.fleet.control import slept
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from iort_station.page import answers
 from testkit.waiting import until
 from tests.local.robots.test_shadow import driving
@@ -109,7 +109,7 @@ def test_a_simulated_car_obeys_a_command_and_its_log_lines_are_recorded(iort, bu
     asked = ("send", car.robot, "drive", '{"drive": {"speed": -1.0}}', "--lease-ms", "3000")
 
     def recorded(stream, field):
-        batches = counts.batches(embedded.cloud, car.robot, stream)
+        batches = audit.batches(embedded.cloud, car.robot, stream)
         return [value for batch in batches for value in batch.columns[field]]
 
     with driving(car):

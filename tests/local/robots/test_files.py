@@ -40,7 +40,7 @@ from iort_contract.messages.requests.files import (
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
 from iort_station.fleet import files, robots
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.deployment import ROOT
 from testkit.mqtt import Robot
 from testkit.waiting import GUARD_S, until
@@ -153,7 +153,7 @@ def test_pictures_of_a_recording_are_uploaded_as_attachments(embedded, bundle, b
     agent = Agent(car)
     report = agent.report()
     columns: dict[str, list[Any]] = {}
-    for batch in counts.batches(embedded.cloud, car.robot, "camera"):
+    for batch in audit.batches(embedded.cloud, car.robot, "camera"):
         for name, values in batch.columns.items():
             columns.setdefault(name, []).extend(values)
     assert columns["format"] == ["jpeg"] * 4

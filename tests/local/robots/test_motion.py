@@ -16,7 +16,7 @@ from typing import Any
 from iort_contract.messages.control.shadow import decode_reported
 from iort_station import data
 from iort_station.cloud import EMBEDDED
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.demo.run import DOWNLINK
 from testkit.waiting import until
 from tests.local.robots.test_shadow import Shadow, driving
@@ -47,7 +47,7 @@ def test_a_car_is_driven_stopped_and_released_and_the_stop_outlives_the_agent(em
         until(lambda: "emergency stop" in str(send().exception))
         until(lambda: iort("stop", robot, "--release").stdout == f"{robot}: released\n")
         until(lambda: "has accepted drive" in send().output)
-    until(lambda: list(counts.batches(embedded.cloud, robot, "drive")))
+    until(lambda: list(audit.batches(embedded.cloud, robot, "drive")))
     told = data.query(embedded.cloud, robot, "drive", "-1h", "now")
     outcomes = list(told.columns["outcome"])
     assert {"accepted", "stopped", "emergency_stop"} <= set(outcomes)
@@ -93,7 +93,7 @@ def test_a_car_is_driven_by_keys_and_stops_when_the_terminal_freezes(embedded, b
             until(lambda: terminal.hold("w", "you drive"))
             until(lambda: terminal.hold("w", "+0.50 m/s"))
             terminal.process.send_signal(signal.SIGSTOP)
-            until(lambda: list(counts.batches(embedded.cloud, car.robot, "drive")))
+            until(lambda: list(audit.batches(embedded.cloud, car.robot, "drive")))
             told = until(lambda: ended_while_driving(embedded, car.robot))
         finally:
             terminal.close()

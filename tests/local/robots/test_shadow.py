@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from iort_contract.topics import SHADOW
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from local.cloud import ROOT
 from testkit.waiting import GUARD_S, until
 
@@ -56,7 +56,7 @@ def test_settings_take_effect_and_invalid_ones_are_rejected_with_the_reason(embe
         until(
             lambda: (
                 {"speed", "voltage_input"}
-                in [set(batch.columns) for batch in counts.batches(embedded.cloud, car.robot, "vesc")]
+                in [set(batch.columns) for batch in audit.batches(embedded.cloud, car.robot, "vesc")]
             )
         )
         shadow.request(live={"rate_hz": 50}, fields={"vesc": ["sped"]})
@@ -82,4 +82,4 @@ def test_settings_made_while_the_agent_was_off_take_effect_at_its_start(embedded
         shadow.request(record={"enabled": None})
         until(lambda: shadow.reported().get("record") == {"enabled": True})
         assert shadow.reported()["ping"] == {"rate_hz": 5}
-        until(lambda: list(counts.batches(embedded.cloud, car.robot, "rtt")))
+        until(lambda: list(audit.batches(embedded.cloud, car.robot, "rtt")))

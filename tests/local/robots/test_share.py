@@ -16,7 +16,7 @@ from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import control
-from iort_station.operations.delivery import counts
+from iort_station.operations import audit
 from testkit.mqtt import Robot
 from testkit.waiting import until
 from testkit.worst_case import worst_batches
@@ -57,7 +57,7 @@ def test_expensive_batches_of_one_robot_do_not_delay_other_robots(embedded, bund
     assert control.over_share(embedded.cloud, good.robot) is None
     shown = json.loads(iort("robots", "show", bad.robot, "--json").stdout)
     assert shown[OVER_SHARE]["batches"] >= over.batches
-    stored = list(counts.batches(embedded.cloud, bad.robot, VESC_STREAM))
+    stored = list(audit.batches(embedded.cloud, bad.robot, VESC_STREAM))
     assert [batch.seq for batch in stored] == list(range(count))
     # After the robot has stopped, the waiting batches are summarised automatically.
     until(lambda: len(seconds_of(embedded, bad.robot)) >= count, seconds=600)

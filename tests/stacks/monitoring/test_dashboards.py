@@ -21,7 +21,7 @@ from iort_station.cost.bill.fixed_costs import (
     dashboard_metrics,
 )
 from iort_station.cost.usage import Usage
-from iort_station.operations.monitoring import cloudwatch
+from iort_station.operations import cloudwatch
 from stacks.settings import ROOT
 from tests.stacks.monitoring.aws_metrics import AWS_METRICS
 

@@ -76,7 +76,7 @@ def test_the_projects_expressions_are_found():
         "functions/shared/tables.py",
         "contract/iort_contract/dynamodb.py",
         "station/iort_station/fleet/registry.py",
-        "station/iort_station/operations/replay.py",
+        "station/iort_station/operations/quarantine.py",
     }
 
 

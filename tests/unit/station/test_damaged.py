@@ -24,7 +24,7 @@ from iort_contract.messages.analysis.run import AnalysisRequest
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import BATCH, RECOMPUTE_FROM_S, TOPIC
 from iort_station import data
-from iort_station.operations.delivery import audit
+from iort_station.operations import audit
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
 from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of

@@ -12,7 +12,7 @@ from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.messages.page import AlarmEntry
 from iort_contract.topics import LIVE, build_topic
-from iort_station.operations.monitoring import alarms
+from iort_station.operations import alarms
 from testkit.mqtt import Robot
 from testkit.target import Target
 from testkit.waiting import InstrumentError, until
@@ -93,7 +93,7 @@ def set_state(target: Target) -> Seen:
     "alarms.acknowledged",
     expected={"by": _BY, "kept": True},
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_TagResource.html",
-    relied_on_by=("station/iort_station/operations/monitoring/alarms.py",),
+    relied_on_by=("station/iort_station/operations/alarms.py",),
 )
 def acknowledged(target: Target) -> Seen:
     """A raised alarm takes a tag that says who has seen it and when, and keeps it."""

@@ -9,8 +9,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_contract.topics import rule_name
-from iort_station.operations.delivery import counts
-from iort_station.operations.replay import replay
+from iort_station.operations import audit
+from iort_station.operations.quarantine import replay
 from testkit.target import Target
 from testkit.waiting import until
 from verify.question import Seen, question
@@ -18,7 +18,7 @@ from verify.tools.telemetry import batch, listed, only_entry, send, topic
 
 
 def _summarized(target: Target, robot: str) -> int:
-    return counts.samples_summarized(target.cloud, robot, VESC_STREAM)
+    return audit.samples_summarized(target.cloud, robot, VESC_STREAM)
 
 
 @question(
@@ -52,7 +52,7 @@ def refused_batch(target: Target) -> Seen:
     "quarantine.replayed",
     expected={"before": 0, "fate": "replayed", "summarized": 1, "left": 0},
     source="https://docs.aws.amazon.com/iot/latest/developerguide/iot-basic-ingest.html",
-    relied_on_by=("station/iort_station/operations/replay.py", "functions/quarantine.py"),
+    relied_on_by=("station/iort_station/operations/quarantine.py", "functions/quarantine.py"),
 )
 def replayed(target: Target) -> Seen:
     """A batch in quarantine is published again to its rule alone, by Basic Ingest; it is then in the

@@ -12,7 +12,7 @@ from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
 from iort_station.data.recorded import summary_table
 from iort_station.fleet import control
-from iort_station.operations.replay import replay
+from iort_station.operations.quarantine import replay
 from testkit.target import Target, temporary_function
 from testkit.waiting import until
 from testkit.worst_case import worst_batches

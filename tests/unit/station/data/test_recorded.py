@@ -32,11 +32,11 @@ from iort_station.cli.main import app
 from iort_station.data import tabular
 from iort_station.data.runs import overview, runs
 from iort_station.errors import StationError
-from iort_station.operations.delivery import accounts, audit
+from iort_station.operations import accounts, audit
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
-from iort_station.upkeep import deep
-from iort_station.upkeep.finding import FAIL
+from iort_station.upkeep import deployment
+from iort_station.upkeep.deployment import FAIL
 from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_message
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
@@ -420,7 +420,7 @@ def test_a_changed_byte_of_a_stored_batch_is_named_by_every_verb(monkeypatch, be
 def deeply(cloud):
     """What the doctor's deep look says is damaged, and how many items it has read."""
     items = []
-    found = deep.of_recordings(cloud, deep.topics(cloud), items.append)
+    found = deployment.of_recordings(cloud, deployment.topics(cloud), items.append)
     return [(one.what, one.text) for one in found if one.level == FAIL], sum(items)
 
 

@@ -20,7 +20,7 @@ from iort_station.cli.verbs.fleet.robots import commands as robots
 from iort_station.cli.verbs.fleet.stop import commands
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
-from iort_station.operations.monitoring.alarms import user
+from iort_station.operations.alarms import user
 from iort_station.page import answers, motion
 from testkit.waiting import GUARD_S
 

@@ -10,7 +10,7 @@ import pytest
 
 from iort_contract.catalog.metrics import METRICS
 from iort_station.errors import StationError
-from iort_station.operations.monitoring import alarms
+from iort_station.operations import alarms
 from testkit.dynamodb import ROBOTS, serialize
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 

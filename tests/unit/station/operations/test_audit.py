@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.messages.batch import Batch, BatchId
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.delivery.audit import audit, last_figures
+from iort_station.operations.audit import audit, last_figures
 from testkit.dynamodb import TELEMETRY, item_of
 from tests.unit.station.data.test_queries import cloud_of
 

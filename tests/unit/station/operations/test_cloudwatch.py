@@ -10,7 +10,7 @@ import boto3
 import pytest
 
 from iort_station.errors import StationError
-from iort_station.operations.monitoring import cloudwatch
+from iort_station.operations import cloudwatch
 
 NOW_S = 1_700_000_000
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from iort_station.errors import StationError
-from iort_station.operations.monitoring import cloudwatch_logs
-from iort_station.operations.monitoring.log_records import readable
+from iort_station.operations import cloudwatch
+from iort_station.operations.cloudwatch import readable
 
 NOW_S = 1_700_000_000
 NAME = "iort-platform"
@@ -49,7 +49,7 @@ def row(**cells: str) -> list[dict[str, str]]:
 def test_the_widgets_own_query_is_sent_for_its_log_groups() -> None:
     found = [row(timestamp="t1", message="one", ptr="x"), row(message="x" * 5000, log="1:a", ptr="y")]
     cloud = Insights({"status": "Scheduled"}, {"status": "Running"}, {"status": "Complete", "results": found})
-    told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
+    told = cloudwatch.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
     assert cloud.asked == {
         "logGroupNames": ["/aws/lambda/a", "b"],
         "queryString": "fields @timestamp, @message\n| filter @message like /a|b/",
@@ -58,7 +58,7 @@ def test_the_widgets_own_query_is_sent_for_its_log_groups() -> None:
     }
     # Columns are in their order of appearance; a missing cell is empty, and long cells are cut.
     assert told["columns"] == ["@timestamp", "@message", "@log"]
-    assert told["rows"] == [["t1", "one", ""], ["", "x" * cloudwatch_logs.MAX_TEXT, "1:a"]]
+    assert told["rows"] == [["t1", "one", ""], ["", "x" * cloudwatch.MAX_TEXT, "1:a"]]
     assert (told["found"], told["from_s"], told["to_s"]) == (2, NOW_S - 900, NOW_S)
 
 
@@ -103,35 +103,33 @@ def test_the_first_line_of_a_json_record_is_what_happened() -> None:
 
 def test_rows_over_the_limit_are_counted_and_left_out() -> None:
     cloud = Insights({"status": "Complete", "results": [row(message=str(i)) for i in range(250)]})
-    told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
-    assert (len(told["rows"]), told["found"]) == (cloudwatch_logs.MAX_ROWS, 250)
+    told = cloudwatch.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
+    assert (len(told["rows"]), told["found"]) == (cloudwatch.MAX_ROWS, 250)
 
 
 def test_a_query_keeps_its_own_query_language() -> None:
     cloud = Insights({"status": "Complete"}, queryLanguage="PPL")
-    assert cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)["rows"] == []
+    assert cloudwatch.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)["rows"] == []
     assert cloud.asked["queryLanguage"] == "PPL"
 
 
 @pytest.mark.parametrize("status", ["Failed", "Cancelled", "Timeout"])
 def test_a_failed_query_is_an_error(status: str) -> None:
     with pytest.raises(StationError, match=f"ended the query: {status.lower()}"):
-        cloudwatch_logs.rows(Insights({"status": status}), NAME, 1, minutes=15)
+        cloudwatch.rows(Insights({"status": status}), NAME, 1, minutes=15)
 
 
 def test_only_log_widgets_that_name_log_groups_can_be_queried() -> None:
     for number in (0, 2):
         with pytest.raises(StationError, match="not a log widget"):
-            cloudwatch_logs.rows(Insights(), NAME, number, minutes=15)
+            cloudwatch.rows(Insights(), NAME, number, minutes=15)
     with pytest.raises(StationError, match="must name a log group"):
-        cloudwatch_logs.rows(
-            Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), NAME, 1, minutes=15
-        )
+        cloudwatch.rows(Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), NAME, 1, minutes=15)
 
 
 @pytest.mark.parametrize("name", ["billing", "iort", "iort2-platform", "IORT-platform"])
 def test_the_logs_of_another_deployments_dashboard_are_not_queried(name: str) -> None:
     cloud = Insights({"status": "Complete"})
     with pytest.raises(StationError, match="another deployment's"):
-        cloudwatch_logs.rows(cloud, name, 1, minutes=15)
+        cloudwatch.rows(cloud, name, 1, minutes=15)
     assert not cloud.asked

@@ -21,7 +21,7 @@ from iort_contract.messages.control.commands import (
     encode_fleet,
 )
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
-from iort_station.operations.delivery.audit import audit
+from iort_station.operations.audit import audit
 from testkit.dynamodb import item_of, serialize
 
 T_US = 1_700_000_000_000_000

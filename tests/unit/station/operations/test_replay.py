@@ -10,8 +10,7 @@ import pytest
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.quarantine import DeadLetter
-from iort_station.operations.replay import Fate, replay
+from iort_station.operations.quarantine import DeadLetter, Fate, replay
 from testkit.dynamodb import item_of
 
 TOPIC = build_topic(RECORD, "car", "vesc")

@@ -19,9 +19,8 @@ import pytest
 
 from iort_station.errors import StationError
 from iort_station.upkeep import backup
-from iort_station.upkeep.backup import back_up
-from iort_station.upkeep.restore import restore, verify
-from iort_station.upkeep.state import held
+from iort_station.upkeep.backup import back_up, restore, verify
+from iort_station.upkeep.snapshot import held
 
 # As the cloud does it: a file is whole before the ledger names it.
 WRITER = """
@@ -222,8 +221,9 @@ def test_a_backup_of_another_format_or_with_a_broken_database_is_not_restored(
         backup._write(archive, files, 0.0, lambda _bytes: None)
     with pytest.raises(StationError, match=r"database ledger\.db is damaged"):
         restore(tmp_path / "cloud.tar", tmp_path / "restored")
-    monkeypatch.setattr(backup, "FORMAT", 2)
-    back_up(state, tmp_path / "newer.tar")
+    with monkeypatch.context() as later:
+        later.setattr(backup, "FORMAT", 2)
+        back_up(state, tmp_path / "newer.tar")
     with pytest.raises(StationError, match="must have format 1, got 2"):
         restore(tmp_path / "newer.tar", tmp_path / "restored")
     assert not (tmp_path / "restored").exists()

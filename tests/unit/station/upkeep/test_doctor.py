@@ -18,9 +18,9 @@ import pytest
 
 from iort_station import kept
 from iort_station.errors import StationError
-from iort_station.upkeep import deployment, doctor, machine
-from iort_station.upkeep.finding import FAIL, OK, WARN
-from iort_station.upkeep.state import LAST_BACKUP, held
+from iort_station.upkeep import deployment, doctor
+from iort_station.upkeep.deployment import FAIL, OK, WARN
+from iort_station.upkeep.snapshot import LAST_BACKUP, held
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 DAY_S = 86_400
@@ -179,16 +179,14 @@ def test_a_load_is_told_before_summaries_fall_behind(monkeypatch, robots, level)
     monkeypatch.setattr(doctor.time, "sleep", lambda _s: None)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     told = {pid: iter([0.0, seconds]) for pid, seconds in spent_s.items()}
-    monkeypatch.setattr(
-        doctor,
-        "machine",
-        SimpleNamespace(
-            family=lambda _pid: [1, 2],
-            memory=lambda: SimpleNamespace(total=24e9, available=20e9),
-            resident_bytes=lambda _pid: 1e8,
-            processor_s=lambda pid: next(told[pid]),
-        ),
-    )
+    facts = {
+        "family": lambda _pid: [1, 2],
+        "memory": lambda: SimpleNamespace(total=24e9, available=20e9),
+        "resident_bytes": lambda _pid: 1e8,
+        "processor_s": lambda pid: next(told[pid]),
+    }
+    for name, fact in facts.items():
+        monkeypatch.setattr(doctor, name, fact)
     found = looked(doctor._emulator(1))
     assert found["load"].level == level
 
@@ -202,15 +200,15 @@ def test_the_facts_of_a_process_and_of_its_children():
     command = [sys.executable, "-c", f"{code}; input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
-        assert {os.getpid(), child.pid} <= set(machine.family(os.getpid()))
-        assert machine.resident_bytes(child.pid) > 50_000_000
-        assert machine.processor_s(child.pid) >= 0.08
+        assert {os.getpid(), child.pid} <= set(doctor.family(os.getpid()))
+        assert doctor.resident_bytes(child.pid) > 50_000_000
+        assert doctor.processor_s(child.pid) >= 0.08
         child.communicate(b"\n")
-    assert machine.family(child.pid) == []
-    assert machine.resident_bytes(child.pid) == machine.processor_s(child.pid) == 0
-    assert not machine.runs(child.pid)
-    assert machine.memory().total > machine.memory().available > 0
-    assert machine.clock_is_set() in (True, False)
+    assert doctor.family(child.pid) == []
+    assert doctor.resident_bytes(child.pid) == doctor.processor_s(child.pid) == 0
+    assert not doctor.runs(child.pid)
+    assert doctor.memory().total > doctor.memory().available > 0
+    assert doctor.clock_is_set() in (True, False)
 
 
 @pytest.mark.parametrize(("told", "level"), [(6, OK), (8, WARN), ("{", WARN)])

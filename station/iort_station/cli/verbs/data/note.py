@@ -14,7 +14,7 @@ from iort_station.cli.words import examples, say
 from iort_station.data import findings as stored
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
-from iort_station.operations.monitoring.alarms import user
+from iort_station.operations.alarms import user
 from iort_station.times import iso_s, stamped, time_us
 
 commands = typer.Typer()

@@ -17,7 +17,7 @@ from iort_station.times import between, between_hours, iso, iso_s
 
 if TYPE_CHECKING:
     from iort_analysis.archive.stored import Origin
-    from iort_station.operations.delivery.audit import Missing
+    from iort_station.operations.audit import Missing
 
 commands = typer.Typer()
 # The missing batches of a run and stream.
@@ -81,7 +81,7 @@ def _of(found: list[Run], origin: Origin) -> Origin:
 
 
 def _gaps(cloud: Cloud, robot: str, run: Run, origin: Origin) -> Gaps:
-    from iort_station.operations.delivery import audit  # noqa: PLC0415 - as above
+    from iort_station.operations import audit  # noqa: PLC0415 - as above
 
     return {
         (run["run"], stream): one.missing

@@ -28,7 +28,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry, stopping
 from iort_station.fleet.stopping import Motion
-from iort_station.operations.monitoring import alarms
+from iort_station.operations import alarms
 from iort_station.times import iso_s
 
 commands = typer.Typer()

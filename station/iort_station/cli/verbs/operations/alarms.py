@@ -13,7 +13,7 @@ from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples, say
 from iort_station.errors import StationError
-from iort_station.operations.monitoring import alarms
+from iort_station.operations import alarms
 from iort_station.times import iso_s, stamped
 
 commands = typer.Typer()

@@ -24,7 +24,7 @@ from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
     from iort_station.cloud import Cloud
-    from iort_station.operations.delivery.audit import Audit, RunAudit
+    from iort_station.operations.audit import Audit, RunAudit
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -102,7 +102,7 @@ class _Audited(NamedTuple):
 
     def hashed(self, cloud: Cloud, robot: str, within: Range) -> _Audited:
         """With the hashes of each stream's runs."""
-        from iort_station.operations.delivery import contents  # noqa: PLC0415 - numpy, as below
+        from iort_station.operations import audit as contents  # noqa: PLC0415 - numpy, as below
 
         with errors.status("reading contents"):
             return self._replace(
@@ -137,7 +137,7 @@ def _audit(
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_analysis.samples.batches import RefusedItems  # noqa: PLC0415 - as above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.operations.delivery import accounts, audit  # noqa: PLC0415 - as above
+    from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
 
     try:
         check_robot(robot)

@@ -22,8 +22,8 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 
 if TYPE_CHECKING:
-    from iort_station.moving.compared import Compared
-    from iort_station.moving.plan import Plan
+    from iort_station.migration.plan import Plan
+    from iort_station.migration.recordings import Compared
 
 commands = typer.Typer()
 AWS = "aws"
@@ -70,7 +70,7 @@ def move_(
     """
     # numpy takes longer to load than TAB may take.
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.moving import plan  # noqa: PLC0415 - as above
+    from iort_station.migration import plan  # noqa: PLC0415 - as above
 
     source = context.obj.cloud()
     target = _target(source, to, to_profile, to_region)
@@ -122,14 +122,14 @@ class _Moving:
 
     def move(self, plan: Plan, bundles: Path | None) -> None:
         """Move a robot."""
-        from iort_station.moving import registered, written  # noqa: PLC0415 - numpy, as above
+        from iort_station.migration import robots  # noqa: PLC0415 - numpy, as above
 
         robot, between = plan.robot, (self._source, self._target)
         if self._units is not None:
-            self.counts["registered"] += registered.copy(*between, robot)
+            self.counts["registered"] += robots.copy(*between, robot)
             if bundles is not None:
-                self.counts["bundles"] += registered.equip(self._target, robot, bundles)
-            self.counts["findings"] += written.copy(*between, robot)
+                self.counts["bundles"] += robots.equip(self._target, robot, bundles)
+            self.counts["findings"] += robots.copy_findings(*between, robot)
         self.quarantine(robot)
         for stream in plan.streams:
             self._stream(robot, stream)
@@ -138,28 +138,28 @@ class _Moving:
 
     def quarantine(self, robot: str) -> None:
         """Move a robot's quarantined messages."""
-        from iort_station.moving import quarantined  # noqa: PLC0415 - as above
+        from iort_station.migration import robots  # noqa: PLC0415 - as above
 
         between = (self._source, self._target)
         if self._units is not None:
-            self.counts["quarantined"] += quarantined.copy(*between, robot)
-        if lacking := quarantined.lacking(*between, robot):
+            self.counts["quarantined"] += robots.copy_quarantine(*between, robot)
+        if lacking := robots.lacking(*between, robot):
             self._problem(f"{robot}: the target lacks {len(lacking):,} quarantined messages: move again")
 
     def _stream(self, robot: str, stream: str) -> None:
         from iort_station.data.recorded import topic_of  # noqa: PLC0415 - as above
-        from iort_station.moving import archived, compared, recorded  # noqa: PLC0415 - as above
+        from iort_station.migration import recordings  # noqa: PLC0415 - as above
 
         source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)
-        batches, hours = 0, archived.Hours(0, 0)
+        batches, hours = 0, recordings.Hours(0, 0)
         with errors.status(f"{robot} {stream}") as status:
             read = _Reading(status.update, f"{robot} {stream}")
             if self._units is not None:
                 # Before the batches, which the target's archive adds to these hours.
-                hours = archived.copy(source, target, topic)
-                for copy in (recorded.copy, recorded.merge):
+                hours = recordings.copy_hours(source, target, topic)
+                for copy in (recordings.copy_batches, recordings.merge_hours):
                     batches += copy(source, target, topic, units_per_s=self._units, progress=read.tell)
-            found = compared.compare(source, target, robot, stream, read.tell)
+            found = recordings.compare(source, target, robot, stream, read.tell)
         if not found.batches and not hours.left:
             return
         problem = found.problem
@@ -174,7 +174,7 @@ class _Moving:
 
     def _files(self, plan: Plan) -> None:
         from iort_station.fleet import files  # noqa: PLC0415 - as above
-        from iort_station.moving.stored_files import Files  # noqa: PLC0415 - as above
+        from iort_station.migration.files import Files  # noqa: PLC0415 - as above
 
         both = Files(self._source, self._target)
         title = f"{plan.robot}: {len(plan.files):,} files"

@@ -12,8 +12,8 @@ from iort_station.cli.options import AsJson, DryRun, OneRobot, When, ranged
 from iort_station.cli.progress import bar
 from iort_station.cli.verbs.operations.errors import as_fields, entries
 from iort_station.cli.words import examples
-from iort_station.operations import quarantine, replay
-from iort_station.operations.replay import Fate
+from iort_station.operations import quarantine
+from iort_station.operations.quarantine import Fate
 
 commands = typer.Typer()
 
@@ -26,7 +26,7 @@ def replay_errors(
     robot: OneRobot = None,
     dry_run: DryRun = False,
     again: Annotated[
-        bool, typer.Option("--again", help=f"Also messages replayed {replay.MAX_REPLAYS} times already.")
+        bool, typer.Option("--again", help=f"Also messages replayed {quarantine.MAX_REPLAYS} times already.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -41,7 +41,7 @@ def replay_errors(
     found = sorted(entries(cloud, robot, within), key=lambda entry: (entry.first_ms, entry.id))
     outcomes = []
     with bar("putting back", len(found)) as progress:
-        for outcome in replay.replay(cloud, found, dry_run=dry_run, again=again):
+        for outcome in quarantine.replay(cloud, found, dry_run=dry_run, again=again):
             outcomes.append(outcome)
             progress(1)
     if as_json:

@@ -23,7 +23,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.roles import transport
 from iort_station.fleet.viewing import Viewer
-from iort_station.operations.delivery import audit, trace
+from iort_station.operations import audit, trace
 from iort_station.page.listening import listening
 from iort_station.page.page import load_keys
 

@@ -18,7 +18,7 @@ from iort_station.errors import StationError
 
 if TYPE_CHECKING:
     from iort_station.cloud import Cloud
-    from iort_station.upkeep.finding import Finding
+    from iort_station.upkeep.deployment import Finding
 
 commands = typer.Typer()
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
@@ -83,18 +83,18 @@ def _deep(find: Callable[[], Cloud]) -> Iterator[Finding]:
     from rich.progress import DownloadColumn, TextColumn  # noqa: PLC0415 - it takes long to load
 
     from iort_station.fleet import files  # noqa: PLC0415 - as below
-    from iort_station.upkeep import deep  # noqa: PLC0415 - it loads numpy and pyarrow
-    from iort_station.upkeep.finding import FAIL, Finding  # noqa: PLC0415 - as above
+    from iort_station.upkeep import deployment  # noqa: PLC0415 - it loads numpy and pyarrow
+    from iort_station.upkeep.deployment import FAIL, Finding  # noqa: PLC0415 - as above
 
     try:
         cloud = find()
-        topics = deep.topics(cloud)
+        topics = deployment.topics(cloud)
         with bar("reading recordings", None, TextColumn("{task.completed:,} batches")) as progress:
-            found = list(deep.of_recordings(cloud, topics, progress))
+            found = list(deployment.of_recordings(cloud, topics, progress))
         yield from found
         listed = list(files.listed(cloud, None))
         with bar("reading files", sum(one.size for one in listed), DownloadColumn()) as progress:
-            found = list(deep.of_files(cloud, listed, progress))
+            found = list(deployment.of_files(cloud, listed, progress))
         yield from found
     except (StationError, ClientError, BotoCoreError) as error:
         yield Finding("stored", FAIL, f"cannot be read: {error}", "see the lines above")

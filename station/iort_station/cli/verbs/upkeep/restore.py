@@ -32,16 +32,16 @@ def restore_(
     Every file is compared with its hash first. The folder appears when it is whole, and never where a cloud
     runs. --dry-run only reads the archive, and says whether it is good.
     """
-    from iort_station.upkeep import restore  # noqa: PLC0415 - as in `iort backup`
+    from iort_station.upkeep import backup  # noqa: PLC0415 - as in `iort backup`
 
     folder, earlier = state_folder(context, state), None
     if not dry_run:
         say(f"to {folder}, for `make up`")
     with bar("restore", file.stat().st_size) as progress:
         if dry_run:
-            manifest = restore.verify(file, progress)
+            manifest = backup.verify(file, progress)
         else:
-            manifest, earlier = restore.restore(file, folder, force=force, progress=progress)
+            manifest, earlier = backup.restore(file, folder, force=force, progress=progress)
     made = iso_s(round(manifest.made_s * 1e6))
     text = f"{file}: good, {len(manifest.files):,} files, {manifest.size / 1e6:,.1f} MB, of {made}"
     if not dry_run:

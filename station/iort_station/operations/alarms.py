@@ -1,8 +1,7 @@
 """The deployment's alarms with what they mean, who has seen them, and the cars that they may be about.
 
 An acknowledgement is a tag of the alarm in CloudWatch: every operator's page and AWS' console show it, and it
-needs no table. It names the time since when the alarm is raised, so it ends with that.
-"""
+needs no table. It names the time since when the alarm is raised, so it ends with that."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from iort_contract.messages.analysis.run import AnalysedDrive
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.moving import archived, plan, recorded, written
+from iort_station.migration import plan, recordings, robots
 from tests.unit.analysis.archive.test_archive import batch_at, item_of
 from tests.unit.analysis.archive.test_archive import written as written_hour
 from tests.unit.contract.messages.test_findings import FINDING
@@ -104,8 +104,8 @@ def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, account: Account, _topic: str) -> None:
             self.rows = account.rows.copy
 
-    monkeypatch.setattr(archived, "archive_of", Rows)
-    monkeypatch.setattr(written.findings, "findings_table", lambda account: account.findings)
+    monkeypatch.setattr(recordings, "archive_of", Rows)
+    monkeypatch.setattr(robots.findings, "findings_table", lambda account: account.findings)
 
 
 def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,19 +122,19 @@ def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.Monk
 def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
     source = Account("1", "07", "08")
     new, other = Account("2"), Account("2", "08", "09")
-    assert archived.copy(source, new, TOPIC) == (2, 0)
+    assert recordings.copy_hours(source, new, TOPIC) == (2, 0)
     assert (new.content, new.rows) == (source.content, source.rows)
     own = other.content[DAY]
-    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert recordings.copy_hours(source, other, TOPIC) == (1, 0)
     assert other.content[DAY] == own
     assert other.speeds() == {"08": [8.0] * 3, "09": [9.0] * 3, "07": [7.0] * 3}
-    assert archived.copy(source, other, TOPIC) == (0, 0)
+    assert recordings.copy_hours(source, other, TOPIC) == (0, 0)
     # Killed before the row was written; then the target's archive is about to write the same hour.
     hour = other.rows.pop()
-    assert archived.copy(source, other, TOPIC) == (1, 0)
+    assert recordings.copy_hours(source, other, TOPIC) == (1, 0)
     assert other.rows.pop() == hour
     other.content[hour.key] = b"being written"
-    assert archived.copy(source, other, TOPIC) == (0, 1)
+    assert recordings.copy_hours(source, other, TOPIC) == (0, 1)
     assert other.content[hour.key] == b"being written"
 
 
@@ -165,10 +165,10 @@ def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: 
         def put(self, new: list[Any]) -> None:
             table.extend(new)
 
-    monkeypatch.setattr(recorded, "archive_of", Hours)
-    monkeypatch.setattr(recorded, "telemetry_table", lambda _side: Table())
+    monkeypatch.setattr(recordings, "archive_of", Hours)
+    monkeypatch.setattr(recordings, "telemetry_table", lambda _side: Table())
     sides: Any = "source", "target"
-    assert [recorded.merge(*sides, TOPIC) for _ in range(2)] == [1, 0]
+    assert [recordings.merge_hours(*sides, TOPIC) for _ in range(2)] == [1, 0]
     (copied,) = table
     expires_s = int(copied.pop("expires_s")["N"])
     assert copied == {name: value for name, value in items[0].items() if name != "expires_s"}
@@ -177,7 +177,7 @@ def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: 
     # The source's table has all of it, which is copied from there; or the hours are the same.
     for same in ({"first_expires_s": int(time.time()) + 10 * 86_400}, {"content": "target"}):
         rows["source"] = [replace(row, **same)]
-        assert recorded.merge(*sides, TOPIC) == 0
+        assert recordings.merge_hours(*sides, TOPIC) == 0
 
 
 def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:
@@ -185,7 +185,7 @@ def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:
     # It has joined a day, or written an hour, and no row points to it yet.
     joining = Account("2")
     joining.content[DAY] = day("09")
-    assert archived.copy(source, joining, TOPIC) == (1, 0)
+    assert recordings.copy_hours(source, joining, TOPIC) == (1, 0)
     assert joining.content[DAY] == day("09")
     assert joining.speeds() == {"07": [7.0] * 3}
     hour = Account("1")
@@ -194,12 +194,12 @@ def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:
     hour.rows = [replace(source.rows[0], key=key)]
     writing = Account("2")
     writing.content[key] = b"being written"
-    assert archived.copy(hour, writing, TOPIC) == (0, 1)
+    assert recordings.copy_hours(hour, writing, TOPIC) == (0, 1)
     assert (writing.content[key], writing.rows) == (b"being written", [])
     # The row comes between.
     late = Account("2")
     late.meanwhile = [own := replace(source.rows[0], content="own")]
-    assert archived.copy(source, late, TOPIC) == (0, 1)
+    assert recordings.copy_hours(source, late, TOPIC) == (0, 1)
     assert late.rows == [own]
 
 
@@ -209,14 +209,14 @@ def test_what_the_target_has_analysed_again_is_not_replaced() -> None:
     robot = finding.drive.robot
     source.findings.put_finding(finding)
     # A drive whose analysis failed has no row.
-    assert [written.copy(source, target, robot) for _ in range(2)] == [1, 0]
+    assert [robots.copy_findings(source, target, robot) for _ in range(2)] == [1, 0]
     source.findings.put_drive(AnalysedDrive(finding.drive, finding.drive.start_us + 1, "old", 1, {}, {}, {}))
     source.findings.put_note(note(robot=robot))
-    assert [written.copy(source, target, robot) for _ in range(2)] == [2, 0]
+    assert [robots.copy_findings(source, target, robot) for _ in range(2)] == [2, 0]
     again = AnalysedDrive(finding.drive, finding.drive.start_us + 1, "again", 1, {}, {}, {})
     target.findings.put_drive(again)
     target.findings.remove(finding)
-    assert written.copy(source, target, robot) == 0
+    assert robots.copy_findings(source, target, robot) == 0
     assert (list(target.findings.drives(robot)), list(target.findings.findings(robot))) == ([again], [])
 
 
@@ -225,10 +225,10 @@ def test_a_note_that_was_deleted_on_either_side_does_not_come_back() -> None:
     notes = [note(seconds) for seconds in (0, 60, 120)]
     for one in notes:
         source.findings.put_note(one)
-    assert written.copy(source, target, "car7") == 3
+    assert robots.copy_findings(source, target, "car7") == 3
     assert source.findings.remove_note("car7", notes[0].id)
     assert target.findings.remove_note("car7", notes[1].id)
-    assert written.copy(source, target, "car7") == 0
+    assert robots.copy_findings(source, target, "car7") == 0
     assert list(target.findings.notes("car7")) == [notes[2]]
     assert list(source.findings.notes("car7")) == [notes[2], notes[1]]
 
@@ -250,7 +250,7 @@ def test_the_write_rate_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
     monkeypatch.setattr(time, "sleep", slept.append)
     table: Any = Full()
-    recorded.write(table, [{"samples": "x" * 100}] * 100, 5)
+    recordings.write(table, [{"samples": "x" * 100}] * 100, 5)
     # A small batch is one unit, and 25 are written at once.
     assert table.calls == [25] * 4
     assert sum(slept) == pytest.approx(100 / 5, abs=1)
@@ -259,4 +259,4 @@ def test_the_write_rate_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_items_that_stay_unprocessed_are_an_error_with_advice() -> None:
     table: Any = Full(TableError("1 items of telemetry not written"))
     with pytest.raises(StationError, match=r"1 items of telemetry not written; do it again"):
-        recorded.write(table, [{"samples": "x"}], 5)
+        recordings.write(table, [{"samples": "x"}], 5)

@@ -2,27 +2,28 @@
 
 Each run of the agent numbers its batches of a stream from 0 without gaps, and its first batches name the runs
 before it with their last numbers, as far as its queue knows. A number that is not stored is a batch that was
-lost, or that still waits in the car.
-"""
+lost, or that still waits in the car."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
+from iort_analysis.archive.hours import key_of
 from iort_analysis.archive.stored import HEADER, Origin, only
 from iort_analysis.samples.batches import ATTRIBUTES, RefusedItems, part
-from iort_contract.archive import HASH
+from iort_contract.archive import HASH, content_hash, item_hash
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.checks import shown
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
-from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
+from iort_contract.tables import BATCH, ENVELOPE, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Recorded
+from iort_station.data.recorded import Recorded, summary_table, topic_of
 
 # So many batches are decoded together.
 _TOGETHER = 200
@@ -291,3 +292,63 @@ def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
         return decode_batch(plain(found[0])) if found else None
     except ContractError:
         return None
+
+
+# What a stream's batches contain, as hashes that two deployments can compare.
+
+
+def hashes(
+    cloud: Cloud, robot: str, stream: str, first_us: int | None = None, last_us: int | None = None
+) -> dict[str, str]:
+    """For each run, the hash over its batches that start between two times, wherever they are stored."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for items in Recorded(cloud, robot, stream).items(starting_between(first_us, last_us), (*ENVELOPE, HASH)):
+        for item in items:
+            key = key_of(item)
+            with suppress(ContractError):
+                found.setdefault(batch_id(key).boot, []).append((key, item_hash(dict(item))))
+    return {boot: content_hash(batches) for boot, batches in found.items()}
+
+
+# Samples counted in the tables, stored and summarised.
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """The counts of one stream; missing batches are those between the stored ones."""
+
+    samples_stored: int
+    batches_stored: int
+    batches_missing: int
+    samples_summarized: int
+
+
+def batches(cloud: Cloud, robot: str, stream: str) -> Iterator[Batch]:
+    """Every stored batch of a stream, in order of time; raises `iort_contract.ContractError`."""
+    yield from map(decode_batch, items(cloud, robot, stream))
+
+
+def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:
+    """Every stored item of a stream, in order of time."""
+    for found in Recorded(cloud, robot, stream).items(starting_between(None, None), ()):
+        yield from map(plain, found)
+
+
+def delivery(cloud: Cloud, robot: str, stream: str) -> Delivery:
+    """Count what the tables hold of a stream."""
+    stored = list(batches(cloud, robot, stream))
+    numbers: dict[str, set[int]] = {}
+    for batch in stored:
+        numbers.setdefault(batch.boot, set()).add(batch.seq)
+    return Delivery(
+        samples_stored=sum(len(batch.times_us) for batch in stored),
+        batches_stored=len(stored),
+        batches_missing=sum(max(seqs) - min(seqs) + 1 - len(seqs) for seqs in numbers.values()),
+        samples_summarized=samples_summarized(cloud, robot, stream),
+    )
+
+
+def samples_summarized(cloud: Cloud, robot: str, stream: str) -> int:
+    """The number of samples in the summary's seconds."""
+    pages = summary_table(cloud).pages(topic_of(cloud, robot, stream), attributes=(SAMPLES,))
+    return sum(int(item[SAMPLES]["N"]) for page in pages for item in page.items)

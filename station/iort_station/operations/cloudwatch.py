@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from iort_contract.messages.page import Alarm, Dashboard, Series, Widget
+from iort_contract.messages.page import Alarm, Dashboard, Logs, Series, Widget
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
@@ -239,3 +241,134 @@ def _series(
                 }
             )
     return series
+
+
+# Log records as people read them: what happened in the first line, and the details after it.
+
+_TRACEBACK = "Traceback (most recent call last):"
+# Lambda's keys of a record in JSON that are not details. Its own lines have the second spelling.
+_LEVELS = ("level", "log_level")
+_TOLD = (*_LEVELS, "timestamp", "message", "errorType", "errorMessage", "stackTrace", "location")
+
+
+def readable(message: str) -> str:
+    """A log record whose first line says what happened: an exception, or the logged text.
+
+    A record is a text, or an object in JSON, as AWS writes those of our functions.
+    """
+    text = message.strip()
+    if text.startswith("{"):
+        try:
+            record = json.loads(text)
+        except ValueError:
+            return text
+        return _of_json(record)
+    before, traceback, stack = text.partition(_TRACEBACK)
+    if not traceback:
+        return text
+    # The exception ends a traceback; Lambda writes it before that.
+    lines = [line for line in stack.splitlines() if line.strip()]
+    exception = lines[-1] if lines and not lines[-1].startswith((" ", "\t", "\u00a0")) else ""
+    logged = " ".join(before.split())
+    head = logged if exception and exception in logged else _joined(logged, exception)
+    return f"{head}\n{text}" if head else text
+
+
+def _of_json(record: Mapping[str, Any]) -> str:
+    level = next((str(record[name]) for name in _LEVELS if name in record), "")
+    kind, said = (str(record.get(name) or "") for name in ("errorType", "errorMessage"))
+    exception = f"{kind}: {said}" if kind and said else kind or said
+    message = str(record.get("message") or "")
+    head = _joined(message, "" if said and said in message else exception)
+    if not head:
+        return json.dumps(record)
+    stack = record.get("stackTrace") or ""
+    frames = stack if isinstance(stack, str) else "\n".join(str(frame).rstrip() for frame in stack)
+    others = {name: value for name, value in record.items() if name not in _TOLD}
+    details = [frames, *(f"{name}: {value}" for name, value in others.items())]
+    return "\n".join(filter(None, (f"[{level}] {head}" if level else head, *details)))
+
+
+def _joined(logged: str, exception: str) -> str:
+    return ": ".join(filter(None, (logged.rstrip(":"), exception)))
+
+
+# The log widgets of CloudWatch's dashboards, answered by Logs Insights.
+#
+# Only the queries of deployed dashboards are run, so the page cannot query other logs.
+
+# The most rows of a widget, and the most characters of a cell.
+MAX_ROWS, MAX_TEXT = 100, 4_000
+# Logs Insights sends no event when a query ends.
+_POLL_S, _PATIENCE_S = 0.3, 60.0
+_UNDER_WAY = {"Scheduled", "Running", "Unknown"}
+_SOURCE = re.compile(r"""\s*SOURCE\s+(['"])(?P<group>[^'"]+)\1\s*(\||$)""")
+# The field for GetLogRecord.
+_POINTER = "@ptr"
+
+
+def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | None = None) -> Logs:
+    """The rows that a dashboard's log widget finds in the last ``minutes``.
+
+    Raises `StationError` if there is no such widget or no answer, and for another deployment's dashboard: its
+    logs may be confidential.
+    """
+    if not name.startswith(f"{cloud.namespace}-"):
+        raise StationError(
+            f"dashboard {name[:80]!r} is another deployment's: see its logs in the AWS console"
+        )
+    widgets = body_of(cloud, name)
+    widget = widgets[number] if number < len(widgets) else {}
+    if widget.get("type") != "log":
+        raise StationError(f"widget {number} of dashboard {name[:80]!r} is not a log widget")
+    properties: Mapping[str, Any] = widget.get("properties", {})
+    groups, query = parsed(str(properties.get("query", "")))
+    if not groups:
+        raise StationError("the widget's query must name a log group as SOURCE 'name': see the AWS console")
+    to_s = int(time.time() if now_s is None else now_s)
+    client = cloud.client("logs")
+    asked = {"queryLanguage": properties["queryLanguage"]} if "queryLanguage" in properties else {}
+    query_id = client.start_query(
+        logGroupNames=groups, queryString=query, startTime=to_s - minutes * 60, endTime=to_s, **asked
+    )["queryId"]
+    answer = _awaited(client, query_id)
+    found = [
+        {cell["field"]: cell.get("value", "") for cell in row if cell["field"] != _POINTER}
+        for row in answer.get("results", [])
+    ]
+    columns = list(dict.fromkeys(field for row in found for field in row))
+    return {
+        "columns": columns,
+        "rows": [[_cell(field, row.get(field, "")) for field in columns] for row in found[:MAX_ROWS]],
+        "found": len(found),
+        "from_s": to_s - minutes * 60,
+        "to_s": to_s,
+    }
+
+
+def parsed(query: str) -> tuple[list[str], str]:
+    """Split a widget's query into the log groups of its first ``SOURCE`` lines and the rest."""
+    groups: list[str] = []
+    while (source := _SOURCE.match(query)) is not None:
+        groups.append(source["group"])
+        query = query[source.end() :]
+    return groups, query.strip()
+
+
+def _cell(field: str, value: str) -> str:
+    return (readable(value) if field == "@message" else value)[:MAX_TEXT]
+
+
+def _awaited(client: Any, query_id: str) -> Mapping[str, Any]:
+    until, never = time.monotonic() + _PATIENCE_S, threading.Event()
+    while True:
+        answer: Mapping[str, Any] = client.get_query_results(queryId=query_id)
+        status = str(answer.get("status", ""))
+        if status == "Complete":
+            return answer
+        if status not in _UNDER_WAY:
+            raise StationError(f"Logs Insights ended the query: {status.lower()}")
+        if time.monotonic() >= until:
+            client.stop_query(queryId=query_id)
+            raise StationError(f"Logs Insights has no answer after {_PATIENCE_S:g} s")
+        never.wait(_POLL_S)

@@ -1,4 +1,5 @@
-"""Moves a robot's registration: row, thing with its tags, desired settings; and gives it a new certificate.
+"""Copies what is known of a robot into another deployment: row, thing with its tags, desired settings,
+quarantined messages, findings and notes; and gives it a new certificate.
 
 Until the robot has connected to the target, the source's values replace the target's. Then the target's stay.
 """
@@ -6,13 +7,15 @@ Until the robot has connected to the target, the source's values replace the tar
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from iort_contract.dynamodb import Item
 from iort_contract.tables import (
     ADMISSION,
     ADMITTED_CERTIFICATE,
@@ -20,6 +23,9 @@ from iort_contract.tables import (
     ASKED_PREFIX,
     CONNECTED_MS,
     DAYS,
+    ENTRY,
+    EXPIRES_S,
+    LAST_MS,
     MOVED_FROM,
     OVER_SHARE,
     PRESENCE,
@@ -29,10 +35,11 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
+from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.fleet import identity, registry, robots
 from iort_station.fleet.identity import Bundle
-from iort_station.moving.plan import origin
+from iort_station.migration.plan import origin
 
 # What a registry's row says of the deployment and not of the robot.
 _STAYS = frozenset({ROBOT, MOVED_FROM, *DAYS, *PRESENCE, *ADMISSION}) - {SERIAL}
@@ -135,3 +142,80 @@ def _is_of(cloud: Cloud, bundle: Bundle) -> bool:
     except (KeyError, OSError, TypeError, ValueError, yaml.YAMLError):
         return False
     return found in {one.id for one in identity.certificates(cloud, bundle.robot)}
+
+
+# Moves a robot's quarantined messages, byte for byte.
+
+
+def copy_quarantine(source: Cloud, target: Cloud, robot: str) -> int:
+    """Copy the messages that the target lacks; returns how many."""
+    wanted = lacking(source, target, robot)
+    client, table = target.client("dynamodb"), target.output("storage", "QuarantineTable")
+    for item in _items(source, robot) if wanted else ():
+        if item[ENTRY]["S"] in wanted:
+            client.put_item(TableName=table, Item=item)
+    return len(wanted)
+
+
+def lacking(source: Cloud, target: Cloud, robot: str) -> set[str]:
+    """The ids of the source's messages that the target does not have."""
+    names = {"#robot": ROBOT, "#id": ENTRY, "#expires": EXPIRES_S, "#last": LAST_MS}
+    keys = {"ProjectionExpression": "#id, #expires, #last", "ExpressionAttributeNames": names}
+    # Of a message that was replayed the id is left.
+    there = {item[ENTRY]["S"] for item in _items(target, robot, **keys)}
+    now_s = time.time()
+    return {
+        str(item[ENTRY]["S"])
+        for item in _items(source, robot, **keys)
+        if LAST_MS in item
+        and item[ENTRY]["S"] not in there
+        # DynamoDB is about to delete those that have expired.
+        and (EXPIRES_S not in item or int(item[EXPIRES_S]["N"]) > now_s)
+    }
+
+
+def _items(cloud: Cloud, robot: str, **request: Any) -> Iterator[Item]:
+    asked = {
+        "TableName": cloud.output("storage", "QuarantineTable"),
+        "ConsistentRead": True,
+        "KeyConditionExpression": "#robot = :robot",
+        "ExpressionAttributeNames": {"#robot": ROBOT},
+        "ExpressionAttributeValues": {":robot": {"S": robot}},
+        **request,
+    }
+    for page in cloud.client("dynamodb").get_paginator("query").paginate(**asked):
+        yield from page["Items"]
+
+
+# Moves what the analysis and people have written about robots: findings, analysed drives and notes.
+
+
+def copy_findings(source: Cloud, target: Cloud, robot: str) -> int:
+    """Copy the findings, analysed drives and notes of a robot that the target lacks; returns how many.
+
+    A note that was deleted on either side is deleted in the target.
+    """
+    old, new = findings.findings_table(source), findings.findings_table(target)
+    # The target may have analysed a drive again, with all of its batches.
+    analysed, there = {one.drive for one in new.drives(robot)}, {note.id for note in new.notes(robot)}
+    # A drive whose analysis failed has a finding, and no row.
+    found = {finding.id for finding in new.findings(robot)}
+    count = 0
+    for finding in old.findings(robot):
+        if finding.drive not in analysed and finding.id not in found:
+            new.put_finding(finding)
+            count += 1
+    # After its findings: a move that ends between them goes on.
+    for drive in old.drives(robot):
+        if drive.drive not in analysed:
+            new.put_drive(drive)
+            count += 1
+    removed = old.removed_notes(robot)
+    for note_id in removed & there:
+        new.remove_note(robot, note_id)
+    removed |= new.removed_notes(robot)
+    for note in old.notes(robot):
+        if note.id not in there | removed:
+            new.put_note(note)
+            count += 1
+    return count

@@ -1,8 +1,7 @@
 """The delay of live updates from the sample in the car to a subscriber, hop by hop.
 
 A hop starts and ends by the clock of the car, AWS, PubNub or this machine. The measured offset between two
-clocks is subtracted, and its uncertainty is reported.
-"""
+clocks is subtracted, and its uncertainty is reported."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import last_reports
-from iort_station.operations.delivery.audit import Audit, RunAudit, Shortfall
+from iort_station.operations.audit import Audit, RunAudit, Shortfall
 
 # A run that has been silent for this long has ended.
 _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
