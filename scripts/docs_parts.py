@@ -35,9 +35,8 @@ from iort_contract.cloud import PUBNUB
 from iort_contract.messages.control.driving import REFUSALS
 from iort_contract.messages.requests.ask import REASONS
 from iort_station.cli.main import app
-from iort_station.cost import report
-from iort_station.cost.bill import line_items, model
-from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
+from iort_station.cost import model, report
+from iort_station.cost.model import deployment_dollars_per_month
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 from scripts import agent_reference, cloud_tables
@@ -288,7 +287,7 @@ def month() -> None:
 
 def _month(usage: Usage) -> tuple[float, float]:
     """AWS' dollars a month for the driving, and for the deployment itself."""
-    driving = line_items.dollars_per_month(model.bill(usage), usage)
+    driving = model.dollars_per_month(model.bill(usage), usage)
     return driving, sum(deployment_dollars_per_month(usage).values())
 
 

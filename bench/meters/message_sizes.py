@@ -2,7 +2,7 @@
 
     python -m bench.meters.message_sizes
 
-prints the constants of station/iort_station/cost/sizes.py, on which the cost model rests.
+prints the constants of station/iort_station/cost/model.py, on which the cost model rests.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from iort_contract.messages.live import LiveSample, encode_live, encode_ping, li
 from iort_contract.statistics import summarize_second
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
-from iort_station.cost.sizes import Measured
+from iort_station.cost.model import Measured
 from testkit.car import simulated_drive
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
@@ -43,7 +43,7 @@ SAMPLES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
 
 def main() -> None:
-    """Print the constants of station/iort_station/cost/sizes.py."""
+    """Print the constants of station/iort_station/cost/model.py."""
     for samples in SAMPLES:
         print(f"    Measured{tuple(batch_sizes(samples, 1.0))},")
     print(f"OWN_ITEM_BYTES = {own_item_bytes()}")
@@ -66,7 +66,7 @@ def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
 
 
 def message_sizes() -> dict[str, int]:
-    """The sizes of messages and items with one sample, by the field of `iort_station.cost.sizes.Sizes`."""
+    """The sizes of messages and items with one sample, by the field of `iort_station.cost.model.Sizes`."""
     (first,) = simulated_drive(1, after_s=_WARM_S)
     live = LiveSample(_BOOT, 100_000, _T_US, _T_US + 500, first)
     flat = {"boot": _BOOT, "seq": 100_000, "t": _T_US, **first}

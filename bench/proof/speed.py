@@ -20,7 +20,7 @@ from iort_analysis.drives.recorded import recorded
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
-from iort_station.cost.bill.analysing import Function, drive_items
+from iort_station.cost.model import DRIVES_AT_ONCE, drive_billed_s, drive_items
 from iort_station.cost.usage import Usage
 from testkit.waiting import InstrumentError
 
@@ -77,14 +77,13 @@ def _check(streams: Mapping[str, Block], floor: Mapping[str, Mapping[str, NDArra
                 raise InstrumentError(f"{stream}.{name}: the floor must decode the same values")
 
 
-def bill(robot_hours: float, cpu_s: float, drive_s: float, function: Function | None = None) -> Bill:
+def bill(robot_hours: float, cpu_s: float, drive_s: float) -> Bill:
     """What the analysis of so many robot-hours takes and costs, in drives of ``drive_s`` seconds.
 
     The samples, of a VESC and as many of poses, are read from the telemetry table.
     """
-    f = function or Function()
     drives = ceil(robot_hours * HOUR_S / drive_s)
-    billed_s = f.billed_s(cpu_s * drive_s / HOUR_S)
-    items = drive_items(Usage(rate_hz=RATE_HZ, streams=2), drives / robot_hours, billed_s, f)
+    billed_s = drive_billed_s(cpu_s * drive_s / HOUR_S)
+    items = drive_items(Usage(rate_hz=RATE_HZ, streams=2), drives / robot_hours, billed_s)
     dollars = {f"{item.service}, {item.what}": robot_hours * item.dollars for item in items}
-    return Bill(ceil(drives / f.at_once) * billed_s, dollars)
+    return Bill(ceil(drives / DRIVES_AT_ONCE) * billed_s, dollars)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from iort_contract.cloud import PUBNUB
-from iort_station.cost.report import Rows, times
-from iort_station.cost.scale import Scale, on_paper
+from iort_station.cost.report import Rows, Scale, on_paper, times
 from iort_station.cost.usage import Usage
 
 ROBOTS = (1, 100, 10_000, 1_000_000)

@@ -10,8 +10,8 @@ from bench.sections import dashboard, outage, query, round_trips, utilisation, v
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
-from iort_station.cost.bill import line_items, model
-from iort_station.cost.bill.line_items import LineItem
+from iort_station.cost import model
+from iort_station.cost.model import LineItem
 from iort_station.cost.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
@@ -38,7 +38,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "viewing": lambda: _driven(viewing.IDLE_S + 2 * (viewing.WATCHED_S + viewing.WAKES * _WAKE_S)),
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
     }
-    return {key: line_items.total(counted[key]()) for key in sections if key in counted}
+    return {key: model.total(counted[key]()) for key in sections if key in counted}
 
 
 def _round_trips() -> list[LineItem]:
@@ -87,7 +87,7 @@ def _invoked(calls: int, memory_mb: int) -> list[LineItem]:
 
 
 def _items(**units: float) -> list[LineItem]:
-    return [LineItem("", "", "", price, count) for price, count in units.items()]
+    return [LineItem("", "", price, count) for price, count in units.items()]
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:

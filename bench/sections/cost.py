@@ -8,8 +8,7 @@ from bench.report import plots
 from bench.report.fleet_costs import fleets
 from bench.report.result import Section
 from iort_contract.cloud import PUBNUB
-from iort_station.cost import report
-from iort_station.cost.bill import line_items, model
+from iort_station.cost import model, report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 from testkit.target import Say, Target
@@ -39,11 +38,11 @@ def run(target: Target, say: Say) -> Section:
         ("On paper: needs of AWS' default quotas", fleets(usage)),
     ):
         section.table(title, rows.head, rows.body)
-    thesis = line_items.total(model.thesis_bill(usage))
+    thesis = model.total(model.thesis_bill(usage))
     rates = (10.0, 5.0, 2.0, 1.0, 0.0)
     # The thesis archives and analyses nothing, so neither counts here.
     alike = replace(usage, archive_days=0, drive_minutes=0.0, watched_hours=None)
-    ours = {rate: line_items.total(model.bill(replace(alike, live_hz=rate))) for rate in rates}
+    ours = {rate: model.total(model.bill(replace(alike, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
     for what, rate in (
         ("with the live lane at 10 Hz", 10.0),

@@ -17,7 +17,7 @@ from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import LiveSample, decode_live, decode_live_update
 from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_contract.topics import LIVE
-from iort_station.cost.bill import line_items, model
+from iort_station.cost import model
 from iort_station.cost.usage import Usage
 from iort_station.fleet import viewing
 from iort_station.fleet.broker import Broker
@@ -138,9 +138,9 @@ def report(
     alike = Usage(archive_days=0, drive_minutes=0.0)
     alone = replace(alike, watched_hours=0.0)
     usages = {way: replace(alike, live_transport=way) for way in _WAYS}
-    costs = {way: line_items.total(model.bill(usage)) for way, usage in usages.items()}
-    pubnub = {way: line_items.total(model.pubnub_bill(usage)) for way, usage in usages.items()}
-    unwatched = line_items.total(model.bill(alone))
+    costs = {way: model.total(model.bill(usage)) for way, usage in usages.items()}
+    pubnub = {way: model.total(model.pubnub_bill(usage)) for way, usage in usages.items()}
+    unwatched = model.total(model.bill(alone))
     an_hour = idle * 3600 / IDLE_S
     section.table(
         f"Nobody looks, one stream at 50 Hz; counted by a subscriber at the broker for {IDLE_S} s",
@@ -151,11 +151,11 @@ def report(
             [
                 "AWS, dollars a robot-hour without archive and analysis",
                 f"{unwatched:.4f}",
-                f"{line_items.total(model.bill(replace(alike, watched_hours=None))):.4f}",
+                f"{model.total(model.bill(replace(alike, watched_hours=None))):.4f}",
             ],
             [
                 "PubNub by transactions, dollars a robot-hour",
-                f"{line_items.total(model.pubnub_bill(alone)):.4f}",
+                f"{model.total(model.pubnub_bill(alone)):.4f}",
                 f"{pubnub[PUBNUB]:.4f}",
             ],
         ],

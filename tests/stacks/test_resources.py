@@ -13,7 +13,7 @@ from iort_contract.cloud import ANALYSIS_PREFIX, IOT, PLANS_PREFIX, PUBNUB, RESU
 from iort_contract.messages.requests.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
-from iort_station.cost.bill.model import RECORDS_A_CALL, WINDOW_S
+from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
 from stacks.checks import granted, several
 from stacks.settings import A_ROBOTS_MOST, Settings
 from stacks.storage import VERSIONS_DAYS

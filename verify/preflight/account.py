@@ -7,7 +7,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import rule_name
-from iort_station.cost.scale import on_paper
+from iort_station.cost.report import on_paper
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import UNRESERVED, Settings

@@ -117,7 +117,7 @@ def _widget(client: Any, number: int, widget: Mapping[str, Any], from_s: int, to
     if widget.get("type") == "alarm":
         return _with_alarms(client, drawn, properties)
     if widget.get("type") == "log":
-        # The page requests its rows separately, since Logs Insights is slow: see cloudwatch_logs.py.
+        # The page requests its rows separately, since Logs Insights is slow: see `rows`.
         return {**drawn, "kind": "log"}
     if widget.get("type") != "metric" or "metrics" not in properties:
         return {**drawn, "text": f"a widget of type {widget.get('type')}: see the AWS console"}

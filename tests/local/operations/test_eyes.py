@@ -12,7 +12,6 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations import cloudwatch
-from iort_station.operations import cloudwatch as cloudwatch_logs
 from local.emulator import first_calls
 from testkit.mqtt import Robot
 from testkit.waiting import until
@@ -120,7 +119,7 @@ def test_the_platform_dashboard_shows_warnings_of_functions(embedded, bundle):
     (number,) = [widget["number"] for widget in widgets if widget["kind"] == "log"]
 
     def told():
-        found = cloudwatch_logs.rows(embedded.cloud, name, number, minutes=30, now_s=time.time() + 1)
+        found = cloudwatch.rows(embedded.cloud, name, number, minutes=30, now_s=time.time() + 1)
         return [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
 
     line = until(lambda: next((row for row in told() if robot.name in row["@message"]), None))

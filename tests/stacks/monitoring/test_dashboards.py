@@ -14,7 +14,7 @@ from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.batch import Batch
-from iort_station.cost.bill.fixed_costs import (
+from iort_station.cost.model import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
     ROBOT_SEARCHES,

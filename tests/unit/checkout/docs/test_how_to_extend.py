@@ -283,7 +283,7 @@ def test_each_way_to_change_a_thing_works(deployed: Deployed) -> None:
         deployed.of_type("monitoring", "AWS::CloudWatch::Dashboard", "DashboardsRobots")
     )
     prices = "from iort_station.cost.prices import PRICES"
-    assert copy.show("PRICES['rule'].usd", prices) == 0.16
+    assert copy.show("PRICES['read'].usd", prices) == 0.142
     (copy.root / "node_modules").symlink_to(ROOT / "node_modules")
     compiler = copy.root / "node_modules" / "typescript" / "bin" / "tsc"
     types = subprocess.run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -11,13 +12,19 @@ from typer.testing import CliRunner
 from bench.meters import message_sizes
 from functions.shared.metrics import Gathered, emit
 from functions.shared.summary import measure
+from iort_agent.agent import Agent
+from iort_agent.config import Config
 from iort_agent.lanes.pings import CLOCK_EVERY_S
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.mqtt.failures import SHORTEST_S
+from iort_agent.runtime import Runtime
+from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.cloud import IOT, PUBNUB
+from iort_contract.topics import SHADOW
 from iort_station.cli.main import app
-from iort_station.cost import report, scale
-from iort_station.cost.bill import line_items, model
-from iort_station.cost.bill.fixed_costs import (
+from iort_station.cost import model, report
+from iort_station.cost.model import (
     FREE_ALARMS,
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
@@ -25,10 +32,11 @@ from iort_station.cost.bill.fixed_costs import (
     PAGE_REFRESH_S,
     deployment_dollars_per_month,
 )
-from iort_station.cost.prices import PRICES
+from iort_station.cost.prices import PRICES, QUOTAS, SERVICES
 from iort_station.cost.usage import CLOCK_PING_S, Usage
 from iort_station.errors import StationError
 from scripts.docs_parts import ROOT
+from testkit.agent import Loopback, ManualClock
 from testkit.car import simulated_drive
 
 # By PubNub, which uses every part of the model.
@@ -44,7 +52,7 @@ def test_the_record_lane_costs_a_rule_an_action_and_write_units_a_batch():
     assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
     assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
     assert _units(items, "record", "write") == 3600 * (1 + 1), "each item fits in a unit"
-    rules = next(i for i in items if (i.lane, i.what) == ("record", "rules triggered"))
+    rules = next(i for i in items if (i.lane, i.what, i.price) == ("record", "batches", "rule"))
     assert rules.dollars == pytest.approx(3600 * 0.15e-6)
 
 
@@ -64,9 +72,9 @@ def test_a_car_that_nobody_looks_at_sends_a_message_in_ten_seconds():
     idle = replace(_ONE, watched_hours=0.0)
     items = model.bill(idle)
     assert _units(items, "live", "invocation") == _units(items, "live", "message") == 360
-    assert line_items.total(model.pubnub_bill(idle)) < line_items.total(model.pubnub_bill(_ONE)) / 99
+    assert model.total(model.pubnub_bill(idle)) < model.total(model.pubnub_bill(_ONE)) / 99
     # The goal, as the thesis is compared: it archives and analyses nothing.
-    assert line_items.total(model.bill(replace(idle, archive_days=0, drive_minutes=0.0))) < 0.014
+    assert model.total(model.bill(replace(idle, archive_days=0, drive_minutes=0.0))) < 0.014
     half = replace(_ONE, hours_per_day=4.0, watched_hours=2.0)
     assert half.live_per_s == pytest.approx((10 + 0.1) / 2)
     # A lease every five seconds is sent and received.
@@ -81,7 +89,7 @@ def test_by_aws_iot_alone_each_message_is_sent_to_each_viewer_and_no_function_ru
     assert _units(items, "live", "message") == 36_000 * (1 + 3) + 3 * 2 * 720
     assert _units(items, "live", "rule") == 2 * 36_000, "a fault, and a low battery"
     assert _units(items, "live", "connection") == 3 * 60
-    assert line_items.total(model.pubnub_bill(usage)) == model.pubnub_mau_dollars_per_month(usage) == 0
+    assert model.total(model.pubnub_bill(usage)) == model.pubnub_mau_dollars_per_month(usage) == 0
 
 
 def test_a_car_without_measured_pings_still_pings_for_the_clock_offset():
@@ -156,12 +164,12 @@ def test_the_thesis_layout_pays_for_every_sample():
     assert _units(items, "record", "message") == 50 * 3600
     assert _units(items, "record", "write") == 2 * 50 * 3600
     assert _units(items, "live", "invocation") == 50 * 3600
-    assert 0.6 < line_items.total(items) < 0.8
+    assert 0.6 < model.total(items) < 0.8
 
 
 def test_the_cost_without_a_live_lane_is_under_a_twentieth_of_the_thesis():
-    ours = line_items.total(model.bill(replace(_ONE, live_hz=0.0)))
-    assert ours < line_items.total(model.thesis_bill(_ONE)) / 20
+    ours = model.total(model.bill(replace(_ONE, live_hz=0.0)))
+    assert ours < model.total(model.thesis_bill(_ONE)) / 20
 
 
 def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
@@ -190,7 +198,9 @@ def test_pubnub_counts_publishes_and_receipts_or_users():
 def test_every_item_has_a_price_and_every_price_names_its_page():
     for items in (model.bill(replace(_ONE, ping_hz=1.0)), model.thesis_bill(_ONE), model.pubnub_bill(_ONE)):
         assert all(item.price in PRICES and item.units >= 0 for item in items)
-    assert all(price.page.startswith("https://") and price.usd > 0 for price in PRICES.values())
+    assert all(
+        SERVICES[price.service][0].startswith("https://") and price.usd > 0 for price in PRICES.values()
+    )
 
 
 @pytest.mark.parametrize(
@@ -209,7 +219,7 @@ def test_the_modelled_log_size_of_lambda_1_matches_its_real_lines(capsys):
     written = len(capsys.readouterr().out)
     assert written == pytest.approx(_units(model.bill(_ONE), "live", "logs") * 1e9, rel=0.1)
     whole = _units(model.bill(replace(_ONE, function_logs="all")), "live", "logs") * 1e9
-    assert whole - 36_000 * len(line_items.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
+    assert whole - 36_000 * len(model.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
 
 
 def test_each_environment_gathers_its_own_metrics():
@@ -230,11 +240,11 @@ def test_the_modelled_length_of_other_lines_matches_the_real_lines(capsys):
 
 
 def test_the_quota_that_breaks_first_needs_the_fewest_robots():
-    paper = scale.on_paper(replace(_ONE, robots=10_000, live_concurrency=5))
+    paper = report.on_paper(replace(_ONE, robots=10_000, live_concurrency=5))
     at = [need.robots_at_quota for need in paper.needs if need.robots_at_quota]
     assert at == sorted(at)
     assert paper.breaks_first.robots_at_quota == 5 / (10 * 0.020)
-    unreserved = scale.on_paper(Usage(robots=10_000))
+    unreserved = report.on_paper(Usage(robots=10_000))
     assert unreserved.breaks_first.name.startswith("IoT Core")
 
 
@@ -279,17 +289,115 @@ def test_the_command_prints_json_that_adds_up(tmp_path):
 @pytest.mark.parametrize("batch_s", [0.0, 0.2, 1.0])
 def test_each_stream_is_billed_separately(batch_s):
     one, three = (
-        {(item.lane, item.what): item.units for item in model.bill(Usage(streams=streams, batch_s=batch_s))}
+        {
+            (item.lane, item.what, item.price): item.units
+            for item in model.bill(Usage(streams=streams, batch_s=batch_s))
+        }
         for streams in (1, 3)
     )
     times = {what: three[what] / units for what, units in one.items() if units}
-    for what in ("rules triggered", "actions", "telemetry written", "telemetry kept", "summary kept"):
-        assert times["record", what] == pytest.approx(3), what
+    for what in (
+        ("record", "batches", "rule"),
+        ("record", "batches", "action"),
+        ("record", "telemetry written", "write"),
+        ("record", "telemetry kept", "storage"),
+        ("record", "summary kept", "storage"),
+    ):
+        assert times[what] == pytest.approx(3), what
     # The window limits Lambda 2's calls until its events are full.
-    assert times["record", "Lambda 2 invoked"] <= 3
-    assert times["connection", "minutes"] == times["agent, rtt", "kept"] == 1
+    assert times["record", "Lambda 2", "invocation"] <= 3
+    assert times["connection", "minutes", "connection"] == times["agent, rtt", "kept", "storage"] == 1
     messages = [next(i.units for i in model.thesis_bill(usage) if i.what == "messages") for usage in USAGES]
     assert messages[1] == 3 * messages[0]
 
 
 USAGES = (Usage(), Usage(streams=3))
+
+
+# The cost model's figures of a connection match the agent's messages when it connects.
+
+_BY_IOT = Usage()
+# AWS IoT Core, "Additional metering details".
+_METER, _SHADOW_METER = 5 * 1024, 1024
+
+
+def messages(usage):
+    """The metered messages of an hour, by kind."""
+    return {item.what: item.units for item in model.bill(usage) if item.price == "message"}
+
+
+class Counting(Loopback):
+    """An uplink that records its subscriptions."""
+
+    def __init__(self, *given, **named):
+        super().__init__(*given, **named)
+        self.filters = []
+
+    def subscribe(self, topic_filter, handler):
+        self.filters.append(topic_filter)
+        super().subscribe(topic_filter, handler)
+
+
+def test_an_agent_subscribes_as_the_model_assumes():
+    clock, dispatcher = ManualClock(), Dispatcher()
+    uplink = Counting(clock, dispatcher)
+    config = Config("car1", "host", Path(), Path(), ())
+    agent = Runtime(Agent(config, uplink=uplink, spool=MemorySpool(max_bytes=10**6), clock=clock))
+    assert len(uplink.filters) == model.SUBSCRIPTIONS
+    assert all(len(topic) < _METER for topic in uplink.filters)
+    uplink.connect()
+    dispatcher.run_pending()
+    agent.tick()
+    asked = [message for message in uplink.published if f"/name/{SHADOW}/" in message.topic]
+    assert [(message.topic.rpartition("/")[2], message.payload) for message in asked] == [("get", b"")]
+    # Without desired settings, the shadow holds only the agent's report.
+    uplink.deliver(f"{asked[0].topic}/rejected", b'{"code": 404}')
+    dispatcher.run_pending()
+    agent.tick()
+    assert uplink.published[-1].topic.endswith("/update")
+    assert len(json.dumps(json.loads(uplink.published[-1].payload)["state"])) < _SHADOW_METER
+
+
+def test_a_connect_adds_its_messages_to_an_hour():
+    more, less = (
+        messages(_BY_IOT),
+        messages(replace(_BY_IOT, connects_per_hour=0.0)),
+    )
+    assert {what: more[what] - less[what] for what in more if more[what] != less[what]} == {
+        "CONNECT and SUBSCRIBE": 1 + model.SUBSCRIPTIONS,
+        "shadow request, answer and PUBACK": 3,
+    }
+
+
+def test_a_connect_adds_two_events_of_presence():
+    items = model.bill(replace(_BY_IOT, connects_per_hour=3.0))
+    units = {item.price: item.units for item in items if item.lane == "connection"}
+    for price in ("rule", "action", "invocation", "write"):
+        assert units[price] == 2 * 3, price
+    assert units["shadow"] == 3
+    assert units["connection"] == 60, "minutes, however often"
+
+
+def test_a_command_is_sent_received_and_acknowledged():
+    commanded = messages(replace(_BY_IOT, command_hz=10.0))
+    assert commanded["sent, received, acknowledged"] == 3 * 10 * 3600
+    assert messages(_BY_IOT)["sent, received, acknowledged"] == 0
+
+
+def test_the_thesis_layout_pays_for_connects_without_subscriptions():
+    items = {item.what: item.units for item in model.thesis_bill(replace(_BY_IOT, connects_per_hour=2.0))}
+    assert items["CONNECT"] == 2
+
+
+def test_the_modelled_length_of_a_presence_line_matches_the_real_line(capsys, monkeypatch):
+    monkeypatch.setenv("NAMESPACE", "iort")
+    emit("presence", RobotsConnected=True, RobotsDisconnected=False)
+    assert len(capsys.readouterr().out) == pytest.approx(model._PRESENCE_LINE, rel=0.1)
+
+
+def test_an_outage_is_compared_with_the_lower_quota_of_awss_pages():
+    assert QUOTAS["IoT Core: connects in a minute after an outage"].value == 500 * 60
+    paper = {need.name: need.times for need in report.on_paper(Usage(robots=60_000)).needs}
+    assert paper["IoT Core: connects in a minute after an outage"] == 2
+    assert paper["IoT Core: connects of one client id"] == 1, "the agent waits a second at least"
+    assert report.SHORTEST_RECONNECT_S == SHORTEST_S

@@ -15,14 +15,10 @@ from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
 from iort_station.cli.words import examples
-from iort_station.cost import report, scale
-from iort_station.cost.bill import archiving, line_items, model
-from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
-from iort_station.cost.car import as_configured
-from iort_station.cost.deployed import as_deployed
-from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
-from iort_station.cost.prices import AS_OF, PRICES, REGION
-from iort_station.cost.usage import TRANSPORTS, Usage
+from iort_station.cost import model, report
+from iort_station.cost.model import deployment_dollars_per_month
+from iort_station.cost.prices import API_REGION, AS_OF, PRICES, REGION, Listed, keep, kept_at, load, read
+from iort_station.cost.usage import TRANSPORTS, Usage, as_configured, as_deployed
 
 commands = typer.Typer()
 _DEFAULT = Usage()
@@ -156,7 +152,7 @@ def cost_(
         ("A month", report.month(usage, prices)),
         ("A robot-year in DynamoDB beside one in the archive", report.robot_year(usage, prices)),
         ("What if", report.what_if(usage, prices)),
-        ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
+        ("What it needs of the default quotas", report.quotas(report.on_paper(usage, prices))),
     ):
         out.print(_table(title, rows))
 
@@ -200,10 +196,10 @@ def _dated(listed: Listed | None) -> str:
 
 def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
     prices = PRICES if listed is None else listed.prices()
-    paper = scale.on_paper(usage, prices)
+    paper = report.on_paper(usage, prices)
     ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
 
-    def items(found: list[line_items.LineItem]) -> list[dict[str, Any]]:
+    def items(found: list[model.LineItem]) -> list[dict[str, Any]]:
         return [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in found]
 
     return {
@@ -215,10 +211,10 @@ def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
         "items": items(ours),
         "thesis_items": items(thesis),
         "pubnub_items": items(model.pubnub_bill(usage, prices)),
-        "dollars_per_robot_hour": line_items.total(ours),
-        "thesis_dollars_per_robot_hour": line_items.total(thesis),
+        "dollars_per_robot_hour": model.total(ours),
+        "thesis_dollars_per_robot_hour": model.total(thesis),
         "deployment_dollars_per_month": deployment_dollars_per_month(usage, prices),
-        "robot_year": [place._asdict() for place in archiving.robot_year(usage, prices)],
+        "robot_year": [place._asdict() for place in model.robot_year(usage, prices)],
         "fleet_dollars_per_month": paper.aws_dollars_per_month,
         "pubnub_mau_dollars_per_month": model.pubnub_mau_dollars_per_month(usage),
         "quotas": [

@@ -12,11 +12,9 @@ from botocore.stub import Stubber
 from typer.testing import CliRunner
 
 from iort_station.cli.main import app
-from iort_station.cost import report
-from iort_station.cost.bill import line_items, model
-from iort_station.cost.bill.fixed_costs import deployment_dollars_per_month
-from iort_station.cost.price_list import API_REGION, PRODUCTS, Listed, keep, kept_at, load, read
-from iort_station.cost.prices import PRICES
+from iort_station.cost import model, report
+from iort_station.cost.model import deployment_dollars_per_month
+from iort_station.cost.prices import API_REGION, LISTED, PRICES, SERVICES, Listed, keep, kept_at, load, read
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 
@@ -73,12 +71,12 @@ def as_built_in():
     """The price list with the built-in prices."""
     return {
         name: product(
-            one.service,
+            SERVICES[one.service][1],
             USAGES.get(name, f"EU-{one.usage}"),
             (0, PRICES[name].each),
             region="" if one.everywhere else REGION,
         )
-        for name, one in PRODUCTS.items()
+        for name, one in LISTED.items()
     }
 
 
@@ -112,9 +110,9 @@ class Pricing:
 def test_an_unchanged_price_list_changes_nothing():
     listed = read(Pricing(as_built_in().values()), REGION, TODAY)
     assert (listed.read_on, listed.region, listed.kept) == ("2026-11-22", REGION, {})
-    assert listed.each.keys() == PRODUCTS.keys()
+    assert listed.each.keys() == LISTED.keys()
     assert listed.changed() == {}
-    assert report.differences(listed).body == [(f"as built in: {len(PRODUCTS)} of {len(PRODUCTS)}", "", "")]
+    assert report.differences(listed).body == [(f"as built in: {len(LISTED)} of {len(LISTED)}", "", "")]
 
 
 def test_the_requests_pass_botocores_validation():
@@ -122,7 +120,9 @@ def test_the_requests_pass_botocores_validation():
     client = boto3.client("pricing", region_name=API_REGION, aws_access_key_id="x", aws_secret_access_key="x")
     products = as_built_in().values()
     with Stubber(client) as stubber:
-        for service, everywhere in dict.fromkeys((one.service, one.everywhere) for one in PRODUCTS.values()):
+        for service, everywhere in dict.fromkeys(
+            (SERVICES[one.service][1], one.everywhere) for one in LISTED.values()
+        ):
             found = [
                 json.dumps(one)
                 for one in products
@@ -141,11 +141,11 @@ def test_the_requests_pass_botocores_validation():
             stubber.add_response("get_products", rest, {**asked, "NextToken": "more"})
         listed = read(client, REGION, TODAY)
         stubber.assert_no_pending_responses()
-    assert (listed.each.keys(), listed.kept, listed.changed()) == (PRODUCTS.keys(), {}, {})
+    assert (listed.each.keys(), listed.kept, listed.changed()) == (LISTED.keys(), {}, {})
 
 
 def test_every_aws_price_is_requested():
-    assert PRICES.keys() - PRODUCTS.keys() == {"pubnub_publish", "pubnub_receive"}
+    assert PRICES.keys() - LISTED.keys() == {"pubnub_publish", "pubnub_receive"}
 
 
 def test_a_changed_price_is_reported_and_used():
@@ -154,10 +154,10 @@ def test_a_changed_price_is_reported_and_used():
     assert listed.changed() == {"rule": (0.15, pytest.approx(0.30))}
     line, rest = report.differences(listed).body
     assert line[1:] == ("0.15", "0.3")
-    assert rest[0].startswith(f"as built in: {len(PRODUCTS) - 1} of")
+    assert rest[0].startswith(f"as built in: {len(LISTED) - 1} of")
     changed, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
     more = sum(item.units for item in before if item.price == "rule") * 0.15e-6
-    assert line_items.total(changed) == pytest.approx(line_items.total(before) + more)
+    assert model.total(changed) == pytest.approx(model.total(before) + more)
     assert "2026-11-22" in listed.prices()["rule"].seen
 
 
@@ -273,7 +273,7 @@ def test_later_calls_use_the_kept_price_list_and_name_its_date(tmp_path):
     told = json.loads(run("--json", **environment).output)
     assert (told["prices_as_of"], told["region"]) == ("2026-11-22", "eu-north-1")
     assert told["prices_changed"] == {"rule": [0.15, pytest.approx(0.3)]}
-    expected = line_items.total(model.bill(Usage(), listed.prices()))
+    expected = model.total(model.bill(Usage(), listed.prices()))
     assert told["dollars_per_robot_hour"] == pytest.approx(expected)
     kept_at(environment).unlink()
     assert "List prices of 2025-06-01" in run(**environment).output
