@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -24,10 +25,9 @@ from iort_agent.errors import AskError
 from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.lanes import PingConfig
 from iort_agent.lanes.pings import Pings
-from iort_agent.mqtt.aws import IotCore
-from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link
+from iort_agent.runtime import make_uplink
 from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import RTT_FIELDS
@@ -158,16 +158,7 @@ class Connected:
         self.config = load_config(bundle.config)
         self.clock = SystemClock()
         self.lost = 0
-        self.uplink = IotCore(
-            endpoint=self.config.endpoint,
-            port=port or self.config.port,
-            client_id=self.config.robot,
-            certificate=self.config.certificate,
-            private_key=self.config.private_key,
-            root_ca=self.config.root_ca,
-            clock=self.clock,
-            dispatcher=Dispatcher(),
-        )
+        self.uplink = make_uplink(replace(self.config, port=port or self.config.port), self.clock)
 
     def __enter__(self) -> Self:
         connected = threading.Event()

@@ -32,17 +32,12 @@ def make_uplink(config: Config, clock: Clock) -> Uplink:
     """The connection of a robot's configuration."""
     # Reading a configuration must not need the network's library.
     from iort_agent.mqtt.aws import IotCore  # noqa: PLC0415 - it loads the library
+    from iort_agent.mqtt.client import Broker  # noqa: PLC0415 - as above
 
-    return IotCore(
-        endpoint=config.endpoint,
-        port=config.port,
-        client_id=config.robot,
-        certificate=config.certificate,
-        private_key=config.private_key,
-        root_ca=config.root_ca,
-        clock=clock,
-        dispatcher=Dispatcher(),
+    broker = Broker(
+        config.endpoint, config.port, config.robot, config.certificate, config.private_key, config.root_ca
     )
+    return IotCore(broker, clock=clock, dispatcher=Dispatcher())
 
 
 class Runtime:

@@ -12,7 +12,6 @@ import functools
 import logging
 import threading
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any, Callable
 
 from awscrt import mqtt5
@@ -20,7 +19,7 @@ from awscrt import mqtt5
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.mqtt.client import ClientFactory, keep_state, send_at_once
+from iort_agent.mqtt.client import Broker, ClientFactory, keep_state, send_at_once
 from iort_agent.mqtt.dispatch import Dispatcher, Subscriptions
 from iort_agent.mqtt.failures import (
     SETTLED_S,
@@ -47,42 +46,26 @@ _WE_STOPPED = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
 
 
 class IotCore:
-    """An `iort_agent.mqtt.uplink.Uplink` to one endpoint, as one robot. Without ``root_ca``, the system's
-    trust store must contain the broker's authority, as it does AWS'."""
+    """An `iort_agent.mqtt.uplink.Uplink` to one broker, as one robot."""
 
     def __init__(
         self,
+        broker: Broker,
         *,
-        endpoint: str,
-        port: int,
-        client_id: str,
-        certificate: Path,
-        private_key: Path,
-        root_ca: Path | None,
         clock: Clock,
         dispatcher: Dispatcher,
-        backoff: Backoff | None = None,
         keep_alive_s: int = KEEP_ALIVE_S,
         ping_timeout_s: float = PING_TIMEOUT_S,
     ) -> None:
-        self._endpoint, self._port = f"{endpoint}:{port}", port
-        self._client_id = client_id
+        self._broker, self._endpoint = broker, f"{broker.endpoint}:{broker.port}"
+        self._client_id = broker.client_id
         self._clock = clock
         self._dispatcher = dispatcher
-        self._factory = ClientFactory(
-            endpoint=endpoint,
-            port=port,
-            client_id=client_id,
-            certificate=certificate,
-            private_key=private_key,
-            root_ca=root_ca,
-            keep_alive_s=keep_alive_s,
-            ping_timeout_s=ping_timeout_s,
-        )
+        self._factory = ClientFactory(broker, keep_alive_s=keep_alive_s, ping_timeout_s=ping_timeout_s)
         self._client: Any = None
         self._generation = 0
         self._thread = Supervised("uplink", self._keep_connected)
-        self._backoff = backoff or Backoff()
+        self._backoff = Backoff()
         self._causes = Causes()
         # Set when the attempt or the connection has ended, or should end.
         self._down, self._client_stopped = threading.Event(), threading.Event()
@@ -193,7 +176,7 @@ class IotCore:
                 self._client.start()
                 while not self._clock.wait(self._down, _LOOK_S):
                     if self._connected and self._factory.replaced():
-                        _log.info("%s was replaced: connecting with it", self._factory.certificate_file)
+                        _log.info("%s was replaced: connecting with it", self._broker.certificate)
                         self._backoff.reset()
                         break
             finally:
@@ -256,7 +239,7 @@ class IotCore:
 
     def _on_connected(self, _: Any) -> None:
         keep_state()
-        send_at_once(self._port)
+        send_at_once(self._broker.port)
         self._switch(connected=True)
         self._connects += 1
         self._causes.connected()

@@ -11,7 +11,7 @@ import os
 import socket
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
@@ -31,31 +31,31 @@ _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _PEER, _INODE = 2, 9
 
 
-class ClientFactory:
-    """Makes clients for one endpoint and one robot, and notices when the files are replaced."""
+class Broker(NamedTuple):
+    """Where to connect, and as whom. Without ``root_ca``, the system's trust store must contain the broker's
+    authority, as it does AWS'."""
 
-    def __init__(
-        self,
-        *,
-        endpoint: str,
-        port: int,
-        client_id: str,
-        certificate: Path,
-        private_key: Path,
-        root_ca: Path | None,
-        keep_alive_s: int,
-        ping_timeout_s: float,
-    ) -> None:
-        self.certificate_file = certificate
-        self._files: tuple[Path, Path, Path | None] = (certificate, private_key, root_ca)
+    endpoint: str
+    port: int
+    client_id: str
+    certificate: Path
+    private_key: Path
+    root_ca: Path | None = None
+
+
+class ClientFactory:
+    """Makes clients for one broker, and notices when the files are replaced."""
+
+    def __init__(self, broker: Broker, *, keep_alive_s: int, ping_timeout_s: float) -> None:
+        self._files = broker[3:]
         self._build = functools.partial(
             mqtt5_client_builder.mtls_from_path,
-            str(certificate),
-            str(private_key),
-            endpoint=endpoint,
-            port=port,
-            ca_filepath=None if root_ca is None else str(root_ca),
-            client_id=client_id,
+            str(broker.certificate),
+            str(broker.private_key),
+            endpoint=broker.endpoint,
+            port=broker.port,
+            ca_filepath=None if broker.root_ca is None else str(broker.root_ca),
+            client_id=broker.client_id,
             keep_alive_interval_sec=keep_alive_s,
             ping_timeout_ms=round(ping_timeout_s * 1000),
             ack_timeout_sec=_ACK_TIMEOUT_S,
@@ -80,7 +80,7 @@ class ClientFactory:
         check_pair(*self._files[:2])
         client = self._build(client_bootstrap=self._bootstrap, **handlers)
         try:
-            self._certificate = read_certificate(self.certificate_file)
+            self._certificate = read_certificate(self._files[0])
         except IdentityError as error:
             # The library accepts the file, so the agent connects without knowing its id and validity.
             _log.warning("%s", error)

@@ -17,6 +17,7 @@ import pytest
 from iort_agent.common.threads import SystemClock
 from iort_agent.mqtt import aws, dispatch
 from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import SLOW_SHORTEST_S
 from iort_contract.topics import BROKER, CMD, PING, build_topic
@@ -53,17 +54,10 @@ class UplinkLog:
 
 @contextmanager
 def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[UplinkLog]:
-    settings: dict[str, Any] = {
-        "endpoint": "127.0.0.1",
-        "port": proxy.port,
-        "client_id": bundle.robot,
-        "certificate": bundle.folder / "certificate.pem",
-        "private_key": bundle.folder / "private.key",
-        "root_ca": bundle.folder / "root-ca.pem",
-        "clock": SystemClock(),
-        "dispatcher": Dispatcher(),
-    }
-    uplink = IotCore(**{**settings, **other})
+    files = [bundle.folder / name for name in ("certificate.pem", "private.key", "root-ca.pem")]
+    changes = {name: other.pop(name) for name in Broker._fields if name in other}
+    broker = Broker("127.0.0.1", proxy.port, bundle.robot, *files)._replace(**changes)
+    uplink = IotCore(broker, **{"clock": SystemClock(), "dispatcher": Dispatcher(), **other})
     log = UplinkLog(uplink, bundle.robot)
     uplink.start()
     try:

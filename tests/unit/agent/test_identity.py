@@ -26,6 +26,7 @@ from iort_agent.config import load_config
 from iort_agent.errors import BusyError, IdentityError, RefusedError, UplinkError
 from iort_agent.identity import check_pair, parse_certificate, read_certificate, stamp
 from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.verbs import provision as provision_module
 from iort_agent.verbs.provision import provision
@@ -158,16 +159,8 @@ def test_swapped_files_are_named_also_by_the_running_agent_and_of_a_claim(tmp_pa
         paths = tuple(tmp_path / name for name in named)
         with pytest.raises(IdentityError, match=why):
             check_pair(*paths)
-        uplink = IotCore(
-            endpoint="127.0.0.1",
-            port=9,
-            client_id="car1",
-            certificate=paths[0],
-            private_key=paths[1],
-            root_ca=None,
-            clock=SystemClock(),
-            dispatcher=Dispatcher(),
-        )
+        broker = Broker("127.0.0.1", 9, "car1", *paths)
+        uplink = IotCore(broker, clock=SystemClock(), dispatcher=Dispatcher())
         with pytest.raises(UplinkError, match=why):
             uplink.start()
         with pytest.raises(IdentityError, match=rf"^the claim: .*{why}"):

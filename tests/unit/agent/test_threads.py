@@ -24,6 +24,8 @@ from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import AgentError
 from iort_agent.files.folder import FilesConfig
 from iort_agent.lanes import PingConfig
+from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.node import Node
 from iort_agent.runtime import Runtime
@@ -193,7 +195,6 @@ def status(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
 
 def uplink(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
     """It tries to connect again."""
-    aws = pytest.importorskip("iort_agent.mqtt.aws")
     now = dt.datetime.now(dt.timezone.utc)
     certificate, key = made(now, now + dt.timedelta(days=1))
     files = {"certificate": folder / "certificate.pem", "private_key": folder / "private.key"}
@@ -201,15 +202,8 @@ def uplink(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
     files["private_key"].write_text(key)
     clock = Trap(kind)
     # Nothing listens at port 9 of this machine.
-    connection = aws.IotCore(
-        endpoint="127.0.0.1",
-        port=9,
-        client_id="car1",
-        root_ca=None,
-        clock=clock,
-        dispatcher=Dispatcher(),
-        **files,
-    )
+    broker = Broker("127.0.0.1", 9, "car1", **files)
+    connection = IotCore(broker, clock=clock, dispatcher=Dispatcher())
     connection.start()
     try:
         assert clock.back.wait(SOON_S)
