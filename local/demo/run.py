@@ -35,7 +35,8 @@ from iort_station.operations import audit
 from iort_station.page import answers as control
 from iort_station.page.answers import actions, answers
 from iort_station.page.history import downloads
-from iort_station.page.listening import Listening, listening
+from iort_station.page.listening import listening
+from iort_station.page.live import Listening
 from iort_station.page.motion import reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud

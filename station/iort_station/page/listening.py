@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from typing_extensions import Self
 
@@ -19,22 +18,8 @@ from iort_contract.topics import LIVE, check_robot, parse_topic
 from iort_station.cloud import Cloud
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
-from iort_station.page.live import Heard, OnUpdate, heard_of
+from iort_station.page.live import Listening, OnUpdate
 from iort_station.page.page import load_keys
-
-
-class Listening(Protocol):
-    """What `listening` returns, within its ``with`` block."""
-
-    @property
-    def heard(self) -> list[Heard]:
-        """The updates so far, in the order of arrival; none if ``on_update`` takes them."""
-        ...
-
-    @property
-    def malformed(self) -> int:
-        """How many messages were none."""
-        ...
 
 
 def listening(
@@ -63,8 +48,8 @@ def listening(
     )
 
 
-class BrokerListener:
-    """Subscribes as a viewer within a ``with`` block, and appends to `heard` or calls ``on_update``.
+class BrokerListener(Listening):
+    """Subscribes as a viewer.
 
     An update has the form of Lambda 1's without its times, and with all fields. A malformed message becomes
     an update that `decode_live_update` refuses, and that has its robot and the ``error``.
@@ -72,9 +57,7 @@ class BrokerListener:
 
     def __init__(self, cloud: Cloud, *, robot: str | None = None, on_update: OnUpdate | None = None) -> None:
         name = "+" if robot is None else check_robot(robot)
-        self.heard: list[Heard] = []
-        self.malformed = 0
-        self._on_update = on_update
+        super().__init__(on_update)
         self._broker = Broker(
             cloud, Role(cloud), filters=[f"{LIVE}/{cloud.namespace}/{name}/+"], on_message=self._take
         )
@@ -89,13 +72,7 @@ class BrokerListener:
         self._broker.__exit__(kind, error, trace)
 
     def _take(self, topic: str, message: bytes) -> None:
-        now_us = time.time_ns() // 1000
-        update = update_of(topic, message)
-        self.malformed += "error" in update
-        if self._on_update is not None:
-            self._on_update(update, 0, now_us)
-        elif "error" not in update:
-            self.heard.append(heard_of(update, now_us))
+        self.take(update_of(topic, message), 0)
 
 
 def update_of(topic: str, message: bytes) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -50,6 +51,27 @@ def heard_of(update: Mapping[str, Any], now_us: int) -> Heard:
         t_us=update[T_US],
         hops=hops,
     )
+
+
+class Listening:
+    """What a listener hears within its ``with`` block. Updates are in `heard` in the order of their arrival,
+    unless ``on_update`` takes them; `malformed` counts messages that are none."""
+
+    def __init__(self, on_update: OnUpdate | None) -> None:
+        self.heard: list[Heard] = []
+        self.malformed = 0
+        self._on_update = on_update
+
+    def take(self, update: Any, pubnub_us: int) -> None:
+        """Take an update that arrives now."""
+        now_us = time.time_ns() // 1000
+        try:
+            if self._on_update is not None:
+                self._on_update(update, pubnub_us, now_us)
+            else:
+                self.heard.append(heard_of(update, now_us))
+        except (KeyError, TypeError, ValueError):
+            self.malformed += 1
 
 
 @dataclass

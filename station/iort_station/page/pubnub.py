@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from types import TracebackType
 from typing import Any
 
@@ -19,14 +18,14 @@ from iort_contract.cloud import channel
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace
 from iort_station.errors import StationError
-from iort_station.page.live import Heard, OnUpdate, heard_of
+from iort_station.page.live import Listening, OnUpdate
 
 _log = logging.getLogger(__name__)
 _CONNECT_S = 15.0
 
 
-class Listener:
-    """Subscribes within a ``with`` block, and appends to `heard` or calls ``on_update``.
+class Listener(Listening):
+    """Subscribes at PubNub.
 
     ``robot=None`` listens to the whole fleet; ``token`` is PubNub's access token, if Access Manager is on.
     The delay compares the car's clock with this machine's, so it is only as good as they agree. Raises
@@ -44,6 +43,7 @@ class Listener:
         on_update: OnUpdate | None = None,
         token: str = "",
     ) -> None:
+        super().__init__(on_update)
         config = PNConfiguration()
         config.subscribe_key, config.user_id = subscribe_key, "iort-station"
         if origin:
@@ -52,21 +52,11 @@ class Listener:
         config.disable_config_locking = False
         config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
         self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
-        self._callback = _Callback(on_update)
+        self._callback = _Callback(self)
         self._client = PubNub(config, custom_request_handler=_Requests)
         if token:
             self._client.set_token(token)
         self._client.add_listener(self._callback)
-
-    @property
-    def heard(self) -> list[Heard]:
-        """The updates so far, in the order of arrival."""
-        return self._callback.heard
-
-    @property
-    def malformed(self) -> int:
-        """How many messages were none."""
-        return self._callback.malformed
 
     def __enter__(self) -> Self:
         self._client.subscribe().channels(self._channel).execute()
@@ -100,11 +90,9 @@ class _Requests(HttpxRequestHandler):  # type: ignore[misc]  # the SDK's class h
 
 
 class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
-    def __init__(self, on_update: OnUpdate | None) -> None:
-        self._on_update = on_update
+    def __init__(self, listening: Listening) -> None:
+        self._listening = listening
         self.connected = threading.Event()
-        self.heard: list[Heard] = []
-        self.malformed = 0
 
     def status(self, _pubnub: Any, status: Any) -> None:
         if status.category == PNStatusCategory.PNConnectedCategory:
@@ -114,15 +102,8 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
         pass
 
     def message(self, _pubnub: Any, message: Any) -> None:
-        now_us = time.time_ns() // 1000
-        update = message.message
-        # The SDK's thread must go on, whatever the update is and whatever its taker does.
+        # The SDK's thread must go on, whatever the update's taker does.
         try:
-            if self._on_update is not None:
-                self._on_update(update, int(message.timetoken) // 10, now_us)
-            else:
-                self.heard.append(heard_of(update, now_us))
-        except (KeyError, TypeError, ValueError):
-            self.malformed += 1
+            self._listening.take(message.message, int(message.timetoken) // 10)
         except Exception:  # noqa: BLE001 - a thread that ends in silence is worse
             _log.exception("a live message could not be taken")
