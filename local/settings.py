@@ -10,8 +10,8 @@ from typing import Any
 
 from typing_extensions import Self
 
+from iort_station.output import write_private
 from local.errors import LocalError
-from local.network.certificates import write_private
 
 FILE = "settings.json"
 # Closes again what an earlier start has opened.

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from iort_station.kept import LEDGER, START_BYTES, lock_of
+from iort_station.output import write_private
 from iort_station.page.background import BackgroundServer
 from local.errors import LocalError
-from local.network.certificates import write_private
 from local.settings import FILE, Settings
 
 # Of what a kept folder holds. A folder of a newer version is refused, one of an older version is converted.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import ssl
 from collections.abc import Iterable
 from contextlib import suppress
@@ -16,6 +15,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from iort_station.output import write_private
 from local.errors import LocalError
 
 # A server's certificate in the network, and what is left of it when it gets a new one.
@@ -148,21 +148,6 @@ class ServerCertificate:
 
     def _read(self) -> x509.Certificate:
         return x509.load_pem_x509_certificate(self.path.read_bytes())
-
-
-def write_private(path: Path, content: bytes) -> None:
-    """Write a file that only its owner can read; a reader sees the old one or the new one."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    parent = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(parent)
-    finally:
-        os.close(parent)
 
 
 def is_address(host: str) -> bool:

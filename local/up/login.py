@@ -13,9 +13,9 @@ from typing import TextIO
 from argon2 import PasswordHasher, extract_parameters
 from argon2.exceptions import InvalidHashError, VerificationError
 
+from iort_station.output import write_private
 from iort_station.page.places import client_of
 from local.errors import LocalError
-from local.network.certificates import write_private
 
 LEAST_CHARACTERS = 10
 _MOST_CHARACTERS = 1_000

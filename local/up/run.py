@@ -25,9 +25,9 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE
 from iort_station.errors import StationError
+from iort_station.output import write_private
 from local.cloud import EmbeddedCloud
 from local.errors import EmulatorError, LocalError
-from local.network.certificates import write_private
 from local.network.listen import Listen, is_ipv6
 from local.settings import FILE, NO, Settings
 from local.state import VERSION, StateFolder

@@ -21,6 +21,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station import kept
 from iort_station.errors import StationError
+from iort_station.output import write_private
 
 if TYPE_CHECKING:
     import boto3
@@ -166,10 +167,7 @@ class Cloud:
 
     def save(self, path: Path) -> None:
         """Write the file that `load` reads, whole at any moment; it has a secret."""
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            json.dump(asdict(self), file)
-        part.replace(path)
+        write_private(path, json.dumps(asdict(self)))
 
     @cached_property
     def _session(self) -> boto3.Session:

@@ -7,7 +7,6 @@ enforces. A rotation deletes the old certificates once the robot has stayed conn
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.registry import F1TENTH
+from iort_station.output import write_private
 
 if TYPE_CHECKING:
     from types_boto3_iot import IoTClient
@@ -185,12 +185,6 @@ def configure(bundle: Bundle, settings: Mapping[str, Any]) -> None:
     """Change settings in a bundle's car.yaml."""
     config = yaml.safe_load(bundle.config.read_text())
     write_private(bundle.config, yaml.safe_dump({**config, **settings}, sort_keys=False))
-
-
-def write_private(path: Path, text: str) -> None:
-    """Write a file that only its owner can read."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-        file.write(text)
 
 
 if TYPE_CHECKING:
