@@ -228,16 +228,16 @@ def upload(options: argparse.Namespace) -> int:
     config = load_config(options.config)
     results = upload_files(config, options.files, status_socket=_socket(options, config))
     failed = False
-    found = []
+    rows = []
     for result in results:
         failed |= result.error is not None
-        found.append({**result._asdict(), "path": str(result.path)})
+        rows.append({**result._asdict(), "path": str(result.path)})
         if result.error is not None:
             print(f"iort-agent: {neutral(result.error)}", file=sys.stderr)
         elif not options.json:
             print(neutral(str(result.key)), flush=True)
     if options.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(rows, indent=2))
     return 1 if failed else 0
 
 

@@ -49,10 +49,10 @@ class Certificate(NamedTuple):
         """The host names and addresses of a server's certificate. Raises `IdentityError` as `validity`."""
         x509, read = load_x509(), self._read()
         try:
-            found = read.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+            extension = read.extensions.get_extension_for_class(x509.SubjectAlternativeName)
         except (x509.ExtensionNotFound, ValueError):
             return []
-        return [str(name.value) for name in found.value]
+        return [str(name.value) for name in extension.value]
 
     def issuer(self) -> str:
         """Who signed it. Raises `IdentityError` as `validity`."""
@@ -89,11 +89,11 @@ def read_certificate(path: Path) -> Certificate:
 
 def parse_certificate(pem: str) -> Certificate:
     """Parse the first certificate of a PEM text. Raises `IdentityError` if there is none."""
-    found = _PEM.search(pem)
-    if found is None:
+    match = _PEM.search(pem)
+    if match is None:
         raise IdentityError("holds no PEM certificate")
     try:
-        return Certificate(ssl.PEM_cert_to_DER_cert(found[0]))
+        return Certificate(ssl.PEM_cert_to_DER_cert(match[0]))
     except ValueError as error:
         raise IdentityError(f"is not an X.509 certificate: {error}") from error
 

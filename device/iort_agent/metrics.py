@@ -85,9 +85,9 @@ class Accounts:
             "damaged_files": self._spool.damaged,
         }
         for source, report in [("queue", queue), *((name, report()) for name, report in self._reports)]:
-            found = {path: count for path, count in _counts(report, "") if count}
-            if found:
-                self._streams.record(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
+            counts_by_path = {path: count for path, count in _counts(report, "") if count}
+            if counts_by_path:
+                self._streams.record(ACCOUNT_STREAM, now_us, SourceAccount(source, counts_by_path).sample())
 
     def _losses(self) -> int:
         return self._streams.refused() + self._spool.dropped().samples + self._spool.damaged

@@ -172,10 +172,10 @@ class Runtime:
                 self._stop.set()
 
     def _check_sources(self) -> None:
-        found = self.agent.streams.counts()
+        streams = self.agent.streams.counts()
         for source in self.agent.sources:
-            counts = [found[name] for name in source.streams if name in found]
-            source.check_stored([(one.samples, one.refused) for one in counts])
+            counts = [streams[name] for name in source.streams if name in streams]
+            source.check_stored([(count.samples, count.refused) for count in counts])
 
     def _drain(self, drain_s: float | None, *, stopped: bool) -> bool:
         """Deliver the rest; whether all was delivered, or is kept for the run after a stopped one."""
@@ -193,19 +193,19 @@ class Runtime:
                 _log.error("%d samples were dropped: the queue was full or damaged", dropped.samples)
             return dropped.batches == 0
         left = spool.backlog()
-        kept = f"{left.samples} samples in {left.batches} batches were not delivered"
+        rest = f"{left.samples} samples in {left.batches} batches were not delivered"
         if not spool.durable:
-            _log.error("%s and are lost: the queue is in memory, see queue.path", kept)
+            _log.error("%s and are lost: the queue is in memory, see queue.path", rest)
         elif stopped:
-            _log.warning("%s; the next run sends them, or `iort-agent flush`", kept)
+            _log.warning("%s; the next run sends them, or `iort-agent flush`", rest)
         else:
             # The next run would play a recording again.
-            _log.error("%s; they are in the queue: `iort-agent flush` sends them", kept)
+            _log.error("%s; they are in the queue: `iort-agent flush` sends them", rest)
         return spool.durable and stopped
 
     def _wait(self, empty: Callable[[float], bool], drain_s: float | None, tell: Callable[[], None]) -> bool:
         """Wait until ``empty``, as `run` says of ``drain_s``; whether it is. ``tell`` logs the progress."""
-        waited = told = 0.0
+        waited = logged = 0.0
         while True:
             if drain_s is None and (self._asked or self._broken):
                 drain_s = waited + self._stopped_s
@@ -215,8 +215,8 @@ class Runtime:
             waited += look_s
             if drain_s is not None and waited >= drain_s:
                 return False
-            if waited - told >= self._progress_s:
-                told = waited
+            if waited - logged >= self._progress_s:
+                logged = waited
                 tell()
 
     def _tell_left(self) -> None:

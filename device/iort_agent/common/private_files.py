@@ -93,8 +93,8 @@ def make_private(path: Path) -> None:
         # An existing file is not opened: closing a file that SQLite has open would release SQLite's locks.
         os.close(os.open(path, _WRITE, _MODE))
     except FileExistsError:
-        found = os.lstat(path)
-        if stat.S_ISLNK(found.st_mode):
+        status = os.lstat(path)
+        if stat.S_ISLNK(status.st_mode):
             raise OSError(f"{path} is a link, which is not followed: name the file itself") from None
-        if stat.S_IMODE(found.st_mode) & 0o077:
-            path.chmod(found.st_mode & 0o700)
+        if stat.S_IMODE(status.st_mode) & 0o077:
+            path.chmod(status.st_mode & 0o700)

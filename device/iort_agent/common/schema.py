@@ -41,9 +41,9 @@ class Place(NamedTuple):
         """A path in the file is relative to the file."""
         return self.file.parent / Path(value).expanduser()
 
-    def error(self, found: Any, allowed: str, hint: str = "") -> ConfigError:
+    def error(self, value: Any, allowed: str, hint: str = "") -> ConfigError:
         """The error for a value found here."""
-        return self.problem(f"must be {allowed}, got {show(found)}{hint}")
+        return self.problem(f"must be {allowed}, got {show(value)}{hint}")
 
     def problem(self, text: str) -> ConfigError:
         """The error for another problem here."""
@@ -215,7 +215,7 @@ def load(cls: type[T], value: Any, place: Place) -> T:
         if key not in rules:
             hint = did_you_mean(key, rules)
             raise place.child(key).problem(f"unknown key{hint}; must be one of {', '.join(rules)}")
-    loaded = {name: rules[name](found, place.child(name)) for name, found in value.items()}
+    loaded = {name: rules[name](item, place.child(name)) for name, item in value.items()}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]  # T is any dataclass
         if field.name not in loaded and field.default is dataclasses.MISSING:
             raise place.child(field.name).problem("required, and missing")
@@ -250,7 +250,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def did_you_mean(found: Any, names: Iterable[str]) -> str:
+def did_you_mean(word: Any, names: Iterable[str]) -> str:
     """A hint with the closest of the names; empty if none is close."""
-    close = difflib.get_close_matches(str(found), list(names), n=1)
+    close = difflib.get_close_matches(str(word), list(names), n=1)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -191,30 +191,30 @@ class Report:
     files: Optional[Files]
 
 
-def document(told: Union[Status, Report]) -> Dict[str, Any]:
+def document(state: Union[Status, Report]) -> Dict[str, Any]:
     """The JSON document. A report has no key for a part that the agent does not have."""
-    found = dataclasses.asdict(told)
-    if isinstance(told, Report):
-        found = {name: value for name, value in found.items() if value is not None}
-    return found
+    values = dataclasses.asdict(state)
+    if isinstance(state, Report):
+        values = {name: value for name, value in values.items() if value is not None}
+    return values
 
 
-def read(cls: Type[T], found: Mapping[str, Any]) -> T:
+def read(cls: Type[T], values: Mapping[str, Any]) -> T:
     """The dataclass of a JSON document. Ignores keys that it does not know; raises `KeyError` for one that
     is missing."""
-    return cls(**{name: _value(hint, found[name]) for name, hint in get_type_hints(cls).items()})
+    return cls(**{name: _value(hint, values[name]) for name, hint in get_type_hints(cls).items()})
 
 
-def _value(hint: Any, found: Any) -> Any:
+def _value(hint: Any, value: Any) -> Any:
     """A value of the type that a field has: a dataclass, or a list, dictionary or `Optional` of one."""
     if dataclasses.is_dataclass(hint):
-        return read(hint, found)  # type: ignore[arg-type]  # a type, as it comes from an annotation
+        return read(hint, value)  # type: ignore[arg-type]  # a type, as it comes from an annotation
     kind: Any = getattr(hint, "__origin__", None)
     inner: Tuple[Any, ...] = getattr(hint, "__args__", ())
     if kind is Union:
-        return None if found is None else _value(inner[0], found)
+        return None if value is None else _value(inner[0], value)
     if kind is list:
-        return [_value(inner[0], item) for item in found]
+        return [_value(inner[0], item) for item in value]
     if kind is dict:
-        return {name: _value(inner[1], item) for name, item in found.items()}
-    return found
+        return {name: _value(inner[1], item) for name, item in value.items()}
+    return value

@@ -290,7 +290,7 @@ class Commands:
 
     def report(self) -> dict[str, Any]:
         """The passed and the limited commands and the published stops, by name."""
-        return {one.name: one.report() for one in self._commands.values()}
+        return {command.name: command.report() for command in self._commands.values()}
 
     def alarms(self) -> list[str]:
         """Why no motion may pass."""

@@ -180,26 +180,31 @@ class DownlinkConfig:
     def motions(self) -> dict[str, dict[str, Any]]:
         """The ROS topics that move the robot: the type, and the message that stops it."""
         return {
-            one.topic: {"type": one.type, "stop": one.motion.stop}
-            for _, one in self.cmd
-            if one.motion is not None
+            command.topic: {"type": command.type, "stop": command.motion.stop}
+            for _, command in self.cmd
+            if command.motion is not None
         }
 
     def check_topics(self) -> None:
         """Raise `ContractError` for a command without motion on a topic that moves the robot, since neither a
         lease nor the emergency stop would end what it began, and for two stops of one topic."""
-        moved = {one.topic: (name, one) for name, one in reversed(self.cmd) if one.motion is not None}
-        for name, one in self.cmd:
-            first, other = moved.get(one.topic, (name, one))
-            if one.motion is None and other.motion is not None:
-                raise ContractError(
-                    f"cmd.{name} must have motion, as cmd.{first} has: {one.topic} moves the robot"
-                )
-            if other.motion is None or one.motion is None:
+        moved = {
+            command.topic: (name, command)
+            for name, command in reversed(self.cmd)
+            if command.motion is not None
+        }
+        for name, command in self.cmd:
+            first, other = moved.get(command.topic, (name, command))
+            if other.motion is None:
                 continue
-            if one.type != other.type or one.motion.stop != other.motion.stop:
+            topic = command.topic
+            if command.motion is None:
                 raise ContractError(
-                    f"cmd.{name} must have the type and motion.stop of cmd.{first}: both are for {one.topic}"
+                    f"cmd.{name} must have motion, as cmd.{first} has: {topic} moves the robot"
+                )
+            if command.type != other.type or command.motion.stop != other.motion.stop:
+                raise ContractError(
+                    f"cmd.{name} must have the type and motion.stop of cmd.{first}: both are for {topic}"
                 )
 
     def drive_limits(self) -> DriveLimits | None:
@@ -227,11 +232,11 @@ def share_rule() -> Rule:
     shares = pairs(section(ShareConfig), what="a mapping of ROS topic to name and rate", key=text(ros_name))
 
     def rule(value: Any, place: Place) -> Any:
-        found = shares(value, place)
-        names = [settings.name for _, settings in found]
-        for i, (topic, settings) in enumerate(found):
+        topics = shares(value, place)
+        names = [settings.name for _, settings in topics]
+        for i, (topic, settings) in enumerate(topics):
             if settings.name in names[:i]:
                 raise place.child(topic).problem(f"another topic is shared as {settings.name} already")
-        return found
+        return topics
 
     return rule

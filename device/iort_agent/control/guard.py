@@ -100,8 +100,8 @@ class Guard:
     def __init__(
         self, agent: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock, queue: Path | None = None
     ) -> None:
-        kept = str(queue.absolute()) if queue is not None else None
-        self._first = _line({"agent": agent, "stops": stops, "queue": kept})
+        file = str(queue.absolute()) if queue is not None else None
+        self._first = _line({"agent": agent, "stops": stops, "queue": file})
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
         # What it must know after a restart, by topic.
@@ -145,7 +145,9 @@ class Guard:
                 self._write(b"\n")
             return
         self._start_at = now + _AGAIN_S
-        remappings = [one for one in sys.argv if ":=" in one and not one.startswith("__name:=")]
+        remappings = [
+            argument for argument in sys.argv if ":=" in argument and not argument.startswith("__name:=")
+        ]
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own module
                 [sys.executable, "-m", PROCESS, *remappings],
@@ -243,7 +245,7 @@ class _Guard:
     def __init__(self, config: Mapping[str, Any]) -> None:
         self._agent: str = config["agent"]
         self.node, self._clock = shared(f"{self._agent}_guard"), SystemClock()
-        self._motions = {topic: _Motion(self.node, topic, one) for topic, one in config["stops"].items()}
+        self._motions = {topic: _Motion(self.node, topic, stop) for topic, stop in config["stops"].items()}
         # Stops since the last news of a lease. At its end the agent publishes a stop itself, and tells it.
         self._stops = 0
         self._joined: float | None = None

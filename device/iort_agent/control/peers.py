@@ -61,7 +61,7 @@ class Peers:
 
     def report(self) -> dict[str, dict[str, int]]:
         """The passed messages of each name, by robot."""
-        return {name: dict(one.passed) for name, one in self._names.items()}
+        return {name: dict(heard.passed) for name, heard in self._names.items()}
 
     def _on_message(self, message: MqttMessage) -> None:
         topic = parse_topic(message.topic)
@@ -128,50 +128,50 @@ class Shares:
         self._shares = [
             _Shared(topic, settings, self._link.topic(FLEET, settings.name)) for topic, settings in share
         ]
-        for one in self._shares:
-            bridge.graph.subscribe(one.ros_topic, functools.partial(self._on_ros, one))
+        for shared in self._shares:
+            bridge.graph.subscribe(shared.ros_topic, functools.partial(self._on_ros, shared))
 
     def tick(self) -> float | None:
         """Send the messages that are due. Returns when to call again; None while no message waits."""
         with self._lock:
-            for one in self._shares:
-                self._send(one)
-            return min((one.due for one in self._shares if one.newest is not None), default=None)
+            for shared in self._shares:
+                self._send(shared)
+            return min((shared.due for shared in self._shares if shared.newest is not None), default=None)
 
     def report(self) -> dict[str, int]:
         """The sent messages of each ROS topic."""
-        return {one.ros_topic: one.seq for one in self._shares}
+        return {heard.ros_topic: heard.seq for heard in self._shares}
 
-    def _on_ros(self, one: _Shared, header: Mapping[str, str], data: bytes) -> None:
+    def _on_ros(self, shared: _Shared, header: Mapping[str, str], data: bytes) -> None:
         with self._lock:
-            waited = one.newest is not None
-            one.newest = (header, data, self._clock.monotonic())
-            self._send(one)
-            waits = one.newest is not None
+            waited = shared.newest is not None
+            shared.newest = (header, data, self._clock.monotonic())
+            self._send(shared)
+            waits = shared.newest is not None
         # The thread knows of a message that waited before. Waking it for each of a thousand messages a second
         # would cost more than sending does.
         if waits and not waited:
             self._wake()
 
-    def _send(self, one: _Shared) -> None:
+    def _send(self, shared: _Shared) -> None:
         now = self._clock.monotonic()
-        if one.newest is None or now < one.due:
+        if shared.newest is None or now < shared.due:
             return
-        if not self._link.rate_limiter.may_go(STEADY, one.topic, len(one.newest[1])):
-            one.due = now + _NO_ROOM_S
+        if not self._link.rate_limiter.may_go(STEADY, shared.topic, len(shared.newest[1])):
+            shared.due = now + _NO_ROOM_S
             return
-        (header, data, at), one.newest = one.newest, None
+        (header, data, at), shared.newest = shared.newest, None
         if now - at > FLEET_MAX_AGE_MS / 1000 or not self._link.uplink.connected():
             return
         try:
-            message = decode(one.definition(header), data)
+            message = decode(shared.definition(header), data)
             payload = encode_fleet(
-                FleetMessage(self._boot, one.seq, self._clock.now_us(), message, self._bridge.offset_us())
+                FleetMessage(self._boot, shared.seq, self._clock.now_us(), message, self._bridge.offset_us())
             )
         except (ContractError, MessageError) as error:
-            self._bridge.reject(f"share {one.ros_topic}", "cannot_be_sent", str(error))
+            self._bridge.reject(f"share {shared.ros_topic}", "cannot_be_sent", str(error))
             return
-        one.seq += 1
-        one.due = max(one.due, now - one.period_s / 2) + one.period_s
+        shared.seq += 1
+        shared.due = max(shared.due, now - shared.period_s / 2) + shared.period_s
         # A lost message is not repeated: the next one follows soon.
-        self._link.publish(one.topic, payload, qos=0)
+        self._link.publish(shared.topic, payload, qos=0)

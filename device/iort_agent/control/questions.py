@@ -142,10 +142,10 @@ class Questions:
         """The question's message; raises `AskError`."""
         try:
             text = to_json(body)
-            given = body if len(text) <= MAX_INLINE_BYTES else self._uploaded(request_id, text, wait)
+            content = body if len(text) <= MAX_INLINE_BYTES else self._uploaded(request_id, text, wait)
             left_ms = max(1, round((until - self._clock.monotonic()) * 1000))
             return encode_ask(
-                Ask(request_id, self._clock.now_us(), left_ms, given, offset_us(self._offset()))
+                Ask(request_id, self._clock.now_us(), left_ms, content, offset_us(self._offset()))
             )
         except ContractError as error:
             raise AskError(INVALID, str(error)) from error
@@ -268,8 +268,8 @@ class Asks:
             self._bridge.reject(asked_on(name), "too_many", f"{_MOST_WAITING} questions wait already")
 
     def _run(self) -> None:
-        while (asked := self._queue.get()) is not None:
-            name, config, text = asked
+        while (question := self._queue.get()) is not None:
+            name, config, text = question
             try:
                 body = json_object(text, "the question") if text.strip() else config.question()
                 answer: Mapping[str, Any] = {"body": self._ask(name, config, body)}

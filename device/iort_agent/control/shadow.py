@@ -260,17 +260,20 @@ class Shadow:
             self._apply(settings)
         self._news = True
 
-    def _note_over_share(self, said: OverShare) -> None:
+    def _note_over_share(self, over_share: OverShare) -> None:
         """Note that the cloud put off batches, and log it once."""
-        before, self.over_share = self.over_share, said
-        if before is None or before.since_ms != said.since_ms:
+        before, self.over_share = self.over_share, over_share
+        if before is None or before.since_ms != over_share.since_ms:
             _log.warning(
                 "more is recorded than this robot's share of the cloud: summaries are made later, "
                 "and nothing is lost"
             )
 
     def _state(self) -> dict[str, Any]:
-        rejected = {name: one._replace(value=_quoted(one.value)) for name, one in self._rejected.items()}
+        rejected = {
+            name: rejection._replace(value=_quoted(rejection.value))
+            for name, rejection in self._rejected.items()
+        }
         settings = self.settings.by_name()
         return encode_reported(
             Reported(settings, rejected, dict(self._answers), self._agent_version, self._drive, self._moves)

@@ -113,13 +113,13 @@ class Session:
                 self._accepted(body[0] if body else 0)
 
     def _read(self, count: int) -> bytes:
-        found = b""
-        while len(found) < count:
-            more = self._socket.recv(count - len(found))
+        data = b""
+        while len(data) < count:
+            more = self._socket.recv(count - len(data))
             if not more:
                 raise ConnectionResetError("the broker hangs up")
-            found += more
-        return found
+            data += more
+        return data
 
 
 def _text(text: str) -> bytes:

@@ -114,7 +114,7 @@ def _queue(config: Config) -> Iterator[Finding]:
 
 def emergency_stop(config: Config) -> Finding:
     """Whether the robot can be stopped from afar."""
-    commands = [name for name, one in config.downlink.cmd if one.motion is not None]
+    commands = [name for name, command in config.downlink.cmd if command.motion is not None]
     if not commands:
         todo = "give downlink.cmd a command with motion, or whoever can stop the robot another way"
         return Finding("emergency stop", WARN, f"does nothing here: {NO_MOTION}", todo)

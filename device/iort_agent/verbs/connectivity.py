@@ -79,9 +79,9 @@ def _distrusted(config: Config, address: str, error: ssl.SSLCertVerificationErro
     now = utc(time.time())
     if shown is not None and error.verify_code in (_EXPIRED, _NOT_YET_VALID):
         validity = shown.validity()
-        said = "ended on" if error.verify_code == _EXPIRED else "is valid from"
+        verb = "ended on" if error.verify_code == _EXPIRED else "is valid from"
         at = validity.not_after_s if error.verify_code == _EXPIRED else validity.not_before_s
-        text = f"{said} {utc(at)}, and this machine's clock says {now}"
+        text = f"{verb} {utc(at)}, and this machine's clock says {now}"
         return text, f"if {now} is wrong, {SET_CLOCK}; if it is right, restart the cloud, which renews it"
     if shown is not None and error.verify_code in _WRONG_NAMES:
         text = f"is for {', '.join(shown.names()) or 'no name'}, and not for {config.endpoint}"
@@ -110,9 +110,9 @@ def _unverified(config: Config, address: str) -> Certificate | None:
     with suppress(OSError, IdentityError):
         raw = socket.create_connection((address, config.port), TIMEOUT_S)
         with closing(raw), closing(context.wrap_socket(raw, server_hostname=config.endpoint)) as secure:
-            found = Certificate(secure.getpeercert(binary_form=True) or b"")
-        found.validity()
-        return found
+            certificate = Certificate(secure.getpeercert(binary_form=True) or b"")
+        certificate.validity()
+        return certificate
     return None
 
 
@@ -191,7 +191,7 @@ def check_connection(config: Config, running: Status | None = None) -> Iterator[
 
 def _addresses(endpoint: str, port: int) -> list[str]:
     try:
-        found = socket.getaddrinfo(endpoint, port, type=socket.SOCK_STREAM)
+        rows = socket.getaddrinfo(endpoint, port, type=socket.SOCK_STREAM)
     except OSError as error:
         if error.errno == socket.EAI_AGAIN:
             todo = (
@@ -203,7 +203,7 @@ def _addresses(endpoint: str, port: int) -> list[str]:
             "robot's /etc/hosts; its IP address as `endpoint` needs neither"
         )
         raise BlockedError("name", f"{endpoint} does not resolve: {error.strerror or error}", todo) from error
-    return list(dict.fromkeys(str(one[4][0]) for one in found))
+    return list(dict.fromkeys(str(row[4][0]) for row in rows))
 
 
 def _route(addresses: list[str]) -> str:
@@ -323,11 +323,11 @@ def _files(config: Config, session: Session) -> Finding:
     empty = File("check", "other", "application/octet-stream", 0, nothing, time.time_ns() // 1000)
     request = encode_file_request(FileRequest(uuid.uuid4().hex, empty, {1: nothing}))
     ask, answered = (build_topic(lane, config.robot, FILE, config.namespace) for lane in (PING, PONG))
-    told = session.round_trip(ask, request, answered, _FILE_ANSWER_S)
-    if told is None:
+    payload = session.round_trip(ask, request, answered, _FILE_ANSWER_S)
+    if payload is None:
         todo = "`iort errors` and `iort alarms` at the cloud tell of the function Upload"
         return Finding("files", WARN, f"the cloud names no address in {_FILE_ANSWER_S:g} s", todo)
-    answer = decode_file_answer(told)
+    answer = decode_file_answer(payload)
     if not answer.addresses:
         return Finding(
             "files", WARN, f"refused: {answer.refused}", "is the robot registered? `iort robots list`"

@@ -153,9 +153,9 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
     lines = file.read_text(encoding="utf-8").splitlines()
     for name, value in settings.items():
         line = f"{name}: {yaml.safe_dump(value).splitlines()[0]}"
-        found = [i for i, old in enumerate(lines) if re.match(rf"{name}\s*:", old)]
-        if found:
-            lines[found[0]] = line
+        places = [i for i, old in enumerate(lines) if re.match(rf"{name}\s*:", old)]
+        if places:
+            lines[places[0]] = line
         else:
             lines.insert(0, line)
     updated = "\n".join(lines) + "\n"

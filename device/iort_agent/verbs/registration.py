@@ -228,8 +228,8 @@ class Exchange:
         """Returns the certificate for a signing request, and the token that proves its ownership."""
         from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
-        asked = iotidentity.CreateCertificateFromCsrRequest(certificate_signing_request=request)
-        answer = _result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(asked))
+        csr = iotidentity.CreateCertificateFromCsrRequest(certificate_signing_request=request)
+        answer = _result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(csr))
         return str(answer.certificate_pem), str(answer.certificate_ownership_token)
 
     def register(self, token: str, parameters: Mapping[str, str]) -> str:

@@ -122,11 +122,11 @@ class FakeGuard:
     def __init__(self, clock: ManualClock) -> None:
         self.clock = clock
         self.told: list[tuple[float, float | None, bool]] = []
-        self.stops = True
+        self.stops = self.up = True
         self.left = False
 
     def ready(self) -> bool:
-        return True
+        return self.up
 
     def tell(self, _topic: str, until: float | None, *, held: bool) -> bool:
         self.told.append((self.clock.monotonic(), until, held))

@@ -20,6 +20,7 @@ import pytest
 from iort_agent.control import guard as guard_module
 from iort_agent.control.guard import Guard, StopFile
 from iort_agent.control.leases import STOP_AHEAD_MS
+from iort_contract.messages.control.driving import NO_GUARD
 from iort_contract.ros1.definition import parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles
@@ -137,6 +138,22 @@ def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.M
     before = len(node.published)
     guarded(node, monkeypatch, ["/speed", None, True], ["/speed", None, False])
     assert len(node.published) == before
+
+
+def test_without_the_guard_no_motion_passes_and_an_alarm_says_why() -> None:
+    clock = ManualClock(now_us=T0)
+    guard = FakeGuard(clock)
+    rig, guard.up = Rig(clock=clock, guard=guard), False
+    rig.send({"data": 1.0})
+    rig.send({"data": "hello"}, name="say", lease_ms=None)
+    assert [topic for topic, _ in rig.graph.published] == ["/say"]
+    assert rig.refused() == {f"cmd/iort/car1/speed {NO_GUARD}": 1}
+    assert rig.downlink.alarms() == ["the guard does not run yet: no motion until it does"]
+    assert rig.downlink.report()["guard"] is False
+    guard.up = True
+    rig.send({"data": 1.0})
+    assert len(rig.graph.published) == 2
+    assert rig.downlink.alarms() == []
 
 
 class DyingError(Exception):
