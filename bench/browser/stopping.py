@@ -26,7 +26,8 @@ from iort_station.fleet import robots, stopping
 from iort_station.page import answers as control
 from iort_station.page import motion
 from iort_station.page.answers import actions, answers
-from iort_station.page.server import Handler, PageServer
+from iort_station.page.requests import Handler
+from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 from local.figures import Spread

@@ -25,8 +25,7 @@ from iort_station.fleet.roles import has_drivers
 from iort_station.operations import alarms, cloudwatch
 from iort_station.page import history, insights, motion
 from iort_station.page.page import DRIVE
-from iort_station.page.requests import text, whole
-from iort_station.page.server import Handler
+from iort_station.page.requests import Handler, text, whole
 
 # A viewer waits for a robot's answer.
 _ANSWER_S = 10.0

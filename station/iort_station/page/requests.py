@@ -1,4 +1,4 @@
-"""Requests to the page's server and its answers: parameters, and bodies, plain and packed."""
+"""Requests to the page's server and its answers: parameters, errors, and bodies, plain and packed."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Generator, Mapping
+from typing import Any, NamedTuple, TypeVar
 
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.limits import ContractError
 from iort_station.errors import StationError
 from iort_station.page.page import TYPES
 
+# What waits for a robot yields whenever it does, and holds no place meanwhile.
+Waiting = Generator[None, None, Mapping[str, Any]]
+Handler = Callable[[Mapping[str, str]], Mapping[str, Any] | Waiting]
+_T = TypeVar("_T")
 # A coding of Accept-Encoding and its weight.
 _CODING = re.compile(r"([^\s,;]+)\s*(?:;\s*q\s*=\s*([0-9.]+))?")
 
@@ -79,3 +86,36 @@ def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
     if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
         raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
     return int(found)
+
+
+def answered(answer: Handler, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
+    """The answer, or what waits for it."""
+
+    def begun() -> tuple[int, Body] | Waiting:
+        result = answer(parameters)
+        return result if isinstance(result, Generator) else (200, as_json(result, level=1))
+
+    return tried(begun)
+
+
+def stepped(waiting: Waiting) -> tuple[int, Body] | None:
+    """The answer; None if it has yet to come."""
+
+    def step() -> tuple[int, Body] | None:
+        try:
+            next(waiting)
+        except StopIteration as end:
+            return 200, as_json(end.value, level=1)
+        return None
+
+    return tried(step)
+
+
+def tried(work: Callable[[], _T]) -> _T | tuple[int, Body]:
+    """The result, or the status and the body of its error."""
+    try:
+        return work()
+    except (StationError, ContractError) as error:
+        return 400, as_json({"error": str(error)})
+    except (BotoCoreError, ClientError) as error:
+        return 502, as_json({"error": f"AWS refused a call: {error}"})

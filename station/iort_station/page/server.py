@@ -17,20 +17,18 @@ import re
 import secrets
 import ssl
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Generator, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, TypeVar
+from typing import Literal
 from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
-from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
 from iort_contract.cloud import PUBNUB
-from iort_contract.limits import ContractError
 from iort_contract.messages.page import Admitted, Identity
 from iort_contract.page import (
     HEADERS,
@@ -46,15 +44,11 @@ from iort_station.page.background import BackgroundServer
 from iort_station.page.invitations import COMMAND, answer, listening
 from iort_station.page.page import BUILT, DRIVE, TYPES, built_files, config
 from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of, off_the_loop
-from iort_station.page.requests import Body, as_json, packed, takes_gzip
+from iort_station.page.requests import Body, Handler, answered, as_json, packed, stepped, takes_gzip, tried
 
-# What waits yields whenever it does, and holds no place meanwhile.
-Waiting = Generator[None, None, Mapping[str, Any]]
-Handler = Callable[[Mapping[str, str]], Mapping[str, Any] | Waiting]
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
 Vehicles = Mapping[str, Mapping[str, float]]
-_T = TypeVar("_T")
 _log = logging.getLogger("iort")
 
 # A connection without a request is closed after this time.
@@ -221,8 +215,9 @@ class PageServer(BackgroundServer):
     async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer with a file, or with the result of one of ``answers``."""
         if not self._accepts(request.headers.get("Host", "")):
-            refused = "this server answers to localhost, to addresses and to what --name says"
-            return self._response(request, as_json({"error": refused}), 403)
+            return self._refusal(
+                request, 403, "this server answers to localhost, to addresses and to what --name says"
+            )
         path = request.raw_path.partition("?")[0]
         if request.method == "POST" and path == ADMISSION and self._keyed:
             return await self._act(request, path, self._admit)
@@ -252,7 +247,7 @@ class PageServer(BackgroundServer):
         """One reading for all who ask meanwhile; who has waited long enough gets the last one's."""
         if self._fresh is None or self._fresh.done():
             read = self._read_config
-            self._fresh = asyncio.ensure_future(off_the_loop(lambda: _tried(lambda: (200, read()))))
+            self._fresh = asyncio.ensure_future(off_the_loop(lambda: tried(lambda: (200, read()))))
         with suppress(asyncio.TimeoutError):
             status, body = await asyncio.wait_for(
                 asyncio.shield(self._fresh), None if self._known is None else _FRESH_S
@@ -275,10 +270,10 @@ class PageServer(BackgroundServer):
         """The answer, in a place of its lane; what yields waits without one."""
         client = client_of(request.remote or "")
         try:
-            result = await self._work.do(lambda: _answered(answer, parameters), lane, client, path)
+            result = await self._work.do(lambda: answered(answer, parameters), lane, client, path)
             if not isinstance(result, tuple):
                 waiting = result
-                result = await self._work.until(lambda: _stepped(waiting), lane, client, path)
+                result = await self._work.until(lambda: stepped(waiting), lane, client, path)
         except Busy as busy:
             return self._busy(request, busy)
         return self._response(request, result[1], result[0])
@@ -288,7 +283,7 @@ class PageServer(BackgroundServer):
         with TemporaryDirectory(prefix="iort-download-") as folder:
             try:
                 found = await self._work.do(
-                    lambda: _tried(lambda: download(parameters, Path(folder))),
+                    lambda: tried(lambda: download(parameters, Path(folder))),
                     WRITING,
                     client_of(request.remote or ""),
                     path,
@@ -314,7 +309,7 @@ class PageServer(BackgroundServer):
             return response
 
     def _busy(self, request: web.BaseRequest, busy: Busy) -> web.Response:
-        response = self._response(request, as_json({"error": f"{busy}: try again"}), 429 if busy.own else 503)
+        response = self._refusal(request, 429 if busy.own else 503, f"{busy}: try again")
         response.headers["Retry-After"] = "1"
         return response
 
@@ -345,26 +340,22 @@ class PageServer(BackgroundServer):
         # Every browser sends the origin with a POST, and no script can change it.
         origin = urlsplit(request.headers.get("Origin", "")).netloc
         if origin.lower() != request.headers["Host"].lower():
-            refused = "an action needs this page's own origin"
-            return self._response(request, as_json({"error": refused}), 403)
+            return self._refusal(request, 403, "an action needs this page's own origin")
         if keyed and not self._is_key(request.headers.get(KEY_HEADER, "")):
-            refused = f"this browser may only look: {self._another()}"
-            return self._response(request, as_json({"error": refused}), 403)
+            return self._refusal(request, 403, f"this browser may only look: {self._another()}")
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:
-            return self._response(
-                request, as_json({"error": "an action needs a body of application/json"}), 415
-            )
+            return self._refusal(request, 415, "an action needs a body of application/json")
         try:
             asked = json.loads(await asyncio.wait_for(request.text(), self._body_s))
         except asyncio.TimeoutError:
-            late = self._response(request, as_json({"error": "the body must be here sooner"}), 408)
+            late = self._refusal(request, 408, "the body must be here sooner")
             late.force_close()
             return late
         except (ValueError, LookupError, RecursionError):  # also of an unknown charset
             asked = None
         if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
-            return self._response(request, as_json({"error": "the body must be an object of texts"}), 400)
+            return self._refusal(request, 400, "the body must be an object of texts")
         return await self._answer(request, path, action, asked, ACTING)
 
     def _accepts(self, host: str) -> bool:
@@ -382,13 +373,14 @@ class PageServer(BackgroundServer):
             return found[1].lower() in self._names
         return True
 
+    def _refusal(self, request: web.BaseRequest, status: int, reason: str) -> web.Response:
+        return self._response(request, as_json({"error": reason}), status)
+
     def _response(self, request: web.BaseRequest, body: Body, status: int) -> web.Response:
-        headers = {**self._headers, "Content-Type": body.kind}
+        headers, content = {**self._headers, "Content-Type": body.kind}, body.plain
         if takes_gzip(request.headers.get("Accept-Encoding", "")):
-            return web.Response(
-                body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
-            )
-        return web.Response(body=body.plain, status=status, headers=headers)
+            headers, content = {**headers, "Content-Encoding": "gzip"}, body.packed
+        return web.Response(body=content, status=status, headers=headers)
 
 
 def on_loopback(host: str) -> bool:
@@ -397,34 +389,3 @@ def on_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def _answered(answer: Handler, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
-    def begun() -> tuple[int, Body] | Waiting:
-        result = answer(parameters)
-        return result if isinstance(result, Generator) else (200, as_json(result, level=1))
-
-    return _tried(begun)
-
-
-def _stepped(waiting: Waiting) -> tuple[int, Body] | None:
-    """The answer; None if it has yet to come."""
-
-    def step() -> tuple[int, Body] | None:
-        try:
-            next(waiting)
-        except StopIteration as end:
-            return 200, as_json(end.value, level=1)
-        return None
-
-    return _tried(step)
-
-
-def _tried(work: Callable[[], _T]) -> _T | tuple[int, Body]:
-    """The result, or the status and the body of its error."""
-    try:
-        return work()
-    except (StationError, ContractError) as error:
-        return 400, as_json({"error": str(error)})
-    except (BotoCoreError, ClientError) as error:
-        return 502, as_json({"error": f"AWS refused a call: {error}"})
