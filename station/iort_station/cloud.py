@@ -297,6 +297,18 @@ class Cloud:
             raise StationError(f"stack {stack} cannot be read: {error}") from error
 
 
+def invoke(cloud: Cloud, noun: str, function: str, event: bytes, called: str) -> bytes:
+    """A function's answer to an event; ``function`` is the output of the stack that names it.
+
+    Raises `StationError` if it fails, by the name ``called``.
+    """
+    reply = cloud.client("lambda").invoke(FunctionName=cloud.output(noun, function), Payload=event)
+    answer: bytes = reply["Payload"].read()
+    if "FunctionError" in reply:
+        raise StationError(f"{called} failed: {json.loads(answer).get('errorMessage', answer[:500])}")
+    return answer
+
+
 class _Urgent(Cloud):
     _calls: ClassVar[dict[str, Any]] = {
         "retries": {"mode": "standard", "max_attempts": 2},

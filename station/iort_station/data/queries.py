@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import ssl
 import urllib.request
 from collections import Counter
@@ -32,7 +31,7 @@ from iort_contract.messages.requests.query import (
     unpacked_samples,
 )
 from iort_contract.tables import STATS
-from iort_station.cloud import Cloud
+from iort_station.cloud import Cloud, invoke
 from iort_station.data import inventory
 from iort_station.data.inventory import unit
 from iort_station.data.recorded import Reading, in_column_order, seconds
@@ -258,11 +257,10 @@ def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterat
         selection.where,
         reading.scan,
     )
-    function = cloud.output("processing", "QueryFunction")
     parts: list[Block] = []
     there: set[str] = set()
     while True:
-        answer = _invoke(cloud, function, request)
+        answer = _invoke(cloud, request)
         part = _unpacked(cloud, answer)
         parts.append(part)
         there |= set(answer.fields)
@@ -284,12 +282,9 @@ def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterat
         yield Block(block.times_us, {name: block.columns[name] for name in names})
 
 
-def _invoke(cloud: Cloud, function: str, request: QueryRequest) -> QueryAnswer:
-    reply = cloud.client("lambda").invoke(FunctionName=function, Payload=encode_query_request(request))
-    text = reply["Payload"].read()
-    if "FunctionError" in reply:
-        message = json.loads(text).get("errorMessage", text[:500])
-        raise StationError(f"the query function failed: {message}")
+def _invoke(cloud: Cloud, request: QueryRequest) -> QueryAnswer:
+    event = encode_query_request(request)
+    text = invoke(cloud, "processing", "QueryFunction", event, "the query function")
     try:
         answer = decode_query_answer(text)
     except ContractError as error:

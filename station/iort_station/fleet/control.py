@@ -1,4 +1,4 @@
-"""What an operator tells a robot: settings, by its named shadow `agent`, and single commands.
+"""What an operator tells a robot: settings, by its named shadow `agent`, and commands; and asks in its name.
 
 Settings have the names and units of car.yaml. The robot reports in the shadow what is in force, what it
 rejects, and the outcome of a command that asks for an answer.
@@ -38,7 +38,7 @@ from iort_contract.messages.control.shadow import (
 )
 from iort_contract.tables import DISCONNECTED_MS, ONLINE
 from iort_contract.topics import CMD, SHADOW, build_topic
-from iort_station.cloud import Cloud
+from iort_station.cloud import Cloud, invoke
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.times import iso_s
@@ -376,3 +376,15 @@ def _offline(cloud: Cloud, robot: str) -> str:
         return ""
     since_ms = row.get(DISCONNECTED_MS)
     return f"{robot} is not connected" + (f" since {iso_s(int(since_ms) * 1000)}" if since_ms else "")
+
+
+def ask(cloud: Cloud, robot: str, question: str, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The answer's body to a question that is asked in the robot's name, without quota or deadline.
+
+    Raises `StationError` if the function refuses or fails.
+    """
+    event = json.dumps({"robot": robot, "question": question, "body": body}).encode()
+    answer = json.loads(invoke(cloud, "processing", "AnswerFunction", event, "the function answer"))
+    if "refused" in answer:
+        raise StationError(f"{answer['refused']}: {answer['text']}")
+    return dict(answer["body"])

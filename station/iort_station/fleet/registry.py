@@ -163,13 +163,7 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
 
 def set_moved(cloud: Cloud, robot: str, origin: str) -> None:
     """Note the deployment that a registered robot has come from."""
-    cloud.client("dynamodb").update_item(
-        TableName=_table(cloud),
-        Key=_key(robot),
-        UpdateExpression=f"SET {MOVED_FROM} = :origin",
-        ConditionExpression=f"attribute_exists({ROBOT})",
-        ExpressionAttributeValues={":origin": {"S": origin}},
-    )
+    _update(cloud, robot, f"SET {MOVED_FROM} = :origin", {":origin": {"S": origin}})
 
 
 class ClaimId(NamedTuple):
@@ -189,28 +183,28 @@ def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) 
         update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint REMOVE {before}"
         values[":claim"] = {"S": claim.id.lower().removeprefix("0x")}
         values[":fingerprint"] = {"S": claim.fingerprint}
-    cloud.client("dynamodb").update_item(
-        TableName=_table(cloud),
-        Key=_key(robot),
-        UpdateExpression=update,
-        ConditionExpression=f"attribute_exists({ROBOT})",
-        ExpressionAttributeValues=values,
-    )
+    _update(cloud, robot, update, values)
 
 
 def close_name(cloud: Cloud, robot: str) -> None:
     """Allow no further certificate for a name."""
-    cloud.client("dynamodb").update_item(
-        TableName=_table(cloud),
-        Key=_key(robot),
-        UpdateExpression=f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}",
-        ConditionExpression=f"attribute_exists({ROBOT})",
-    )
+    _update(cloud, robot, f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}")
 
 
 def forget(cloud: Cloud, robot: str) -> None:
     """Delete a robot's row."""
     cloud.client("dynamodb").delete_item(TableName=_table(cloud), Key=_key(robot))
+
+
+def _update(cloud: Cloud, robot: str, expression: str, values: Mapping[str, Any] | None = None) -> None:
+    valued: Any = {"ExpressionAttributeValues": values} if values else {}
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=expression,
+        ConditionExpression=f"attribute_exists({ROBOT})",
+        **valued,
+    )
 
 
 def _table(cloud: Cloud) -> str:

@@ -33,7 +33,7 @@ from iort_contract.archive import (
 )
 from iort_contract.tables import TOPIC
 from iort_contract.topics import parse_topic
-from iort_station.cloud import Cloud
+from iort_station.cloud import Cloud, invoke
 from iort_station.data import inventory
 from iort_station.data.recorded import stores, telemetry_table, topic_of
 from iort_station.errors import StationError
@@ -90,12 +90,9 @@ def archived_topics(cloud: Cloud) -> set[str]:
 def run(cloud: Cloud, topic: str) -> int:
     """Queue what is over and not archived of a stream; returns the number of hours."""
     task = {TASK: SWEEP, TOPIC: topic, ALL: True}
-    name = cloud.output("archive", "ArchiveFunction")
-    reply = cloud.client("lambda").invoke(FunctionName=name, Payload=json.dumps(task))
-    answer = json.loads(reply["Payload"].read())
-    if "FunctionError" in reply:
-        raise StationError(f"the archive's function failed: {answer.get('errorMessage', answer)}")
-    return int(answer["tasks"])
+    event = json.dumps(task).encode()
+    answer = invoke(cloud, "archive", "ArchiveFunction", event, "the archive's function")
+    return int(json.loads(answer)["tasks"])
 
 
 def wait(cloud: Cloud, progress: Callable[[int], None]) -> None:

@@ -38,7 +38,7 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import RECORD, as_subscribed
-from iort_station.cloud import Cloud
+from iort_station.cloud import Cloud, invoke
 from iort_station.data.recorded import telemetry_table
 from iort_station.errors import StationError
 
@@ -328,14 +328,9 @@ def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[s
         for number, item in enumerate(items)
     ]
     records = [{"eventID": "replay", "eventName": "INSERT", "dynamodb": change} for change in changes]
-    answer = cloud.client("lambda").invoke(
-        FunctionName=cloud.output("processing", "SummarizeFunction"),
-        Payload=json.dumps({**event, "Records": records}).encode(),
-    )
-    said = json.loads(answer["Payload"].read() or b"null")
-    if "FunctionError" in answer:
-        raise StationError(f"Lambda 2 failed: {said.get('errorMessage', said)}")
-    return {"batchItemFailures": [], **said}
+    payload = json.dumps({**event, "Records": records}).encode()
+    answer = invoke(cloud, "processing", "SummarizeFunction", payload, "Lambda 2")
+    return {"batchItemFailures": [], **(json.loads(answer or b"null") or {})}
 
 
 def _delete(cloud: Cloud, letter: DeadLetter) -> None:

@@ -15,7 +15,7 @@ from iort_station.cli.console import Lines, errors, tell
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples
 from iort_station.errors import UsageError
-from iort_station.fleet import questions
+from iort_station.fleet import control
 
 commands = typer.Typer()
 
@@ -38,7 +38,7 @@ def ask(
     asked = {} if body is None else _read(body)
     cloud = context.obj.cloud()
     with errors.status(f"waiting for {question} of {robot}"):
-        answer = questions.ask(cloud, robot, question, asked)
+        answer = control.ask(cloud, robot, question, asked)
     tell(answer, Lines(json.dumps(answer, indent=2)), as_json=as_json)
 
 
