@@ -19,7 +19,7 @@ from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.downlink import Downlink
 from iort_agent.control.questions import Questions
-from iort_agent.errors import ConfigError, UploadError
+from iort_agent.errors import UploadError
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import MqttMessage
@@ -262,29 +262,24 @@ def test_a_service_asks_the_cloud_and_responds_with_the_answer(rig: Callable[...
     assert robot.downlink.report()["asked"] == {NAME: {"answered": 1}}
 
 
-def test_a_refusal_is_a_failure_with_its_reason(rig: Callable[..., AskingRig]) -> None:
-    robot = rig()
-    robot.cloud = lambda ask: Answer(ask.id, Refusal(OVER_QUOTA, "60 an hour"))
-    assert robot.call() == (False, "over_quota: 60 an hour")
-    assert robot.downlink.report()["asked"] == {NAME: {"over_quota": 1}}
-
-
-def test_without_an_answer_the_call_fails_at_its_deadline(rig: Callable[..., AskingRig]) -> None:
-    robot = rig({NAME: {"timeout_s": 0.1}})
-    robot.cloud = lambda _: None
-    assert robot.call() == (False, "no_answer: no answer within 0.1 s")
-
-
-def test_without_a_connection_the_call_fails_at_once(rig: Callable[..., AskingRig]) -> None:
-    robot = rig(connected=False)
-    success, message = robot.call()
-    assert (success, message.split(":")[0]) == (False, "not_connected")
-
-
-def test_a_question_that_the_broker_refuses_fails_at_once(rig: Callable[..., AskingRig]) -> None:
-    robot = rig()
-    robot.uplink.verdict = lambda _: "not authorized"
-    assert robot.call() == (False, "no_answer: the question was not sent: not authorized")
+@pytest.mark.parametrize(
+    ("settings", "reply", "message"),
+    [
+        ({}, Refusal(OVER_QUOTA, "60 an hour"), "over_quota: 60 an hour"),
+        ({"asks": {NAME: {"timeout_s": 0.1}}}, None, "no_answer: no answer within 0.1 s"),
+        ({"connected": False}, None, "not_connected: the robot is not connected to the cloud"),
+        ({}, "not authorized", "no_answer: the question was not sent: not authorized"),
+    ],
+)
+def test_a_call_without_an_answer_fails_with_the_reason(
+    rig: Callable[..., AskingRig], settings: dict[str, Any], reply: Refusal | str | None, message: str
+) -> None:
+    robot = rig(**settings)
+    robot.cloud = lambda ask: Answer(ask.id, reply) if isinstance(reply, Refusal) else None
+    if isinstance(reply, str):
+        robot.uplink.verdict = lambda _: reply
+    assert robot.call() == (False, message)
+    assert robot.downlink.report()["asked"] == {NAME: {message.split(":", maxsplit=1)[0]: 1}}
 
 
 def test_a_waiting_call_fails_when_the_agent_ends(rig: Callable[..., AskingRig]) -> None:
@@ -362,9 +357,3 @@ def test_a_topic_asks_with_its_own_body_and_answers_in_order(rig: Callable[..., 
     ]
     robot.graph.hear(TOPIC, "std_msgs/Float64", bytes(8))
     assert robot.downlink.report()["refused"] == {f"{TOPIC} malformed": 1}
-
-
-@pytest.mark.parametrize("asks", [{}, {"Calibration": {}}, {"a/b": {}}, {NAME: {"timeout_s": 61}}])
-def test_a_wrong_configuration_is_refused(asks: Any) -> None:
-    with pytest.raises(ConfigError, match="ask"):
-        load(DownlinkConfig, {"ask": asks}, Place(Path("car.yaml")))
