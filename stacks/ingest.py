@@ -103,7 +103,7 @@ class Ingest(PlatformStack):
 
 # The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a defect that
 # nobody would see, so synth refuses it. The lists are what the pinned ministack and local/gaps/ implement;
-# tests/stacks/checks/test_portable.py holds them against both.
+# tests/stacks/test_portable.py holds them against both.
 
 RULE_ACTIONS = frozenset({"lambda", "republish", "dynamoDBv2", "sns", "sqs"})
 SQL_FUNCTIONS = frozenset(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator
 from functools import lru_cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -136,44 +134,20 @@ def failed_if_skipped(report: Any) -> Any:
     return report
 
 
-@dataclass(frozen=True)
-class Synthesized:
-    """The app as deployed: a template for each stack, the folder with the assets, the stacks with
-    termination protection, and the paths of acknowledged findings of the checkers.
-    """
+@pytest.fixture(scope="session")
+def synthesized():
+    """The app in stage dev, with every rule, drivers and the settings of the whole account."""
+    from tests.stacks.templates import synthesize
 
-    folder: Path
-    templates: Mapping[str, dict[str, Any]]
-    protected: set[str]
-    acknowledged: set[str]
-
-    def resources(self, kind: str, stack: str | None = None) -> dict[str, dict[str, Any]]:
-        """Return logical id -> properties for every resource of a type."""
-        return {
-            name: resource.get("Properties", {})
-            for noun, template in self.templates.items()
-            for name, resource in template["Resources"].items()
-            if resource["Type"] == kind and stack in (None, noun)
-        }
-
-    def asset(self, key: dict[str, Any]) -> Path:
-        """Return the source folder of a resource's S3Key."""
-        return self.folder / f"asset.{key['S3Key'].removesuffix('.zip')}"
+    return synthesize(device_defender=True, iot_log_level="error", drivers=True, live_transport="pubnub")
 
 
 @pytest.fixture(scope="session")
-def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """Build the app for stage dev, with every rule, drivers and the settings of the whole account."""
-    return _synthesize(
-        tmp_path_factory, device_defender=True, iot_log_level="error", drivers=True, live_transport="pubnub"
-    )
+def production():
+    """The app with every feature of a production stage."""
+    from tests.stacks.templates import synthesize
 
-
-@pytest.fixture(scope="session")
-def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """Build the app with every feature of a production stage."""
-    return _synthesize(
-        tmp_path_factory,
+    return synthesize(
         stage="prod",
         account_concurrency=1000,
         customer_key=True,
@@ -185,28 +159,4 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
         robot_metrics=True,
         drivers=True,
         live_transport="pubnub",
-    )
-
-
-def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synthesized:
-    # Imported here, because the CDK takes seconds to load.
-    from aws_cdk import App
-
-    from app import build
-    from stacks.settings import Settings
-
-    layer, folder = tmp_path_factory.mktemp("layer"), tmp_path_factory.mktemp("cdk.out")
-    (layer / "python").mkdir()
-    (layer / "python" / "nothing.py").touch()
-    app = App(outdir=str(folder))
-    settings = Settings(layer=layer, analysis_layer=layer, **given)
-    acknowledged = build(app, settings)
-    stacks = app.synth().stacks
-    prefix = f"{settings.namespace}-"
-    nouns = {s.stack_name.removeprefix(prefix): s for s in stacks}
-    return Synthesized(
-        folder,
-        {noun: s.template for noun, s in nouns.items()},
-        {noun for noun, s in nouns.items() if s.termination_protection},
-        {one.path for one in acknowledged},
     )

@@ -1,7 +1,7 @@
 """One table of permissions: (who, action, resource, allowed).
 
 tests/local/identity/test_isolation.py tries every row on the embedded cloud with enforcement on, and
-tests/stacks/permissions/test_isolation.py asks the synthesized policies. roles.py there declares the
+tests/stacks/test_isolation.py asks the synthesized policies. roles.py there declares the
 permissions of each role. This table asks all roles, so that a new function without a declaration fails.
 """
 

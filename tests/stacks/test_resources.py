@@ -18,8 +18,8 @@ from stacks.checks import granted, several
 from stacks.settings import A_ROBOTS_MOST, Settings
 from stacks.storage import VERSIONS_DAYS
 from stacks.variations import EVERYTHING
-from tests.stacks.templates import Reader, layers, name
-from tests.stacks.updates.test_flips import identity
+from tests.stacks.templates import Reader, name
+from tests.stacks.test_updates import identity
 
 WAYS = {IOT: {}, PUBNUB: {"live_transport": PUBNUB}}
 
@@ -55,16 +55,16 @@ def test_the_default_deployment_needs_no_third_party(deployment):
     rules = {
         way: {
             one["Properties"]["RuleName"].removeprefix("iort_")
-            for one in each["iort-ingest"]["Resources"].values()
+            for one in each["ingest"]["Resources"].values()
             if one["Type"] == "AWS::IoT::TopicRule"
         }
         for way, each in templates.items()
     }
     assert rules == {IOT: RULES.keys() - {"live"}, PUBNUB: RULES.keys()}
     for way, each in templates.items():
-        assert each["iort-fleet"]["Outputs"]["LiveTransport"]["Value"] == way
-        assert not any(one.startswith("Public") for one in each["iort-fleet"]["Outputs"])
-    assert templates[IOT]["iort-processing"] == templates[PUBNUB]["iort-processing"]
+        assert each["fleet"]["Outputs"]["LiveTransport"]["Value"] == way
+        assert not any(one.startswith("Public") for one in each["fleet"]["Outputs"])
+    assert templates[IOT]["processing"] == templates[PUBNUB]["processing"]
 
 
 def test_every_rule_has_exactly_its_one_action(rules, reader):
@@ -147,7 +147,7 @@ def test_the_tables_keys_are_the_contracts(synthesized):
 
 def test_no_table_takes_more_than_the_fleet_and_one_robot_at_its_worst(deployment):
     def most(**settings):
-        resources = deployment(**settings).templates["iort-storage"]["Resources"]
+        resources = deployment(**settings).templates["storage"]["Resources"]
         return {
             name(key): one["Properties"]["OnDemandThroughput"]["MaxWriteRequestUnits"]
             for key, one in resources.items()
@@ -315,21 +315,12 @@ def test_the_stream_never_blocks_for_good(synthesized, reader):
     assert mapping["StartingPosition"] == "TRIM_HORIZON"
 
 
-def test_two_deployments_can_share_an_account(tmp_path_factory, synthesized):
+def test_two_deployments_can_share_an_account(deployment, synthesized):
     """Every name that CloudFormation does not generate contains the namespace."""
-    from aws_cdk import App
-
-    from app import build
-
-    layer = tmp_path_factory.mktemp("layer")
-    (layer / "nothing.py").touch()
-    app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-    account = {"device_defender": True, "iot_log_level": "error"}
-    build(app, Settings(namespace="lab2", **layers(layer), retention_days=7, **account))
-    stacks = app.synth().stacks
-    assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
+    app = deployment(namespace="lab2", retention_days=7, device_defender=True, iot_log_level="error")
+    assert app.stacks.keys() == {f"lab2-{noun}" for noun in synthesized.templates}
     # An alarm's advice names a program.
-    text = json.dumps([stack.template for stack in stacks]).replace("`iort-agent ", "")
+    text = json.dumps(app.stacks).replace("`iort-agent ", "")
     assert not any(word in text for word in ("iort/", "/iort", "iort_", "iort-", "iort."))
     assert f"+ {7 * 86_400} AS expires_s" in text
 
@@ -341,7 +332,7 @@ def test_two_environments_in_one_account_share_no_name(deployment):
     apart = {"AWS::IoT::AccountAuditConfiguration", "AWS::IoT::Logging", "AWS::IAM::Policy"}
 
     def names(**settings):
-        templates = deployment(**settings).templates
+        templates = deployment(**settings).stacks
         yield from (("stack", stack) for stack in templates)
         for template in templates.values():
             for output in template.get("Outputs", {}).values():

@@ -20,8 +20,8 @@ from botocore.exceptions import ClientError
 from iort_contract.cloud import pubnub_parameter
 from iort_station.fleet.roles import role_arn
 from tests import isolation
-from tests.stacks.permissions.roles import IOT, PUBLIC
-from tests.stacks.permissions.roles import ROLES as OF_AWS
+from tests.stacks.roles import IOT, PUBLIC
+from tests.stacks.roles import ROLES as OF_AWS
 from tests.stacks.templates import name
 
 ACCOUNT = "000000000000"
@@ -77,7 +77,7 @@ _LOADER = botocore.loaders.create_loader()
 
 def as_role(embedded: Any, role: str) -> dict[str, Any]:
     """Return clients with the role's credentials. The role trusts only its service, and
-    tests/stacks/permissions/test_policies.py checks this; the operator may change the trust, and lets the
+    tests/stacks/test_policies.py checks this; the operator may change the trust, and lets the
     account assume the role for a moment.
     """
     cloud = embedded.cloud
@@ -232,7 +232,7 @@ def refused(clients: dict[str, Any], probe: Probe) -> bool:
 def test_every_role_is_declared(deployed):
     roles = {one.arn for one in of(deployed, "AWS::IAM::Role")}
     # The embedded cloud leaves out other roles, for example those of account-wide settings.
-    assert roles <= ROLES.keys(), "declare the permissions of a new role in tests/stacks/permissions/roles.py"
+    assert roles <= ROLES.keys(), "declare the permissions of a new role in tests/stacks/roles.py"
 
 
 def test_every_role_is_denied_undeclared_access(deployed, role_clients):

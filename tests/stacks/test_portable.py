@@ -13,6 +13,9 @@ import pytest
 from iort_contract.catalog.rules import RULES
 from stacks.ingest import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
+from tests.stacks.test_updates import identity
+from verify.preflight.account import BOOTSTRAP, BOOTSTRAP_PARAMETER
+from verify.preflight.deployed import STACKS
 
 GOOD = {
     "sql": RULES["live"].statement(),
@@ -184,3 +187,50 @@ def test_a_republish_topic_is_accepted_only_if_the_emulator_expands_it(embedded)
         expanded = action["republish"]["topic"]
         payload = {"sql": "SELECT * FROM 'a'", "actions": [{"republish": {"topic": topic}}]}
         assert (rule_problems(payload) == []) == ("${" not in expanded), topic
+
+
+# The preflight knows all stacks and names.
+
+# Kinds with a name of ours; the preflight asks for the name.
+ASKED = {
+    "AWS::IoT::Policy",
+    "AWS::IoT::ProvisioningTemplate",
+    "AWS::IoT::ThingGroup",
+    "AWS::IoT::ThingType",
+    "AWS::IoT::TopicRule",
+    "AWS::CloudWatch::Dashboard",
+    # One in each account, with separate items.
+    "AWS::IoT::AccountAuditConfiguration",
+    "AWS::IoT::Logging",
+}
+# Deleted with their stack in every stage, and made only by our stack.
+NOT_ASKED = {
+    "AWS::CloudWatch::Alarm",
+    "AWS::IAM::Policy",
+    "AWS::Lambda::EventInvokeConfig",
+    "AWS::Lambda::EventSourceMapping",
+    "AWS::S3::BucketPolicy",
+    "AWS::SNS::Subscription",
+}
+
+
+def test_the_preflight_asks_for_every_stack(synthesized):
+    assert {*synthesized.templates, "site"} == set(STACKS)
+
+
+def test_the_preflight_asks_for_every_fixed_name(synthesized, production):
+    named = {
+        resource["Type"]
+        for templates in (synthesized.templates, production.templates)
+        for template in templates.values()
+        for resource in template["Resources"].values()
+        if identity(resource) is not None
+    }
+    assert named == ASKED | NOT_ASKED
+
+
+def test_the_required_bootstrap_version_is_that_of_the_templates(synthesized):
+    artifacts = json.loads((synthesized.folder / "manifest.json").read_text())["artifacts"].values()
+    stacks = [one["properties"] for one in artifacts if one["type"] == "aws:cloudformation:stack"]
+    assert {one["requiresBootstrapStackVersion"] for one in stacks} == {BOOTSTRAP}
+    assert {one["bootstrapStackVersionSsmParameter"] for one in stacks} == {BOOTSTRAP_PARAMETER}

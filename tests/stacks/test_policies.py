@@ -1,4 +1,4 @@
-"""Every IAM statement, by role. A grant that tests/stacks/permissions/roles.py does not list is an error."""
+"""Every IAM statement, by role. A grant that tests/stacks/roles.py does not list is an error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functions.shared.quotas import DAY, Quota
 from iort_contract.tables import ADMISSION, FILES_BYTES, FILES_DAY
 from stacks.checks import EVERY_RESOURCE
 from stacks.fleet import provisioning_template
-from tests.stacks.permissions.roles import (
+from tests.stacks.roles import (
     CERTIFICATES,
     CHANGES,
     IOT,
