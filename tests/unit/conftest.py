@@ -122,6 +122,6 @@ def s3(aws):
 @pytest.fixture
 def stream():
     """An empty telemetry table and the stream that Lambda 2 reads."""
-    from tests.unit.functions.summary.summarizing import Stream
+    from tests.unit.functions.summarizing import Stream
 
     return Stream()

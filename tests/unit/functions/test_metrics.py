@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+from decimal import Decimal
 
 import pytest
+from boto3.dynamodb.types import TypeDeserializer, TypeSerializer
+from hypothesis import given
+from hypothesis import strategies as st
 
+from functions.shared.clients import SUBJECT_CHARACTERS, subject_line
 from functions.shared.metrics import Gathered, emit
 from iort_contract.catalog.metrics import METRIC_NAMESPACE, METRICS, metrics_of
+from iort_contract.dynamodb import deserialize, plain
 
 
 @pytest.fixture(autouse=True)
@@ -151,3 +157,46 @@ def test_a_gathered_line_has_its_own_timestamp(capsys):
     _, line = map(json.loads, capsys.readouterr().out.splitlines())
     assert (line["_aws"]["Timestamp"], line["LivePublished"]) == (1_011_000, 2)
     assert line["InCarMs"] == [1.23, 1.23]
+
+
+# A mail's subject is one that SNS takes.
+
+
+@pytest.mark.parametrize(
+    ("text", "subject"),
+    [
+        ("iort: car7, fault 5", "iort: car7, fault 5"),
+        ("a" * 99, "a" * 99),
+        # "Less than 100 characters long".
+        ("a" * 100, "a" * 96 + "..."),
+        ("two\nlines\x00", "two lines "),
+    ],
+)
+def test_a_subject_is_one_short_line(text, subject):
+    assert subject_line(text) == subject
+    assert len(subject_line(text)) <= SUBJECT_CHARACTERS < 100
+
+
+# Stored attributes are read as boto3's deserializer reads them, and long numbers that it refuses too.
+
+numbers = st.integers(-(10**37), 10**37).map(Decimal)
+leaves = st.none() | st.booleans() | st.text() | st.binary() | numbers
+sets = (
+    st.sets(st.text(min_size=1), min_size=1)
+    | st.sets(numbers, min_size=1)
+    | st.sets(st.binary(min_size=1), min_size=1)
+)
+values = st.recursive(
+    leaves | sets, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=20
+)
+
+
+@given(values)
+def test_a_value_is_read_as_boto3_reads_it(value):
+    stored = TypeSerializer().serialize(value)
+    assert deserialize(stored) == TypeDeserializer().deserialize(stored) == value
+
+
+def test_a_number_that_boto3_refuses_is_read():
+    digits = "1" * 40
+    assert plain({"n": {"N": digits}, "e": {"N": "1e126"}}) == {"n": Decimal(digits), "e": Decimal("1e126")}

@@ -30,7 +30,7 @@ from iort_station.page.history import downloads
 from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of
 from tests.archived import FakeS3, archive, expire
 from tests.mutation import ODD_ATTRIBUTES, mutated_item
-from tests.unit.functions.summary.summarizing import Stream
+from tests.unit.functions.summarizing import Stream
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 COUNT = int(os.environ.get("IORT_MUTATED", "600"))

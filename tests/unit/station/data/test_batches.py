@@ -31,7 +31,7 @@ from tests.examples import examples
 from tests.recordings import recording
 from tests.unit.contract.codec.test_columns import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.contract.ros1.ros1_messages import text, u32
-from tests.unit.functions.summary.summarizing import drive_of
+from tests.unit.functions.summarizing import drive_of
 from tests.unit.station.data.test_queries import cloud_of
 
 

@@ -41,7 +41,7 @@ from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_messag
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
 from tests.unit.contract.ros1.ros1_messages import text, u32
-from tests.unit.functions.summary.summarizing import Stream
+from tests.unit.functions.summarizing import Stream
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 HOUR = 3_600_000_000

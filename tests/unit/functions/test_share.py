@@ -10,14 +10,29 @@ from botocore.exceptions import ClientError
 
 from functions import later
 from functions.shared import quotas, share
+from functions.shared.metrics import MOST_VALUES
 from functions.shared.quotas import RateLimiter
 from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
-from functions.shared.summary import Bounds, process
-from iort_contract.catalog.vesc import VESC_STREAM
+from functions.shared.summary import Bounds, measure, process, together
+from functions.summarize import EVERY_S, PARTS, Volume, size_of
+from iort_contract.catalog.metrics import metrics_of
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
+from iort_contract.catalog.vesc import TEMPERATURES, VESC_STREAM, hottest_degc
 from iort_contract.dynamodb import TableError
-from iort_contract.tables import OVER_SHARE, PUT_OFF
+from iort_contract.messages.batch import Batch
+from iort_contract.tables import (
+    BATCH,
+    OVER_SHARE,
+    PUT_OFF,
+    PUT_OFF_TO_S,
+    RECORD_BYTES,
+    RECORD_DAY,
+    ROBOT,
+    TOPIC,
+)
 from iort_contract.topics import RECORD, SHADOW, build_topic
-from tests.unit.functions.summary.summarizing import T0, S, Stream, batch, counted
+from testkit.dynamodb import ROBOTS
+from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
 
 GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))
 
@@ -293,3 +308,154 @@ def test_a_second_that_changes_at_every_read_does_not_block():
     stream.tables.put_seconds = put_and_send
     with pytest.raises(TableError, match="change as fast"):
         process({"Records": records}, stream.tables, stream.refuse, beside_others=True)
+
+
+# What a robot records a day is counted in its row, at little cost, and too much is an alarm.
+
+MOST, NOON_S = 1_000_000, 1_700_049_600.0
+CAR = {"S": "car7"}
+
+
+def change(size: int, *, robot: str = "car7", **more: dict) -> dict:
+    keys = {TOPIC: {"S": f"dt/iort/{robot}/vesc"}, BATCH: {"S": "1"}}
+    image = {**keys, "samples": {"S": "a" * size}, **more}
+    return {"Keys": keys, "NewImage": image, "SequenceNumber": "1"}
+
+
+@pytest.fixture
+def row(dynamodb):
+    dynamodb.put_item(TableName=ROBOTS, Item={ROBOT: CAR})
+    return lambda: dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: CAR})["Item"]
+
+
+@pytest.fixture
+def volume(dynamodb):
+    return Volume(dynamodb, ROBOTS, MOST)
+
+
+def test_a_part_of_the_day_or_some_minutes_are_one_write(row, volume):
+    part = change(MOST // PARTS // 2)
+    volume.note([part], NOON_S)
+    assert row() == {ROBOT: CAR}
+    volume.note([part], NOON_S + 1)
+    size = 2 * size_of(part["NewImage"])
+    assert row() == {ROBOT: CAR, RECORD_DAY: {"S": "2023-11-15"}, RECORD_BYTES: {"N": str(size)}}
+    # A small robot's count is written after some minutes, also by another environment.
+    volume.note([change(10)], NOON_S + 2)
+    volume.note([], NOON_S + 2 + EVERY_S)
+    assert int(row()[RECORD_BYTES]["N"]) == size + size_of(change(10)["NewImage"])
+
+
+def test_above_its_bytes_a_robot_is_named_and_counted_and_the_next_day_is_new(row, volume, caplog, capsys):
+    big = change(MOST // 2)
+    volume.note([big], NOON_S)
+    assert counted(capsys) == {}
+    volume.note([big], NOON_S)
+    assert "car7 has recorded" in caplog.text
+    assert f"more than its {MOST}" in caplog.text
+    assert counted(capsys) == {"RobotsOverVolume": 1}
+    volume.note([big], NOON_S + 86_400)
+    assert row()[RECORD_DAY] == {"S": "2023-11-16"}
+    assert row()[RECORD_BYTES] == {"N": str(size_of(big["NewImage"]))}
+
+
+def test_what_no_robot_wrote_is_not_counted(row, volume):
+    removed = {name: value for name, value in change(9).items() if name != "NewImage"}
+    foreign = {**change(MOST), "Keys": {TOPIC: {"S": "nonsense"}}}
+    volume.note([change(MOST, **{PUT_OFF_TO_S: {"N": "1"}}), removed, foreign], NOON_S)
+    assert row() == {ROBOT: CAR}
+
+
+def test_a_removed_robot_gets_no_row(dynamodb, volume):
+    volume.note([change(MOST, robot="gone")], NOON_S)
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "gone"}})
+
+
+def test_a_failed_count_stops_nothing(dynamodb, caplog):
+    Volume(dynamodb, "no-such-table", MOST).note([change(MOST)], NOON_S)
+    assert "are not counted" in caplog.text
+
+
+def test_bytes_in_an_event_are_in_base64():
+    assert size_of({"samples": {"B": "AAAA"}}) == size_of({"samples": {"B": b"AAA"}})
+
+
+# Health: the metrics that follow from a car's batches.
+
+
+def measured_batch(columns, *, times_us=None):
+    length = len(next(iter(columns.values())))
+    return Batch("0" * 8, 0, times_us or [1_000_000 + 20_000 * i for i in range(length)], columns)
+
+
+def test_the_worst_values_of_a_drive_are_measured():
+    first = measured_batch({"voltage_input": [12.1, 11.9], "temp_fet": [40.0, 41.5], "fault_code": [0, 5]})
+    second = measured_batch(
+        {"voltage_input": [11.2, 11.6], "temp_fet": [0.0, 39.0], "temp_motor": [55.5, None]}
+    )
+    measured = measure("vesc", [first, second])
+    assert measured == {
+        "SampleGaps": 0,
+        "FaultSamples": 1,
+        "BatteryVolts": [11.2],
+        "TemperatureDegC": [55.5],
+    }
+
+
+def test_unmeasured_values_are_not_counted():
+    nothing = {"SampleGaps": 0, "FaultSamples": 0, "BatteryVolts": [], "TemperatureDegC": []}
+    assert measure("vesc", [measured_batch({"voltage_input": [0.0, None], "temp_fet": [0, 0]})]) == nothing
+    cold = {"voltage_input": [0.0], "temp_motor": [-273.15], "temp_fet": [-57]}
+    assert measure("vesc", [measured_batch(cold)]) == nothing
+    assert (
+        measure("imu", [measured_batch({"x": [1.0], "fault_code": ["odd"], "voltage_input": [True]})])
+        == nothing
+    )
+
+
+def test_a_hole_is_a_gap():
+    times_us = [0, 20_000, 40_000, 60_000, 200_000, 220_000]
+    assert measure("vesc", [measured_batch({"x": [0.0] * 6}, times_us=times_us)])["SampleGaps"] == 1
+
+
+def test_round_trips_and_the_agents_own_figures_are_measured():
+    rtt = measured_batch({"broker_ms": [12.0, None], "rule_ms": [None, 31.5], "lambda_ms": [None, None]})
+    assert measure(RTT_STREAM, [rtt]) == {
+        "RoundTripBrokerMs": [12.0],
+        "RoundTripRuleMs": [31.5],
+        "RoundTripLambdaMs": [],
+    }
+    agent = measured_batch({"backlog_batches": [0, 7], "thread_errors": [0, 2]})
+    assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0], "ThreadErrors": 2}
+
+
+@pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
+def test_the_metric_names_are_the_contracts(stream):
+    assert measure(stream, [measured_batch({"x": [1.0]})]).keys() <= set(metrics_of("health"))
+
+
+def test_several_robots_share_one_log_line_without_loss_of_values():
+    one = {"SampleGaps": 1, "FaultSamples": 0, "BatteryVolts": [11.2], "TemperatureDegC": []}
+    rtt = {"RoundTripBrokerMs": [5.0] * 3}
+    (line,) = together([one, {**one, "BatteryVolts": [12.0]}, rtt])
+    assert line == {
+        "SampleGaps": 2,
+        "FaultSamples": 0,
+        "BatteryVolts": [11.2, 12.0],
+        "TemperatureDegC": [],
+        "RoundTripBrokerMs": [5.0] * 3,
+    }
+    many = list(together({**one, "BatteryVolts": [float(n)]} for n in range(MOST_VALUES + 1)))
+    assert [len(line["BatteryVolts"]) for line in many] == [MOST_VALUES, 1]
+    assert sum(line.get("SampleGaps", 0) for line in many) == MOST_VALUES + 1
+    assert list(together([])) == [{}]
+
+
+def test_the_alarm_and_the_watch_use_the_same_hottest_temperature() -> None:
+    for hot in TEMPERATURES:
+        sample = {**dict.fromkeys(TEMPERATURES, 20.0), hot: 81.5}
+        measured = measure("vesc", [measured_batch({name: [value] for name, value in sample.items()})])
+        assert measured["TemperatureDegC"] == [81.5] == [hottest_degc(sample)]
+    unread = {"temperature_pcb": 0, "temp_fet": -60.0, "temp_motor": None, "ntc_temp_mos1": True}
+    assert hottest_degc(unread) is None
+    assert hottest_degc({**unread, "ntc_temp_mos2": -3.5}) == -3.5

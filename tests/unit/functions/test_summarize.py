@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import logging
+import random
+import zlib
 from collections import defaultdict
 from decimal import Decimal
 
 import pytest
 
+from functions import summarize
+from functions.shared import tables as tables_module
 from functions.shared.summary import process
+from functions.summarize import size_of
+from iort_contract.codec.columns import DICTIONARY
+from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import TableError, plain
+from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES
+from iort_contract.messages.batch import Batch, BatchId, encode_batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS
-from testkit.dynamodb import EXPIRES, ROBOTS, item_of, record_of
-from tests.unit.functions.summary.summarizing import SECOND, T0, S, Stream, batch, clean, counted
+from testkit.dynamodb import (
+    ARCHIVE,
+    EXPIRES,
+    NAMES,
+    ROBOTS,
+    SUMMARY,
+    TELEMETRY,
+    FakeDynamoDB,
+    item_of,
+    item_of_message,
+    record_of,
+)
+from tests.recordings import recording
+from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch, clean, counted, drive_of
 
 
 def test_a_late_batch_fills_the_gap_that_its_successor_reported(stream, capsys):
@@ -261,3 +285,200 @@ def test_a_recording_played_twice_is_stored_twice_and_misses_no_batch(stream, ca
     # A repeated batch counts once.
     stream.deliver(*again)
     assert stream.column("n") == dict.fromkeys(range(5), 20)
+
+
+# Lambda 2 reports and counts invalid records and neighbours, and continues.
+
+
+def poison(**changes):
+    """An item that looks like a batch; None removes the attribute."""
+    envelope = json.loads(encode_batch(batch(T0 + 10 * S + 1, 3, seq=7))) | changes
+    return item_of_message(json.dumps({k: v for k, v in envelope.items() if v is not None}).encode())
+
+
+def packed(body):
+    """As the samples of a batch are compressed."""
+    deflater = zlib.compressobj(zdict=DICTIONARY)
+    return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+
+
+bomb = base64.b64encode(zlib.compress(b" " * (MAX_COLUMNS_BYTES + 2))).decode()
+POISON = {
+    "not base64": poison(samples="%%%"),
+    "not zlib": poison(samples="AAAA"),
+    "not JSON": poison(samples=base64.b64encode(zlib.compress(b"{")).decode()),
+    "inflates without end": poison(samples=bomb),
+    "no samples": poison(samples=None),
+    "version before": poison(v=1),
+    "other version": poison(v=9),
+    "no version": poison(v=None),
+    "other codec": poison(codec="cbor"),
+    "wrong count": poison(n=4),
+    "huge count with its digits": {**poison(), "n": {"N": "1" + "0" * 125}},
+    "fraction for nonfinite": {**poison(), "nonfinite": {"N": "7.5"}},
+    "huge nonfinite": {**poison(), "nonfinite": {"N": "1E+125"}},
+    "map for nonfinite": {**poison(), "nonfinite": {"M": {}}},
+    "no run": poison(batch=f"{T0}-car-7"),
+    "no number": poison(batch=f"{T0}-aaaaaaaa-"),
+    "huge number": poison(batch=f"{T0}-aaaaaaaa-{10**15 * 9 + 10**14}"),
+    "no key of a batch": poison(batch="zzz"),
+    "a key of text": poison(batch="x" * 1024),
+    "binary samples": {**poison(), "samples": {"B": b"AAAA"}},
+    "messages without a head": poison(codec="ros1", samples=packed(b'{"dt":[0],"fields":{}}'), n=1),
+    "messages of nothing": poison(codec="ros1", samples=packed(b'{"dt":[0],"fields":{}}\n{}\n'), n=1),
+    "other topic": {**poison(), "topic": {"S": "dt/iort/car"}},
+    "topic of no robot": {**poison(), "topic": {"S": "dt/iort/c r/vesc"}},
+    "topic of the live lane": {**poison(), "topic": {"S": "live/iort/car/vesc"}},
+    "in the name of another": {**poison(), "robot": {"S": "other"}},
+    "before 1970": poison(batch=f"-{1:015}-aaaaaaaa-7"),
+    "years ahead": poison(batch=str(BatchId(T0 + 2 * MAX_AHEAD_US, "aaaaaaaa", 7))),
+}
+
+
+@pytest.mark.parametrize("name", POISON)
+def test_a_poison_record_is_reported_and_the_others_are_kept(stream, name, capsys, caplog):
+    good = [batch(T0, 50, seq=0), batch(T0 + 10 * S, 1, seq=1), batch(T0 + 11 * S, 50, seq=2)]
+    first, second = stream.store(*good[:2])
+    bad = stream.store_item(POISON[name])
+    (third,) = stream.store(good[2])
+    with caplog.at_level(logging.WARNING):
+        answer = stream.summarize([first, second, bad, third])
+    assert answer == {"batchItemFailures": []}
+    number = bad["dynamodb"]["SequenceNumber"]
+    assert [(one.number, one.image) for one in stream.refused] == [(number, POISON[name])]
+    assert stream.column("n") == {0: 50, 10: 1, 11: 50}
+    assert stream.column("missing_batches") == {0: 0, 10: 0, 11: 0}
+    assert counted(capsys) == {"BatchesSummarized": 3, "SamplesSummarized": 101, "BatchesRefused": 1}
+    assert [record.message[:7] for record in caplog.records] == ["refused"]
+    # If the dead-letter queue does not take it, it stays in the stream and is delivered again.
+    before = clean(stream.summary())
+    stream.jammed = {number}
+    assert stream.summarize([bad, third]) == {"batchItemFailures": [{"itemIdentifier": number}]}
+    assert clean(stream.summary()) == before
+
+
+def test_a_replay_reports_refused_records_and_does_not_quarantine_them_again(stream):
+    good, bad = stream.store(batch(T0, 5)), stream.store_item(POISON["other version"])
+    event = {"replay": True, "Records": [*good, bad]}
+    answer = process(event, stream.tables, stream.refuse)
+    assert answer == {"batchItemFailures": [{"itemIdentifier": bad["dynamodb"]["SequenceNumber"]}]}
+    assert stream.refused == []
+    assert stream.column("n") == {0: 5}
+
+
+def test_a_poison_neighbour_does_not_count_as_a_stored_batch(stream):
+    stream.deliver(batch(T0, seq=5))
+    for i in range(3):
+        stream.summarize([stream.store_item(poison(v=9, batch=f"{T0 + (20 + i) * S}-aaaaaaaa-7"))])
+    stream.deliver(batch(T0 + 40 * S, seq=8))
+    # 6 and 7 are missing; the poison items may be them, but this cannot be known.
+    assert stream.column("missing_batches") == {0: 5, 40: 2}
+
+
+def test_many_poison_items_are_read_with_few_queries(stream):
+    for i in range(200):
+        stream.store_item(poison(v=9, batch=f"{T0 + i * S}-aaaaaaaa-7"))
+    stream.client.calls.clear()
+    stream.deliver(batch(T0 + 500 * S, seq=1))
+    assert stream.client.calls["query"] <= 15
+    assert stream.column("n") == {500: 1}
+
+
+def test_a_table_that_accepts_no_writes_fails_the_event(monkeypatch):
+    monkeypatch.setattr(tables_module.time, "sleep", lambda _: None)
+    stream = Stream(FakeDynamoDB(unprocessed=10**9))
+    with pytest.raises(TableError):
+        stream.deliver(*(batch(T0 + i * S, seq=i) for i in range(20)))
+
+
+def test_wrong_vehicle_parameters_stop_no_summary(stream, caplog):
+    stream.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"S": "fast"}})
+    stream.deliver(batch(T0, 2, speed=[1, 2]))
+    assert stream.column("speed_max") == {0: 2}
+    assert "car" in caplog.text
+
+
+def test_an_attribute_with_more_digits_than_boto3_reads_stops_no_summary(stream):
+    """DynamoDB returns numbers up to 9.99e125 with all their digits."""
+    odd = {"N": "-1" + "0" * 125}
+    item = item_of_message(encode_batch(batch(T0, 3, a=[1.5] * 3)))
+    odd_item = {**item, "far": odd, "deep": {"M": {"far": {"L": [odd]}}}}
+    assert stream.summarize([stream.store_item(odd_item)]) == {"batchItemFailures": []}
+    assert stream.column("n") == {0: 3}
+    stream.deliver(batch(T0 + S // 2, 2, seq=1, a=[2.5] * 2))
+    assert stream.column("n") == {0: 5}
+    assert stream.refused == []
+
+
+# Lambda 2 against moto's tables, and on a drive of a real car.
+
+
+def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys):
+    for name, table in NAMES.items():
+        monkeypatch.setenv(f"{name.upper()}_TABLE", table)
+    for queue in ("REJECTED", "PUT_OFF"):
+        monkeypatch.setenv(f"{queue}_QUEUE", f"https://sqs.example/{queue}")
+    monkeypatch.setenv("ARCHIVE_TABLE", ARCHIVE)
+    monkeypatch.setenv("ROBOT_METRICS", "false")
+    monkeypatch.setenv("RECORD_BYTES_A_DAY", "1")
+    dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
+    stream = Stream(dynamodb)
+    drive = [
+        batch(T0 + i * S, 50, seq=i, speed=[4614 * i] * 50, text=["a"] * 50) for i in range(40) if i != 7
+    ]
+    order = list(drive)
+    random.Random(1).shuffle(order)
+    for start in range(0, len(order), 13):
+        records = stream.store(*order[start : start + 13])
+        assert summarize.handler({"Records": records}, None) == {"batchItemFailures": []}
+    items = [flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
+    assert sum(item["n"] for item in items) == 39 * 50
+    by_second = {int(item["second"]) - SECOND: item for item in items}
+    assert {s for s, item in by_second.items() if item["missing_batches"]} == {8}
+    assert all(item["speed_mps_mean"] == second for second, item in by_second.items())
+    assert counted(capsys)["SamplesSummarized"] == 39 * 50
+    row = plain(dynamodb.get_item(TableName=ROBOTS, Key={"robot": {"S": "car"}})["Item"])
+    stored = dynamodb.scan(TableName=TELEMETRY)["Items"]
+    assert row["record_bytes"] == sum(map(size_of, stored)) > 0
+    # The same through the fake: it must behave as moto does.
+    fake = Stream()
+    fake.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
+    fake.deliver(*drive)
+    assert {int(item["second"]): item for item in items} == fake.summary()
+
+
+def test_the_drive_of_a_real_car_is_summarised(stream):
+    import numpy as np
+
+    samples = list(drive_of(recording("f1tenth-motor-servo.bag")))
+    assert len(samples) == 2244
+    times = np.array([t_us for t_us, _ in samples])
+    names = list(samples[0][1])
+    values = {name: np.array([sample[name] for _, sample in samples], dtype=float) for name in names}
+    assert len(names) == 13
+    gain = 4614.0
+    stream.client.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
+    seconds = sorted(set((times // S).tolist()))
+    batches = []
+    for seq, second in enumerate(seconds):
+        (inside,) = np.nonzero(times // S == second)
+        columns = {name: [samples[i][1][name] for i in inside] for name in names}
+        batches.append(Batch("aaaaaaaa", seq, times[inside].tolist(), columns))
+    random.Random(2).shuffle(batches)
+    for b in batches:
+        stream.deliver(b)
+
+    summary = stream.summary()
+    assert sum(item["n"] for item in summary.values()) == 2244
+    assert sum(item["missing_batches"] for item in summary.values()) == 0
+    values["speed_mps"] = values["speed"] / gain
+    values["power_w"] = values["voltage_input"] * values["current_input"]
+    for second, item in summary.items():
+        inside = times // S == second
+        assert item["n"] == int(inside.sum())
+        for name, column in values.items():
+            expected = column[inside]
+            got = [float(item[f"{name}_{stat}"]) for stat in ("min", "mean", "max", "last")]
+            want = [expected.min(), expected.mean(), expected.max(), expected[-1]]
+            assert got == pytest.approx(want, rel=1e-8, abs=1e-9), (second, name)
+    assert sorted(summary) == seconds

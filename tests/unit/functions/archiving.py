@@ -6,6 +6,7 @@ import hashlib
 import json
 
 import boto3
+import pytest
 
 from functions import archive as function
 from functions.shared.archive import archive as archive_of_environment
@@ -13,11 +14,12 @@ from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import ARCHIVE, HOUR, HOUR_REST_MS, TASK, Hour, Pending
+from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
 from iort_contract.topics import parse_topic
-from testkit.dynamodb import FILES, TELEMETRY, TOPIC_OF_CAR, item_of
+from testkit.dynamodb import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of
 from tests.unit.contract.contract_values import BOOT
 
 DAY_S = 86_400
@@ -91,3 +93,13 @@ class Cloud:
 
 def kill(**_):
     raise Killed
+
+
+@pytest.fixture(name="cloud")
+def cloud_of_archive(dynamodb, s3, monkeypatch):
+    """An empty deployment."""
+    url = boto3.client("sqs").create_queue(QueueName="tasks")["QueueUrl"]
+    given = ArchiveEnvironment("iort", TELEMETRY, "archive", ROBOTS, FILES, url, RETENTION_S)
+    for name, value in given.variables().items():
+        monkeypatch.setenv(name, value)
+    return Cloud(dynamodb, s3)
