@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -65,9 +64,7 @@ class Broker:
             raise StationError(f"the broker refuses a {self._role.name}: {self._failure}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._stop()
 
     def publish(self, topic: str, message: bytes) -> None:

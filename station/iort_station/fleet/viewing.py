@@ -6,7 +6,6 @@ import secrets
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from types import TracebackType
 
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
@@ -76,9 +75,7 @@ class Viewer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._end.set()
         goodbye = threading.Thread(target=self._leave, name="viewer's end", daemon=True)
         goodbye.start()

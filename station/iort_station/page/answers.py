@@ -15,7 +15,7 @@ from iort_contract.messages.control.commands import MAX_LEASE_MS
 from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, SettingKind, SettingsAnswer
 from iort_contract.tables import ONLINE
-from iort_contract.topics import ACCEPTED, check_robot
+from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.errors import StationError
@@ -25,7 +25,7 @@ from iort_station.fleet.roles import has_drivers
 from iort_station.operations import alarms, cloudwatch
 from iort_station.page import history, insights, motion
 from iort_station.page.page import DRIVE
-from iort_station.page.requests import Handler, text, whole
+from iort_station.page.requests import Handler, robot_of, text, whole
 
 # A viewer waits for a robot's answer.
 _ANSWER_S = 10.0
@@ -34,40 +34,40 @@ _ANSWER_S = 10.0
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer, by its name."""
     return {
-        "robots": lambda _asked: {"robots": registry.presence(cloud)},
-        "tags": lambda _asked: {"tags": robots.tags(cloud)},
-        "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
-        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(text(asked, "robot")))},
-        "runs": lambda asked: history.runs_of(cloud, asked),
-        "history": lambda asked: history.history(cloud, asked),
-        "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
-        "dashboard": lambda asked: cloudwatch.dashboard(
-            cloud, text(asked, "name"), minutes=whole(asked, "minutes", 1, 14 * 24 * 60)
+        "robots": lambda _request: {"robots": registry.presence(cloud)},
+        "tags": lambda _request: {"tags": robots.tags(cloud)},
+        "vehicles": lambda _request: {"vehicles": registry.vehicles(cloud)},
+        "streams": lambda request: {"streams": inventory.streams_of(cloud, robot_of(request))},
+        "runs": lambda request: history.runs_of(cloud, request),
+        "history": lambda request: history.history(cloud, request),
+        "dashboards": lambda _request: {"dashboards": cloudwatch.dashboards(cloud)},
+        "dashboard": lambda request: cloudwatch.dashboard(
+            cloud, text(request, "name"), minutes=whole(request, "minutes", 1, 14 * 24 * 60)
         ),
-        "log": lambda asked: cloudwatch.rows(
+        "log": lambda request: cloudwatch.rows(
             cloud,
-            text(asked, "name"),
-            whole(asked, "widget", 0, 500),
-            minutes=whole(asked, "minutes", 1, 14 * 24 * 60),
+            text(request, "name"),
+            whole(request, "widget", 0, 500),
+            minutes=whole(request, "minutes", 1, 14 * 24 * 60),
         ),
-        "alarms": lambda _asked: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
-        "rejected": lambda _asked: alarms.rejected(cloud),
-        "insights": lambda asked: insights.insights(cloud, asked),
-        "analysis": lambda asked: insights.progress(cloud, asked),
-        "laps": lambda asked: insights.laps(cloud, asked),
-        "delta": lambda asked: insights.delta(cloud, asked),
-        "notes": lambda asked: insights.notes(cloud, asked),
+        "alarms": lambda _request: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
+        "rejected": lambda _request: alarms.rejected(cloud),
+        "insights": lambda request: insights.insights(cloud, request),
+        "analysis": lambda request: insights.progress(cloud, request),
+        "laps": lambda request: insights.laps(cloud, request),
+        "delta": lambda request: insights.delta(cloud, request),
+        "notes": lambda request: insights.notes(cloud, request),
         "motion": motion.fleet(cloud).motion,
-        "socket": lambda _asked: motion.address(cloud, VIEWER),
+        "socket": lambda _request: motion.address(cloud, VIEWER),
     }
 
 
 def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str, Any]]]:
     """What everybody who reaches the page may do, by its name."""
     return {
-        "view": lambda asked: motion.view(motion.prompt(cloud), asked),
-        "acknowledge": lambda asked: alarms.acknowledge(
-            cloud, text(asked, "alarm"), whole(asked, "since_ms", 0, 2**53) / 1000, asked.get("by", "")
+        "view": lambda request: motion.view(motion.prompt(cloud), request),
+        "acknowledge": lambda request: alarms.acknowledge(
+            cloud, text(request, "alarm"), whole(request, "since_ms", 0, 2**53) / 1000, request.get("by", "")
         ),
     }
 
@@ -75,29 +75,33 @@ def actions(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Mapping[str
 def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
     """What moves or changes a robot, or costs something, by its name; only for a server on loopback."""
     return {
-        "send": lambda asked: send(cloud, asked),
-        "settings": lambda asked: settings(cloud, asked),
-        "set": lambda asked: change(cloud, asked),
-        "analyse": lambda asked: insights.analyse(cloud, asked),
-        "note": lambda asked: insights.write_note(cloud, asked),
-        "delete_note": lambda asked: insights.remove_note(cloud, asked),
+        "send": lambda request: send(cloud, request),
+        "settings": lambda request: settings(cloud, request),
+        "set": lambda request: change(cloud, request),
+        "analyse": lambda request: insights.analyse(cloud, request),
+        "note": lambda request: insights.write_note(cloud, request),
+        "delete_note": lambda request: insights.remove_note(cloud, request),
         "stop": motion.fleet(cloud).stop,
-        **({DRIVE: lambda _asked: motion.address(cloud, DRIVER)} if has_drivers(cloud) else {}),
+        **({DRIVE: lambda _request: motion.address(cloud, DRIVER)} if has_drivers(cloud) else {}),
     }
 
 
-def send(cloud: Cloud, asked: Mapping[str, str]) -> Generator[None, None, SendAnswer]:
+def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, SendAnswer]:
     """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves;
     ``takeover`` takes the wheel from whoever drives. It yields while it waits for the robot."""
     try:
-        message = json.loads(text(asked, "message"))
+        message = json.loads(text(request, "message"))
     except (ValueError, RecursionError) as error:
         raise StationError(f"the message must be JSON: {error}") from error
     if not isinstance(message, dict):
         raise StationError("the message must be a JSON object with the fields of the ROS message")
-    lease_ms = whole(asked, "lease_ms", 1, MAX_LEASE_MS) if asked.get("lease_ms") else None
+    lease_ms = whole(request, "lease_ms", 1, MAX_LEASE_MS) if request.get("lease_ms") else None
     began = time.monotonic()
-    robot, name, takeover = text(asked, "robot"), text(asked, "command"), asked.get("takeover") == "true"
+    robot, name, takeover = (
+        text(request, "robot"),
+        text(request, "command"),
+        request.get("takeover") == "true",
+    )
     sent = yield from control.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
@@ -106,19 +110,19 @@ def send(cloud: Cloud, asked: Mapping[str, str]) -> Generator[None, None, SendAn
     return {"accepted": accepted, "reason": "" if accepted else sent.outcome, "after_ms": after_ms}
 
 
-def settings(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+def settings(cloud: Cloud, request: Mapping[str, str]) -> SettingsAnswer:
     """The settings of ``robot``: those in force, and what is pending."""
-    robot = text(asked, "robot")
+    robot = text(request, "robot")
     state = Shadow(cloud, robot).read()
     return {"settings": _entries(state, {}), "online": bool(registry.get(cloud, robot).get(ONLINE))}
 
 
-def change(cloud: Cloud, asked: Mapping[str, str]) -> SettingsAnswer:
+def change(cloud: Cloud, request: Mapping[str, str]) -> SettingsAnswer:
     """Change the setting ``name`` of ``robot`` to ``value``; without a value, car.yaml's applies again."""
-    robot, name = text(asked, "robot"), text(asked, "name")
+    robot, name = text(request, "robot"), text(request, "name")
     if name == MOTION_STOPPED:
         raise StationError("the emergency stop has a button of its own")
-    value = control.parse_setting(name, asked["value"]) if "value" in asked else None
+    value = control.parse_setting(name, request["value"]) if "value" in request else None
     changed = control.change_settings(cloud, robot, {name: value}, _ANSWER_S)
     reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
     return {"settings": _entries(changed.state, reasons), "online": changed.online}

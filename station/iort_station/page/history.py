@@ -16,7 +16,6 @@ from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
 from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
-from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Result, Selection, bags, export, inventory, tabular
@@ -24,7 +23,7 @@ from iort_station.data.bags import Recording, Write
 from iort_station.data.runs import runs
 from iort_station.data.selection import derive
 from iort_station.errors import StationError
-from iort_station.page.requests import text, whole
+from iort_station.page.requests import robot_of, text, whole
 from iort_station.page.server import Download
 from iort_station.times import iso_s
 
@@ -39,42 +38,42 @@ _DERIVED_OF = [frozenset(sources) for name, sources in SOURCES.items() if not PA
 _MOST_RUNS = 200
 
 
-def runs_of(cloud: Cloud, asked: Mapping[str, str]) -> RunsAnswer:
+def runs_of(cloud: Cloud, request: Mapping[str, str]) -> RunsAnswer:
     """The ``count`` newest runs of ``robot``, or the newest ones before ``before_us``."""
-    before_us = whole(asked, "before_us", 0, 2**53) if "before_us" in asked else None
-    count = whole(asked, "count", 1, _MOST_RUNS)
-    robot = check_robot(text(asked, "robot"))
+    before_us = whole(request, "before_us", 0, 2**53) if "before_us" in request else None
+    count = whole(request, "count", 1, _MOST_RUNS)
+    robot = robot_of(request)
     # The page also asks about a car that never recorded, or that nobody knows: it has no runs.
     streams = [name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS]
     return runs(cloud, robot, streams=streams, end_us=before_us, count=count)
 
 
-def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
+def history(cloud: Cloud, request: Mapping[str, str]) -> HistoryAnswer:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
     A row of several samples has the minimum, the mean and the maximum of every number, the last complete
     attachment, and the last value that is not null of everything else. Raises `StationError` for a request
     that cannot be answered.
     """
-    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
-    rows = whole(asked, "rows", 2, MAX_ROWS)
+    start_us, end_us = (whole(request, name, 0, 2**53) for name in ("from_us", "to_us"))
+    rows = whole(request, "rows", 2, MAX_ROWS)
     if start_us >= end_us:
         raise StationError("the range must end after its start")
     summary = end_us - start_us > _SAMPLES_US
-    robot, stream = text(asked, "robot"), text(asked, "stream")
-    found = data.query(cloud, robot, stream, start_us, end_us, summary=summary, most=MOST_VALUES)
+    robot, stream = text(request, "robot"), text(request, "stream")
+    result = data.query(cloud, robot, stream, start_us, end_us, summary=summary, most=MOST_VALUES)
     columns = (
-        _by_statistic(found.columns)
+        _by_statistic(result.columns)
         if summary
-        else {name: (c, c, c) for name, c in _with_derived(found.columns).items()}
+        else {name: (c, c, c) for name, c in _with_derived(result.columns).items()}
     )
     claims = _claims(columns)
-    n = len(found)
+    n = len(result)
     row_us = 0
     starts = np.arange(n)
     if n > rows:
-        row_us = -(-(int(found.times_us[-1] - found.times_us[0]) + 1) // rows)
-        bins = (found.times_us - found.times_us[0]) // row_us
+        row_us = -(-(int(result.times_us[-1] - result.times_us[0]) + 1) // rows)
+        bins = (result.times_us - result.times_us[0]) // row_us
         starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
     several = summary or row_us > 0
     fields: dict[str, PageColumn] = {
@@ -82,17 +81,17 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     }
     for name, key in claims.items():
         # The fields of an attachment belong together, so they come from one sample.
-        told, ends = values(found.columns[name]), _last_known(found.columns[key], starts)
-        fields[name] = {"mean": [told[end] for end in ends]}
+        column, ends = values(result.columns[name]), _last_known(result.columns[key], starts)
+        fields[name] = {"mean": [column[end] for end in ends]}
     return {
-        "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
+        "times_s": [t_us / 1e6 for t_us in result.times_us[starts].tolist()],
         "fields": fields,
-        "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
-        "ros2": found.ros2,
+        "samples": int(np.nansum(result.columns["n"])) if summary and "n" in result.columns else n,
+        "ros2": result.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
-        "archive": found.origin.told(),
-        "refused": found.refused,
-        "reason": found.reason,
+        "archive": result.origin.told(),
+        "refused": result.refused,
+        "reason": result.reason,
     }
 
 
@@ -175,10 +174,10 @@ def downloads(cloud: Cloud) -> dict[str, Download]:
 
 
 def _table(
-    cloud: Cloud, write: Callable[[Result, Path], None], suffix: str, asked: Mapping[str, str], folder: Path
+    cloud: Cloud, write: Callable[[Result, Path], None], suffix: str, request: Mapping[str, str], folder: Path
 ) -> Path:
-    selection = _selection(asked)
-    found = data.query(
+    selection = _selection(request)
+    result = data.query(
         cloud,
         selection.robot,
         selection.stream,
@@ -186,25 +185,25 @@ def _table(
         selection.end_us,
         most=MOST_VALUES,
     )
-    if not len(found):
+    if not len(result):
         raise StationError("no samples in this range")
-    path = folder / _name(selection, suffix, found.refused)
-    write(found, path)
+    path = folder / _name(selection, suffix, result.refused)
+    write(result, path)
     return path
 
 
-def _csv(found: Result, path: Path) -> None:
+def _csv(result: Result, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        tabular.to_csv(found, file)
+        tabular.to_csv(result, file)
 
 
-def _parquet(found: Result, path: Path) -> None:
+def _parquet(result: Result, path: Path) -> None:
     with path.open("wb") as file:
-        tabular.to_parquet(found, file)
+        tabular.to_parquet(result, file)
 
 
-def _mcap(cloud: Cloud, asked: Mapping[str, str], folder: Path) -> Path:
-    selection = _selection(asked)
+def _mcap(cloud: Cloud, request: Mapping[str, str], folder: Path) -> Path:
+    selection = _selection(request)
     path, refused = folder / "export.mcap", RefusedItems()
     with bags.mcap(path) as file:
         if not export.write(cloud, selection, _Bounded(file), refused=refused):
@@ -233,9 +232,9 @@ class _Bounded:
         return bounded
 
 
-def _selection(asked: Mapping[str, str]) -> Selection:
-    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
-    return data.select(text(asked, "robot"), text(asked, "stream"), start_us, end_us)
+def _selection(request: Mapping[str, str]) -> Selection:
+    start_us, end_us = (whole(request, name, 0, 2**53) for name in ("from_us", "to_us"))
+    return data.select(text(request, "robot"), text(request, "stream"), start_us, end_us)
 
 
 def _name(selection: Selection, suffix: str, refused: int) -> str:

@@ -37,7 +37,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.alarms import user
-from iort_station.page.requests import text, whole
+from iort_station.page.requests import robot_of, text, whole
 
 # What is shown of a robot, and of each one of the fleet.
 _DRIVES, _FINDINGS = 60, 60
@@ -47,22 +47,22 @@ _READERS = 8
 _LONGEST_S = 366 * 86_400
 
 
-def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
+def insights(cloud: Cloud, request: Mapping[str, str]) -> InsightsAnswer:
     """The newest findings and drives of ``robot``; without one, of all robots."""
-    robots = [check_robot(asked["robot"])] if asked.get("robot") else sorted(registry.presence(cloud))
-    drives, findings = (_DRIVES, _FINDINGS) if asked.get("robot") else (_FLEET_DRIVES, _FLEET_FINDINGS)
+    robots = [check_robot(request["robot"])] if request.get("robot") else sorted(registry.presence(cloud))
+    drives, findings = (_DRIVES, _FINDINGS) if request.get("robot") else (_FLEET_DRIVES, _FLEET_FINDINGS)
     table = stored.findings_table(cloud)
 
     def of(robot: str) -> tuple[list[Finding], list[AnalysedDrive]]:
         return list(islice(table.findings(robot), findings)), list(table.drives(robot, most=drives))
 
     with ThreadPoolExecutor(_READERS) as pool:
-        found = list(pool.map(of, robots))
-    told = [finding for some, _ in found for finding in some]
+        entries = list(pool.map(of, robots))
+    newest = [finding for some, _ in entries for finding in some]
     return {
-        "findings": [_finding(finding) for finding in _newest(told)],
+        "findings": [_finding(finding) for finding in _newest(newest)],
         "drives": sorted(
-            [*_failed(told), *(_drive(drive) for _, some in found for drive in some)],
+            [*_failed(newest), *(_drive(drive) for _, some in entries for drive in some)],
             key=lambda drive: -drive["from_us"],
         ),
         "groups": {
@@ -72,19 +72,19 @@ def insights(cloud: Cloud, asked: Mapping[str, str]) -> InsightsAnswer:
     }
 
 
-def analyse(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisStarted:
+def analyse(cloud: Cloud, request: Mapping[str, str]) -> AnalysisStarted:
     """Start an analysis of the drives of the last ``last_s``: of ``robot``, or of all robots without one."""
-    last_us = whole(asked, "last_s", 1, _LONGEST_S) * 1_000_000
-    robots = (check_robot(asked["robot"]),) if asked.get("robot") else ()
+    last_us = whole(request, "last_s", 1, _LONGEST_S) * 1_000_000
+    robots = (check_robot(request["robot"]),) if request.get("robot") else ()
     now_us = time.time_ns() // 1000
     run = analysis.start(cloud, AnalysisRequest(robots, now_us - last_us, now_us, again=True))
     return {"run": run.rpartition(":")[2]}
 
 
-def progress(cloud: Cloud, asked: Mapping[str, str]) -> AnalysisAnswer:
+def progress(cloud: Cloud, request: Mapping[str, str]) -> AnalysisAnswer:
     """How far the ``run`` of an analysis is; raises `StationError` if it has failed."""
-    found = analysis.look(cloud, analysis.named(cloud, text(asked, "run")))
-    return {"running": found.state == analysis.RUNNING, "drives": found.drives, "done": found.done}
+    run = analysis.look(cloud, analysis.named(cloud, text(request, "run")))
+    return {"running": run.state == analysis.RUNNING, "drives": run.drives, "done": run.done}
 
 
 def estimate(of: Estimate) -> EstimateEntry:
@@ -161,14 +161,14 @@ def _mined(cloud: Cloud, robot: str, start_us: int, end_us: int) -> Mined:
     return laps_within(cloud, robot, start_us, end_us, most=_MOST_VALUES)
 
 
-def _mined_of(cloud: Cloud, asked: Mapping[str, str]) -> Mined:
-    start_us, end_us = (whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
-    return _mined(cloud, check_robot(text(asked, "robot")), start_us, end_us)
+def _mined_of(cloud: Cloud, request: Mapping[str, str]) -> Mined:
+    start_us, end_us = (whole(request, name, 0, 2**53) for name in ("from_us", "to_us"))
+    return _mined(cloud, robot_of(request), start_us, end_us)
 
 
-def laps(cloud: Cloud, asked: Mapping[str, str]) -> LapsAnswer:
+def laps(cloud: Cloud, request: Mapping[str, str]) -> LapsAnswer:
     """The laps of ``robot`` from ``from_us`` to ``to_us``."""
-    mined = _mined_of(cloud, asked)
+    mined = _mined_of(cloud, request)
     table = mined.tables.get(LAPS_TABLE)
     estimates = {name: estimate(one) for name, one in mined.estimates.items()}
     if table is None:
@@ -199,24 +199,24 @@ def laps(cloud: Cloud, asked: Mapping[str, str]) -> LapsAnswer:
     }
 
 
-def delta(cloud: Cloud, asked: Mapping[str, str]) -> DeltaAnswer:
+def delta(cloud: Cloud, request: Mapping[str, str]) -> DeltaAnswer:
     """How far the lap ``other`` is behind the lap ``one``, at each place of the track."""
-    mined = _mined_of(cloud, asked)
-    one, other = (whole(asked, name, 1, 10**6) for name in ("one", "other"))
+    mined = _mined_of(cloud, request)
+    one, other = (whole(request, name, 1, 10**6) for name in ("one", "other"))
     if PLACES_TABLE not in mined.tables:
         raise StationError(next(iter(mined.missing.values()), "no laps"))
     try:
-        found = compare(mined.tables[PLACES_TABLE], one, other)
+        compared = compare(mined.tables[PLACES_TABLE], one, other)
     except AnalysisError as error:
         raise StationError(str(error)) from error
-    places = found["place_m"]
+    places = compared["place_m"]
     in_metres = bool(np.isfinite(places).all())
     return {
         "places": (places if in_metres else np.linspace(0, 100, len(places))).tolist(),
         "unit": "m" if in_metres else "%",
-        "delta_s": found["delta_s"].tolist(),
-        "one_mps": _known(found["one_mps"]),
-        "other_mps": _known(found["other_mps"]),
+        "delta_s": compared["delta_s"].tolist(),
+        "one_mps": _known(compared["one_mps"]),
+        "other_mps": _known(compared["other_mps"]),
     }
 
 
@@ -227,11 +227,11 @@ def _known(column: Column) -> list[float | None]:
 _NOTES = 200
 
 
-def notes(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+def notes(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
     """The newest notes about ``robot``, or about the fleet; those from ``from_us`` to ``to_us``, if given."""
-    robot = check_robot(asked["robot"]) if asked.get("robot") else None
+    robot = check_robot(request["robot"]) if request.get("robot") else None
     start_us, end_us = (
-        whole(asked, name, 0, 2**53) if name in asked else None for name in ("from_us", "to_us")
+        whole(request, name, 0, 2**53) if name in request else None for name in ("from_us", "to_us")
     )
     newest = stored.notes(cloud, robot, start_us, end_us, most=_NOTES)
     return {
@@ -242,16 +242,16 @@ def notes(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
     }
 
 
-def write_note(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+def write_note(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
     """Write a note with ``text`` about ``robot`` at ``t_us``, or about now."""
-    robot = text(asked, "robot")
-    t_us = whole(asked, "t_us", 0, 2**53) if "t_us" in asked else None
-    stored.write_note(cloud, robot, text(asked, "text"), by=user(), t_us=t_us)
+    robot = text(request, "robot")
+    t_us = whole(request, "t_us", 0, 2**53) if "t_us" in request else None
+    stored.write_note(cloud, robot, text(request, "text"), by=user(), t_us=t_us)
     return notes(cloud, {"robot": robot})
 
 
-def remove_note(cloud: Cloud, asked: Mapping[str, str]) -> NotesAnswer:
+def remove_note(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
     """Delete the note ``id`` of ``robot``."""
-    robot = text(asked, "robot")
-    stored.remove_note(cloud, robot, text(asked, "id"))
+    robot = text(request, "robot")
+    stored.remove_note(cloud, robot, text(request, "id"))
     return notes(cloud, {"robot": robot})

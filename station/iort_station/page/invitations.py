@@ -64,9 +64,9 @@ async def answer(
 ) -> None:
     """Answer a connection: with the page's address, and with an invitation if that is asked for."""
     try:
-        asked = await asyncio.wait_for(reader.readline(), _ANSWER_S)
-        told = {"url": url, **({"address": invite()} if asked.strip() == b"invite" else {})}
-        writer.write(json.dumps(told).encode())
+        request = await asyncio.wait_for(reader.readline(), _ANSWER_S)
+        content = {"url": url, **({"address": invite()} if request.strip() == b"invite" else {})}
+        writer.write(json.dumps(content).encode())
         await writer.drain()
     except (OSError, ValueError, asyncio.TimeoutError):
         # Whoever asked has gone.
@@ -79,9 +79,9 @@ def served(folder: Path) -> list[ServedPage]:
     """The pages of this user that run, by their ports."""
     paths = [path for path in folder.glob(f"*{_ENDING}") if path.stem.isdecimal()]
     return sorted(
-        ServedPage(int(path.stem), told["url"], path)
+        ServedPage(int(path.stem), content["url"], path)
         for path in paths
-        if (told := _ask(path, "url")) is not None
+        if (content := _ask(path, "url")) is not None
     )
 
 
@@ -100,10 +100,10 @@ def invite(folder: Path, port: int | None = None) -> tuple[ServedPage, str]:
     chosen = next((page for page in pages if port in {None, page.port}), None)
     if chosen is None:
         raise UsageError(f"--port must be that of a page of yours, got {port}; there is {shown}")
-    told = _ask(chosen.socket, "invite")
-    if told is None:
+    content = _ask(chosen.socket, "invite")
+    if content is None:
         raise StationError(f"the page {chosen.url} has ended")
-    return chosen, told["address"]
+    return chosen, content["address"]
 
 
 def _ask(path: Path, what: str) -> dict[str, str] | None:
@@ -117,10 +117,10 @@ def _ask(path: Path, what: str) -> dict[str, str] | None:
             received = b""
             while (part := door.recv(_MOST_BYTES)) and len(received) < _MOST_BYTES:
                 received += part
-        told: dict[str, str] = json.loads(received)
+        content: dict[str, str] = json.loads(received)
     except (OSError, ValueError):
         return None
-    return told
+    return content
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from types import TracebackType
 from typing import Any
 
 from typing_extensions import Self
@@ -66,10 +65,8 @@ class BrokerListener(Listening):
         self._broker.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._broker.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._broker.__exit__(*error)
 
     def _take(self, topic: str, message: bytes) -> None:
         self.take(update_of(topic, message), 0)

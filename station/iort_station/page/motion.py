@@ -112,18 +112,18 @@ class Fleet:
         self._read_s = self._changed_s = float("-inf")
         self._robots: dict[str, stopping.Motion] = {}
 
-    def motion(self, asked: Mapping[str, str]) -> MotionAnswer:
+    def motion(self, request: Mapping[str, str]) -> MotionAnswer:
         """Of ``robot``, as it is now; without one, of the fleet."""
-        robot = asked.get("robot")
+        robot = request.get("robot")
         return _motion(stopping.motion(self._cloud, [check_robot(robot)]) if robot else self._all(), {})
 
-    def stop(self, asked: Mapping[str, str]) -> MotionAnswer:
+    def stop(self, request: Mapping[str, str]) -> MotionAnswer:
         """Stop ``robot``, or release it. Without one, stop the fleet, or release what that has stopped.
         ``seen_ms`` is the newest stop that the page shows: a release ends no stop after it."""
-        stops = {"true": True, "false": False}.get(text(asked, "stopped"))
+        stops = {"true": True, "false": False}.get(text(request, "stopped"))
         if stops is None:
             raise StationError("stopped must be true or false")
-        one = [check_robot(asked["robot"])] if asked.get("robot") else None
+        one = [check_robot(request["robot"])] if request.get("robot") else None
         # As they were last read, if they ever were.
         known = list(self._robots)
         cloud, fleet = self._urgent, one is None
@@ -135,7 +135,7 @@ class Fleet:
             failed |= stopping.take_back(cloud, set(one) - set(known) if one else set(known) - set(robots))
         else:
             robots = one or self._names(known)
-            seen_ms = whole(asked, "seen_ms", 0, 10**15)
+            seen_ms = whole(request, "seen_ms", 0, 10**15)
             failed = stopping.release(cloud, robots, by=user(), fleet=fleet, seen_ms=seen_ms)
         # Read again when asked next, and often.
         self._changed_s = time.monotonic()
@@ -190,16 +190,16 @@ def _entry(motion: stopping.Motion) -> MotionEntry:
 _MOST_ROBOTS = 256
 
 
-def view(cloud: Cloud, asked: Mapping[str, str]) -> ViewAnswer:
+def view(cloud: Cloud, request: Mapping[str, str]) -> ViewAnswer:
     """Publish a lease of ``viewer`` for each of ``robots``, separated by commas; ``lease_ms=0`` ends them.
     With ``broker`` the viewer listens there, and not at PubNub."""
-    robots = text(asked, "robots").split(",")
+    robots = text(request, "robots").split(",")
     if len(robots) > _MOST_ROBOTS:
         raise StationError(f"robots must be at most {_MOST_ROBOTS}, got {len(robots)}")
     lease = Lease(
-        text(asked, "viewer"),
-        number(asked, "rate_hz"),
-        whole(asked, "lease_ms", 0, VIEW_LEASE_MS),
-        broker="broker" in asked,
+        text(request, "viewer"),
+        number(request, "rate_hz"),
+        whole(request, "lease_ms", 0, VIEW_LEASE_MS),
+        broker="broker" in request,
     )
     return {"asked": viewing.view(cloud, robots, lease)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from types import TracebackType
 from typing import Any
 
 from pubnub.callbacks import SubscribeCallback
@@ -65,9 +64,7 @@ class Listener(Listening):
             raise StationError(f"PubNub did not accept the subscription within {_CONNECT_S:.0f} s")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._client.stop()
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import ContractError
+from iort_contract.topics import check_robot
 from iort_station.errors import StationError
 from iort_station.page.page import TYPES
 
@@ -63,29 +64,34 @@ def takes_gzip(accepted: str) -> bool:
     return weight == "" or weight.strip("0.") != ""
 
 
-def text(asked: Mapping[str, str], name: str) -> str:
+def text(request: Mapping[str, str], name: str) -> str:
     """A text that is not empty; raises `StationError`."""
-    if not asked.get(name):
+    if not request.get(name):
         raise StationError(f"the request must have the parameter {name}")
-    return asked[name]
+    return request[name]
 
 
-def number(asked: Mapping[str, str], name: str) -> float:
+def robot_of(request: Mapping[str, str]) -> str:
+    """The parameter ``robot``; raises `StationError`, and `ContractError` for a name that no robot has."""
+    return check_robot(text(request, "robot"))
+
+
+def number(request: Mapping[str, str], name: str) -> float:
     """A number; raises `StationError`."""
-    found = text(asked, name)
+    value = text(request, name)
     try:
-        return float(found)
+        return float(value)
     except ValueError as error:
-        raise StationError(f"{name} must be a number, got {found[:40]!r}") from error
+        raise StationError(f"{name} must be a number, got {value[:40]!r}") from error
 
 
-def whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
+def whole(request: Mapping[str, str], name: str, least: int, most: int) -> int:
     """A whole number in the range; raises `StationError`."""
-    found = text(asked, name)
+    value = text(request, name)
     # Sixteen digits are enough for every allowed number.
-    if not (found.isascii() and found.isdecimal()) or len(found) > 16 or not least <= int(found) <= most:
-        raise StationError(f"{name} must be a whole number from {least} to {most}, got {found[:40]!r}")
-    return int(found)
+    if not (value.isascii() and value.isdecimal()) or len(value) > 16 or not least <= int(value) <= most:
+        raise StationError(f"{name} must be a whole number from {least} to {most}, got {value[:40]!r}")
+    return int(value)
 
 
 def answered(answer: Handler, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:

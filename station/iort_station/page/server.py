@@ -123,7 +123,7 @@ class PageServer(BackgroundServer):
         self._body_s = body_s
         self._admitted = admitted or (lambda _: None)
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
-        told = partial(
+        configured = partial(
             config,
             namespace=namespace,
             live=live,
@@ -153,9 +153,9 @@ class PageServer(BackgroundServer):
         self._known: Body | None = None
         self._read_config: Callable[[], Body]
         if callable(vehicles):
-            self._read_config = lambda: as_json(told(vehicles=vehicles()))
+            self._read_config = lambda: as_json(configured(vehicles=vehicles()))
         else:
-            self._files[CONFIG] = as_json(told(vehicles=vehicles))
+            self._files[CONFIG] = as_json(configured(vehicles=vehicles))
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
@@ -282,7 +282,7 @@ class PageServer(BackgroundServer):
         parameters, download = dict(request.query), self._downloads[path]
         with TemporaryDirectory(prefix="iort-download-") as folder:
             try:
-                found = await self._work.do(
+                written = await self._work.do(
                     lambda: tried(lambda: download(parameters, Path(folder))),
                     WRITING,
                     client_of(request.remote or ""),
@@ -290,18 +290,18 @@ class PageServer(BackgroundServer):
                 )
             except Busy as busy:
                 return self._busy(request, busy)
-            if isinstance(found, tuple):
-                return self._response(request, found[1], found[0])
+            if isinstance(written, tuple):
+                return self._response(request, written[1], written[0])
             response = web.StreamResponse(
                 headers={
                     **self._headers,
                     "Content-Type": "application/octet-stream",
-                    "Content-Disposition": f'attachment; filename="{found.name}"',
+                    "Content-Disposition": f'attachment; filename="{written.name}"',
                 }
             )
-            file = await asyncio.to_thread(found.open, "rb")
+            file = await asyncio.to_thread(written.open, "rb")
             with file:
-                response.content_length = found.stat().st_size
+                response.content_length = written.stat().st_size
                 await response.prepare(request)
                 while request.method == "GET" and (part := await asyncio.to_thread(file.read, _CHUNK_BYTES)):
                     await asyncio.wait_for(response.write(part), PART_S)
@@ -313,9 +313,9 @@ class PageServer(BackgroundServer):
         response.headers["Retry-After"] = "1"
         return response
 
-    def _admit(self, asked: Mapping[str, str]) -> Admitted:
+    def _admit(self, parameters: Mapping[str, str]) -> Admitted:
         """The key, for a token that was not used before; or whether a kept key is still the server's."""
-        token = asked.get("token", "")
+        token = parameters.get("token", "")
         if self._is_key(token):
             return {"key": self._key}
         try:
@@ -330,8 +330,8 @@ class PageServer(BackgroundServer):
         """What gives a browser the key."""
         return f"open a link of `{COMMAND}`" if self._invitations else "open the one in the server's terminal"
 
-    def _is_key(self, told: str) -> bool:
-        return secrets.compare_digest(told.encode(errors="surrogateescape"), self._key.encode())
+    def _is_key(self, key: str) -> bool:
+        return secrets.compare_digest(key.encode(errors="surrogateescape"), self._key.encode())
 
     async def _act(
         self, request: web.BaseRequest, path: str, action: Handler, *, keyed: bool = False
@@ -347,16 +347,18 @@ class PageServer(BackgroundServer):
         if request.content_type != TYPES[".json"]:
             return self._refusal(request, 415, "an action needs a body of application/json")
         try:
-            asked = json.loads(await asyncio.wait_for(request.text(), self._body_s))
+            parameters = json.loads(await asyncio.wait_for(request.text(), self._body_s))
         except asyncio.TimeoutError:
             late = self._refusal(request, 408, "the body must be here sooner")
             late.force_close()
             return late
         except (ValueError, LookupError, RecursionError):  # also of an unknown charset
-            asked = None
-        if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
+            parameters = None
+        if not isinstance(parameters, dict) or not all(
+            isinstance(value, str) for value in parameters.values()
+        ):
             return self._refusal(request, 400, "the body must be an object of texts")
-        return await self._answer(request, path, action, asked, ACTING)
+        return await self._answer(request, path, action, parameters, ACTING)
 
     def _accepts(self, host: str) -> bool:
         """Whether a request's Host is ours.
@@ -364,13 +366,13 @@ class PageServer(BackgroundServer):
         In DNS rebinding, a page elsewhere has its own name point here, to read the keys and the fleet's data.
         Its requests carry that name, never an address.
         """
-        found = _HOST.fullmatch(host)
-        if found is None:
+        match = _HOST.fullmatch(host)
+        if match is None:
             return False
         try:
-            ipaddress.ip_address(found[1].strip("[]"))
+            ipaddress.ip_address(match[1].strip("[]"))
         except ValueError:
-            return found[1].lower() in self._names
+            return match[1].lower() in self._names
         return True
 
     def _refusal(self, request: web.BaseRequest, status: int, reason: str) -> web.Response:
