@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
 from typing import Callable
 
 from iort_agent.common.logs import ThrottledLog
@@ -10,17 +10,18 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros1 import Graph
 
+_log = logging.getLogger(__name__)
 
-@dataclass(frozen=True)
+
 class Bridge:
     """The two sides that commands, peers and questions connect: the broker and the ROS graph.
 
-    ``offset`` returns the cloud's clock minus ours, if it is known well enough."""
+    ``offset`` returns the cloud's clock minus ours, if it is known well enough.
+    """
 
-    link: Link
-    graph: Graph
-    offset: Callable[[], ClockOffset | None]
-    rejections: ThrottledLog
+    def __init__(self, link: Link, graph: Graph, offset: Callable[[], ClockOffset | None]) -> None:
+        self.link, self.graph, self.offset = link, graph, offset
+        self.rejections = ThrottledLog(_log, link.clock)
 
     def offset_us(self) -> int | None:
         """The offset in microseconds."""

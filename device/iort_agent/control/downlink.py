@@ -7,7 +7,6 @@ import threading
 from pathlib import Path
 from typing import Any, Callable, Iterable, Sequence
 
-from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import Supervised
 from iort_agent.control import Bridge
@@ -39,20 +38,16 @@ class Downlink:
         self,
         config: DownlinkConfig,
         share: Sequence[tuple[str, ShareConfig]],
+        bridge: Bridge,
         *,
-        link: Link,
         boot: str,
-        graph: Graph,
-        offset: Callable[[], ClockOffset | None],
         operator: Operator,
         guard: Guard | None = None,
         questions: Questions | None = None,
     ) -> None:
-        self._clock, self._graph, self._guard = link.clock, graph, guard
+        self._clock, self._bridge, self._guard = bridge.link.clock, bridge, guard
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = Supervised("downlink", self._run)
-        self._rejections = ThrottledLog(_log, link.clock)
-        bridge = Bridge(link, graph, offset, self._rejections)
         self._commands = Commands(config, bridge, operator=operator, guard=guard, wake=self._wake.set)
         self._peers = Peers(config, bridge)
         self._shares = Shares(share, bridge, boot=boot, wake=self._wake.set)
@@ -60,7 +55,7 @@ class Downlink:
 
     def start(self) -> None:
         """Join the ROS graph and begin."""
-        self._graph.start()
+        self._bridge.graph.start()
         if self._guard is not None:
             self._guard.start()
         self._thread.start()
@@ -93,7 +88,7 @@ class Downlink:
             self._clock.wait(threading.Event(), max(0.0, due - self._clock.monotonic()))
         if self._guard is not None:
             self._guard.close(leave=self._commands.held())
-        self._graph.close()
+        self._bridge.graph.close()
 
     def tick(self) -> float:
         """Publish the stops and shares that are due. Returns the seconds until the next ones are."""
@@ -109,7 +104,7 @@ class Downlink:
             "shared": self._shares.report(),
             **({"guard": guarded} if (guarded := self._commands.guarded()) is not None else {}),
             **({"asked": self._asks.report()} if self._asks is not None else {}),
-            "refused": self._rejections.counts(),
+            "refused": self._bridge.rejections.counts(),
             "waits": self.waits(),
         }
 
@@ -119,7 +114,7 @@ class Downlink:
 
     def waits(self) -> str | None:
         """What the ROS graph waits for; None if it does not wait."""
-        return self._graph.waits()
+        return self._bridge.graph.waits()
 
     def _run(self) -> None:
         while not self._end.is_set():
@@ -164,14 +159,5 @@ def make_downlink(
     questions = None
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)
-    return Downlink(
-        config,
-        share,
-        link=link,
-        boot=boot,
-        graph=graph,
-        offset=offset,
-        operator=operator,
-        guard=guard,
-        questions=questions,
-    )
+    bridge = Bridge(link, graph, offset)
+    return Downlink(config, share, bridge, boot=boot, operator=operator, guard=guard, questions=questions)

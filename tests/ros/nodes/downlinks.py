@@ -18,6 +18,7 @@ from pathlib import Path
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import SystemClock
+from iort_agent.control import Bridge
 from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
@@ -62,10 +63,8 @@ guard = Guard(graph.base, config.motions(), clock) if "--guard" in sys.argv else
 downlink = Downlink(
     config,
     share_rule()(settings["share"], where) if "share" in settings else (),
-    link=link,
-    graph=graph,
+    Bridge(link, graph, lambda: ClockOffset(0.0, 0.0)),
     boot="0badcafe",
-    offset=lambda: ClockOffset(0.0, 0.0),
     operator=Operator(lambda *_: None, lambda _: None, lambda: True),
     guard=guard,
     questions=questions,

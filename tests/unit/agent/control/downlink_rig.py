@@ -11,6 +11,7 @@ from typing import Any
 
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
+from iort_agent.control import Bridge
 from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
@@ -169,11 +170,9 @@ class Rig:
         self.downlink = Downlink(
             load(DownlinkConfig, {**(CONFIG if graph is None else {}), **config}, where),
             share_rule()(share, where) if share else (),
-            link=link_of(self.uplink, self.clock, robot=robot),
+            Bridge(link_of(self.uplink, self.clock, robot=robot), graph or self.graph, lambda: self.offset),
             boot="0badcafe",
-            graph=graph or self.graph,
             guard=guard,
-            offset=lambda: self.offset,
             operator=Operator(
                 lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
                 self.drove.append,

@@ -15,6 +15,7 @@ import pytest
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import SystemClock
+from iort_agent.control import Bridge
 from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.control.downlink import Downlink
@@ -212,10 +213,8 @@ class AskingRig:
         self.downlink = Downlink(
             load(DownlinkConfig, {"ask": asks}, Place(Path("car.yaml"))),
             (),
-            link=link,
+            Bridge(link, graph, offset),
             boot="0badcafe",
-            graph=graph,
-            offset=offset,
             operator=Operator(lambda *_: None, lambda _: None, lambda: True),
             questions=Questions(
                 link, cast("Uploader", self.bucket), download=self.bucket.download, offset=offset
