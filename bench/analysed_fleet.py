@@ -25,7 +25,7 @@ from bench.proof.cars import drive_of
 from bench.proof.speed import HOUR_S
 from bench.proof.stored import stored
 from iort_contract.dynamodb import Item, TelemetryTable
-from iort_contract.messages.analysis.run import AnalysisRequest
+from iort_contract.messages.analysis import AnalysisRequest
 from iort_contract.tables import ROBOT, SAMPLES, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud

@@ -24,7 +24,7 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import drive_prefix
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned
+from iort_contract.messages.analysis import AnalysedDrive, PlannedDrive, decode_planned
 
 # An item of the table holds 400 KB; 50 streams of 100 null fields would be more.
 _MOST_REASONS, _LONGEST_REASON = 200, 300

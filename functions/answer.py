@@ -16,8 +16,8 @@ from functions.shared.quotas import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
 from iort_contract.limits import ContractError
-from iort_contract.messages.event import event_message
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.envelope import event_message
+from iort_contract.messages.questions import (
     FAILED,
     INVALID,
     MALFORMED,

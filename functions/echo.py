@@ -14,7 +14,7 @@ from functions.shared.queues import DeadLetterQueue, refused_event
 from iort_contract.catalog.environments import EchoEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.event import event_message
+from iort_contract.messages.envelope import event_message
 from iort_contract.tables import PING_FIELDS, RECEIVED_MS, TOPIC
 from iort_contract.topics import LAMBDA, PONG, build_topic, parse_topic
 

@@ -16,12 +16,19 @@ from functions.shared.clients import variables
 from iort_analysis.drives.finding import LONGEST_US
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.results import DriveResult, Measured, decode_result
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.catalog.environments import EvaluateEnvironment
 from iort_contract.cloud import drive_prefix, findings_key, plan_key, waiting_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import DriveKey, Finding, encode_finding
-from iort_contract.messages.analysis.run import AnalysedDrive, PlannedDrive, decode_planned, encode_planned
+from iort_contract.messages.analysis import (
+    AnalysedDrive,
+    DriveKey,
+    Finding,
+    PlannedDrive,
+    decode_planned,
+    encode_finding,
+    encode_planned,
+)
 
 # The newest drives of a robot before those of the run, and of each other robot up to its end, with which a
 # drive is compared.

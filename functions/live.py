@@ -20,7 +20,7 @@ from iort_contract.catalog.environments import LiveEnvironment
 from iort_contract.catalog.vesc import absent
 from iort_contract.cloud import channel
 from iort_contract.limits import LIVE_MAX_AGE_MS, ContractError
-from iort_contract.messages.event import event_message
+from iort_contract.messages.envelope import event_message
 from iort_contract.messages.live import LiveSample, decode_live, live_update
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import parse_topic

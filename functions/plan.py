@@ -29,9 +29,10 @@ from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import plan_key, robots_key, waiting_key
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.analysis.findings import DriveKey, Finding
-from iort_contract.messages.analysis.run import (
+from iort_contract.messages.analysis import (
     AnalysisRequest,
+    DriveKey,
+    Finding,
     PlannedDrive,
     decode_request,
     encode_planned,

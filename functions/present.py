@@ -11,11 +11,11 @@ from typing import Any
 from functions.shared import clients
 from functions.shared.analysis import Kept, failure
 from functions.shared.clients import variables
-from iort_contract.catalog.analysis.kinds import KINDS, SERIOUS
+from iort_contract.catalog.analysis import KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.cloud import drive_prefix, findings_key
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding
+from iort_contract.messages.analysis import DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]

@@ -27,7 +27,7 @@ from iort_contract import tables
 from iort_contract.archive import HOUR, TASK
 from iort_contract.catalog.environments import QuarantineEnvironment
 from iort_contract.limits import ContractError
-from iort_contract.messages.event import event_message
+from iort_contract.messages.envelope import event_message
 from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, ENTRY, ITEM_BASE64, ROBOT, TOPIC
 from iort_contract.topics import LANES, as_subscribed
 

@@ -25,7 +25,7 @@ from iort_contract.dynamodb import plain, quick, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import decode_batch
-from iort_contract.messages.requests.query import (
+from iort_contract.messages.questions import (
     QueryAnswer,
     QueryRequest,
     decode_query_request,

@@ -19,8 +19,8 @@ from functions.shared.quotas import DAY, Quota
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.event import event_message
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.envelope import event_message
+from iort_contract.messages.files import (
     UPLOAD_URL_S,
     Address,
     File,

@@ -24,16 +24,14 @@ import iort_station.errors
 from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameter import Parameter
-from iort_contract.catalog.analysis.parameters import PARAMETERS
+from iort_contract.catalog.analysis import KINDS, PARAMETERS, Parameter
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_contract.cloud import PUBNUB
-from iort_contract.messages.control.driving import REFUSALS
-from iort_contract.messages.requests.ask import REASONS
+from iort_contract.messages.commands import REFUSALS
+from iort_contract.messages.questions import REASONS
 from iort_station.cli.main import app
 from iort_station.cost import model, report
 from iort_station.cost.model import deployment_dollars_per_month

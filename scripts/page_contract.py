@@ -10,18 +10,17 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 
 from iort_contract import checks, limits, topics
 from iort_contract import page as served
+from iort_contract.catalog import analysis as kinds
+from iort_contract.catalog import analysis as parameters
 from iort_contract.catalog import vesc
-from iort_contract.catalog.analysis import kinds, parameters
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
-from iort_contract.catalog.ros_types import ROS_UNITS
-from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
+from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM, ROS_UNITS
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import page, viewing
-from iort_contract.messages.analysis import insights, notes
-from iort_contract.messages.control import commands, driving
-from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
+from iort_contract.messages import analysis, commands, insights, live, page
+from iort_contract.messages import commands as driving
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3
@@ -97,8 +96,8 @@ def _constants() -> Iterator[str]:
             "LOST",
             "UNTIMELY",
         ),
-        notes: ("MAX_NOTE_CHARACTERS",),
-        viewing: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
+        analysis: ("MAX_NOTE_CHARACTERS",),
+        live: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
         served: ("KEY_HEADER", "INVITATION"),
     }.items():
         for name in names:

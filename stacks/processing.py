@@ -28,8 +28,8 @@ from iort_contract.catalog.environments import (
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.catalog.rules import Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
-from iort_contract.messages.requests.ask import ASK_FOLDER
-from iort_contract.messages.requests.files import FILES_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.messages.questions import ASK_FOLDER
 from iort_contract.tables import (
     ALERT_PREFIX,
     ASKED_PREFIX,

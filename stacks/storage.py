@@ -9,7 +9,7 @@ from aws_cdk import aws_s3 as s3
 
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
-from iort_contract.messages.requests.files import FILES_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from stacks.parts import Encryption, PlatformStack
 from stacks.settings import Settings

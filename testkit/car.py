@@ -32,7 +32,7 @@ from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.limits import Value
-from iort_contract.messages.requests.ask import NO_DATA
+from iort_contract.messages.questions import NO_DATA
 from iort_contract.topics import BROKER, PING, PONG, build_topic
 from iort_station.fleet.robots import Bundle
 from testkit import ROOT

@@ -18,13 +18,12 @@ from boto3.dynamodb.types import TypeSerializer
 from app import build
 from iort_contract.archive import DUE, TASK
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis.findings import DriveKey
-from iort_contract.messages.analysis.run import PlannedDrive, encode_planned
+from iort_contract.messages.analysis import DriveKey, PlannedDrive, encode_planned
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.files import File, FileRequest, encode_file_request
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
-from iort_contract.messages.requests.ask import Ask, encode_ask
-from iort_contract.messages.requests.files import File, FileRequest, encode_file_request
+from iort_contract.messages.questions import Ask, encode_ask
 from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
 from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, RECORD, build_topic
 from stacks.settings import Settings

@@ -14,7 +14,7 @@ from functions.shared.tables import Tables
 from iort_contract.archive import HOUR
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.checks import json_object
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC

@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
+from iort_contract.codec import CODEC, DICTIONARY, PLAIN_CODEC
 from iort_contract.limits import MAX_BATCH_VALUES
 from iort_contract.messages.batch import Batch, BatchId, encode_batch
 from iort_contract.tables import BATCH

@@ -13,7 +13,7 @@ from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.messages.viewing import LEASE, lease_topic
+from iort_contract.messages.live import LEASE, lease_topic
 from iort_contract.topics import (
     ANSWER,
     ASK,

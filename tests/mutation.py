@@ -10,7 +10,7 @@ import zlib
 from random import Random
 from typing import Any
 
-from iort_contract.codec.columns import DICTIONARY, PLAIN_CODEC
+from iort_contract.codec import DICTIONARY, PLAIN_CODEC
 
 Item = dict[str, Any]
 # What stands where something else should.

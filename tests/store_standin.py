@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from iort_agent.mqtt.uplink import MqttMessage
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     Address,
     FileAnswer,
     FileRequest,

@@ -21,7 +21,7 @@ from iort_analysis.mining.gain import with_gain
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis import DriveKey, Estimate
 
 Miner = Callable[[Drive], Mined]
 # By the name that a result gives as missing if the miner fails.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 from numpy.typing import NDArray
 
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, decode_estimate, encode_estimate
+from iort_contract.messages.analysis import DriveKey, Estimate, decode_estimate, encode_estimate
 
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
 Table: TypeAlias = Mapping[str, NDArray[Any]]

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from iort_contract.cloud import VIEWER
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.viewing import VIEW_LEASE_MS
+from iort_contract.messages.live import VIEW_LEASE_MS
 from iort_contract.topics import LIVE, parse_topic
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots

@@ -30,8 +30,7 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis.findings import DriveKey
-from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import findings

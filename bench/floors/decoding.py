@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract.codec.columns import DICTIONARY
+from iort_contract.codec import DICTIONARY
 
 
 def columns(items: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BATCH, TOPIC
 

@@ -10,7 +10,7 @@ from typing import Any
 from iort_agent.sources.sim import ALL, ROS1
 from iort_agent.sources.sim.faults import KINDS, FaultConfig
 from iort_agent.sources.sim.vehicle import VehicleConfig
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 
 DRIVE_S = 600.0
 # The first drive begins on 2026-03-02 at 9:00 UTC, and a car drives once a day.

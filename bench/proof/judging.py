@@ -11,7 +11,7 @@ from bench.proof.analysing import Analysed
 from bench.proof.truths import TRUTHS
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.results import Measured
-from iort_contract.messages.analysis.findings import Finding
+from iort_contract.messages.analysis import Finding
 
 # The findings that are right for a fault of the simulator. Another one does not count as having found it.
 RIGHT: Mapping[str, frozenset[str]] = {

@@ -20,9 +20,9 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.motor import RAD_S_PER_ERPM
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block, column_of
-from iort_contract.catalog.analysis.car import GROUPS
+from iort_contract.catalog.car import GROUPS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.analysis.findings import DriveKey, Estimate
+from iort_contract.messages.analysis import DriveKey, Estimate
 from testkit import ROOT
 
 Array = NDArray[np.float64]

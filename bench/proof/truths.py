@@ -74,7 +74,7 @@ def _phase_ohm(truth: Mapping[str, float]) -> float:
     return truth["motor_resistance_now_ohm"]
 
 
-# By the names of `iort_contract.catalog.analysis.parameters.PARAMETERS`; of a healthy car.
+# By the names of `iort_contract.catalog.analysis.PARAMETERS`; of a healthy car.
 TRUTHS: dict[str, Truth] = {
     "battery_resistance_ohm": _same("battery_resistance_ohm"),
     "battery_slow_resistance_ohm": _same("battery_slow_resistance_ohm"),

@@ -29,7 +29,7 @@ from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio, spread
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
-from iort_contract.codec.columns import DICTIONARY
+from iort_contract.codec import DICTIONARY
 from iort_contract.topics import LIVE, RECORD, build_topic
 from testkit import ROOT
 from testkit.car import RATE_HZ

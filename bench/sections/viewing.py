@@ -14,8 +14,7 @@ from bench.report.spread import Spread, spread, text
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
-from iort_contract.messages.live import LiveSample, decode_live, decode_live_update
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
+from iort_contract.messages.live import VIEW_LEASE_MS, Lease, LiveSample, decode_live, decode_live_update
 from iort_contract.topics import LIVE
 from iort_station.cost import model
 from iort_station.cost.usage import Usage

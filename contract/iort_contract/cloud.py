@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 from iort_contract.topics import CLAIM, check_namespace, check_robot
 
 # Query results too large for an answer, in the files' bucket for a day.

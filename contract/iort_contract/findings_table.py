@@ -12,9 +12,18 @@ from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import DriveKey, Finding, decode_finding, encode_finding
-from iort_contract.messages.analysis.notes import Note, decode_note, encode_note
-from iort_contract.messages.analysis.run import AnalysedDrive, decode_analysed, encode_analysed
+from iort_contract.messages.analysis import (
+    AnalysedDrive,
+    DriveKey,
+    Finding,
+    Note,
+    decode_analysed,
+    decode_finding,
+    decode_note,
+    encode_analysed,
+    encode_finding,
+    encode_note,
+)
 from iort_contract.tables import CONTENT, FINDING, NOTE_PREFIX, PARAMETERS_PREFIX, REMOVED_PREFIX, ROBOT
 
 T = TypeVar("T")

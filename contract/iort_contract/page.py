@@ -6,7 +6,7 @@ from __future__ import annotations
 from datetime import datetime, timezone
 from urllib.parse import quote, urlencode
 
-from iort_contract.messages.analysis.findings import Finding
+from iort_contract.messages.analysis import Finding
 
 PUBNUB_ORIGIN = "ps.pndsn.com"
 # An action's request has the server's key in it. A browser gets it once for the token in an address.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.catalog.vesc import ABSENT_FROM, absent
-from iort_contract.codec.seconds import Statistics, packed_second
+from iort_contract.codec import Statistics, packed_second
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
@@ -37,7 +37,7 @@ def summarize_second(
     ``batches`` are those of one stream, in order of time: all with a sample in the second, and the one
     before, which shows gaps and missing batches. The result has ``n``, ``batches``, ``missing_batches``,
     ``gaps``, ``nonfinite`` and every field, with the derived fields if fields and vehicle allow
-    (`iort_contract.codec.seconds`). ``absent`` counts values of sensors that are not fitted,
+    (`iort_contract.codec`). ``absent`` counts values of sensors that are not fitted,
     which are null here.
     """
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US

@@ -25,7 +25,7 @@ from iort_agent.runtime import Runtime, make_uplink
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import SOCKET, StatusServer, ask, fetch
 from iort_agent.status import render as render_status
-from iort_contract.messages.control.settings import LOG_LEVELS
+from iort_contract.messages.shadow import LOG_LEVELS
 
 _log = logging.getLogger("iort-agent")
 

@@ -30,7 +30,7 @@ from iort_agent.sources.registry import SOURCES
 from iort_agent.spool import QueueConfig, default_path
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
-from iort_contract.messages.control.settings import SETTINGS
+from iort_contract.messages.shadow import SETTINGS
 from iort_contract.topics import check_namespace, check_robot
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, DRIVES_WAIT, KINDS
+from iort_contract.catalog.analysis import ANALYSIS_FAILED, DRIVES_WAIT, KINDS
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import NO_RUN, DriveKey, Finding
+from iort_contract.messages.analysis import NO_RUN, DriveKey, Finding
 
 if TYPE_CHECKING:
     from types_boto3_s3 import S3Client

@@ -15,9 +15,9 @@ from iort_contract.checks import json_object, shown
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, encode_estimate
-from iort_contract.messages.analysis.run import AnalysedDrive
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate, encode_estimate
+from iort_contract.messages.files import parse_file_key
+from iort_contract.messages.questions import (
     ANSWER_URL_S,
     ASK_FOLDER,
     INVALID,
@@ -26,7 +26,6 @@ from iort_contract.messages.requests.ask import (
     Content,
     Refusal,
 )
-from iort_contract.messages.requests.files import parse_file_key
 from iort_contract.track import Track, parse_track, track_of
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from functions.shared.tables import Tables
-from iort_contract.codec.seconds import Statistics
+from iort_contract.codec import Statistics
 from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_COLUMNS_BYTES, ContractError
 from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_item
 from iort_contract.statistics import ASIDE_US, missing_before, summarize_second

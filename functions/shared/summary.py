@@ -27,7 +27,7 @@ from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_FIELDS, RTT_STREAM
 from iort_contract.catalog.vesc import FAULT_FIELD, TEMPERATURES, VOLTAGE_FIELD, measured_degc
-from iort_contract.codec.seconds import Statistics
+from iort_contract.codec import Statistics
 from iort_contract.dynamodb import TableError, plain, quick
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, decode_item

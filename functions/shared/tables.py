@@ -14,7 +14,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.archive import Marks
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.codec.seconds import Statistics
+from iort_contract.codec import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
 from iort_contract.limits import MAX_FIELD_CHARACTERS, ContractError
 from iort_contract.messages.batch import BatchId, batch_id

@@ -24,8 +24,7 @@ from iort_agent.sources.sim.driver import HALL
 from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT
-from iort_contract.messages.control.commands import MAX_LEASE_MS
-from iort_contract.messages.control.driving import stick_downlink
+from iort_contract.messages.commands import MAX_LEASE_MS, stick_downlink
 from iort_contract.topics import PING_PATHS
 from iort_station import kept
 from iort_station.errors import StationError

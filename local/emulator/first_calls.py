@@ -12,9 +12,9 @@ from functools import partial
 from typing import Any
 
 from iort_contract.cloud import PUBNUB
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.files import File, FileRequest, encode_file_request
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
-from iort_contract.messages.requests.files import File, FileRequest, encode_file_request
 from iort_contract.tables import CONNECTED_MS, ONLINE, ROBOT, SESSION_VERSION
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import Cloud

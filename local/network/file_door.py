@@ -16,7 +16,7 @@ from pathlib import Path
 from aiohttp import ClientError, ClientSession, TCPConnector, web
 from yarl import URL
 
-from iort_contract.messages.requests.files import PART_BYTES, UPLOAD_URL_S
+from iort_contract.messages.files import PART_BYTES, UPLOAD_URL_S
 from iort_station.page.background import BackgroundServer
 from iort_station.page.places import client_of
 from local.network.certificates import ServerCertificate

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from iort_station.errors import UsageError
 
 if TYPE_CHECKING:
-    from iort_contract.messages.analysis.insights import Extent
+    from iort_contract.messages.insights import Extent
     from iort_contract.messages.page import Archived
 
 Time: TypeAlias = int | str | datetime

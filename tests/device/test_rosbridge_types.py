@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
-from iort_contract.messages.message_type import message_type
+from iort_contract.ros1.message import message_type
 from testkit.waiting import until
 from tests.device.running import Running
 from tests.device.test_rosbridge import CORE, VESC, config, state

@@ -19,7 +19,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.status import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract.limits import SCHEMA_VERSION
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     PART_BYTES,
     Address,
     decode_file_request,

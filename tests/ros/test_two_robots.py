@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.control.commands import Command, encode_command
+from iort_contract.messages.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from iort_contract.archive import ARCHIVE_PREFIX, DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX, RESULTS_PREFIX
-from iort_contract.messages.requests.ask import ASK_FOLDER
-from iort_contract.messages.requests.files import FILES_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.messages.questions import ASK_FOLDER
 from iort_contract.tables import (
     BATCH,
     EXPIRES_S,

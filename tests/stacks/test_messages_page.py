@@ -7,7 +7,7 @@ import re
 from aws_cdk import Stack
 
 from iort_contract.cloud import claim_name
-from iort_contract.messages.viewing import lease_topic
+from iort_contract.messages.live import lease_topic
 from iort_contract.topics import (
     ANSWER,
     ASK,

@@ -10,7 +10,7 @@ import pytest
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import ANALYSIS_PREFIX, IOT, PLANS_PREFIX, PUBNUB, RESULTS_PREFIX
-from iort_contract.messages.requests.files import FILES_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
 from iort_contract.topics import rule_name
 from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S

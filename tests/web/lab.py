@@ -6,11 +6,10 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameters import GROUPS, PARAMETERS, STYLE_GROUP
+from iort_contract.catalog.analysis import GROUPS, KINDS, PARAMETERS, STYLE_GROUP
 from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.control.driving import NO_MOTION
+from iort_contract.messages.commands import NO_MOTION
 from iort_station.errors import StationError
 from iort_station.page.server import PageServer
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
@@ -18,7 +17,7 @@ from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.analysis.insights import (
+    from iort_contract.messages.insights import (
         DeltaAnswer,
         DriveEntry,
         EstimateEntry,
@@ -144,7 +143,7 @@ def delta(asked: Mapping[str, str]) -> DeltaAnswer:
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from iort_contract.messages.analysis.insights import Extent
+    from iort_contract.messages.insights import Extent
     from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
     from local.pubnub.standin import PubNubStandIn
 

@@ -12,7 +12,7 @@ import pytest
 from aiohttp import web
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S
+from iort_contract.messages.live import VIEW_LEASE_MS, VIEW_RENEW_S
 from iort_station.page.background import BackgroundServer
 from iort_station.page.server import PageServer
 from local.network.certificates import Authority

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from iort_contract.messages.control.commands import check_by, decode_command
+from iort_contract.messages.commands import check_by, decode_command
 from local.deployment import ROOT
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from iort_agent.files.upload import trusting
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     Address,
     File,
     FileAnswer,

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from iort_analysis.samples.blocks import Column, column_of, objects
-from iort_contract.codec.columns import EXACT
+from iort_contract.codec import EXACT
 from iort_contract.limits import Value
 
 TIME = "time"

@@ -12,11 +12,10 @@ from iort_analysis.archive import columns as names
 from iort_analysis.archive.columns import MIXED, named, runs, to_values
 from iort_analysis.archive.reading import ArchiveFile, head_of
 from iort_contract.archive import Hour
-from iort_contract.codec.columns import CODEC, SERIALIZED_CODEC, packed_samples
+from iort_contract.codec import CODEC, SERIALIZED_CODEC, packed_samples
 from iort_contract.dynamodb import Item
 from iort_contract.limits import BATCH_VERSION, Value
-from iort_contract.ros1.message import Messages
-from iort_contract.ros1.serialized import pack
+from iort_contract.ros1.message import Messages, pack
 from iort_contract.tables import BATCH, SAMPLES, TOPIC
 
 

@@ -16,13 +16,12 @@ from iort_analysis.samples.batches import decode_together
 from iort_analysis.samples.blocks import Block, Column, column_of, join, objects
 from iort_contract.archive import item_hash
 from iort_contract.checks import integer
-from iort_contract.codec.columns import EXACT, packed_samples, unpacked
+from iort_contract.codec import EXACT, packed_samples, unpacked
 from iort_contract.dynamodb import Item, plain
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import BatchId, Opened, open_batch
 from iort_contract.ros1.columns import view
-from iort_contract.ros1.message import Messages
-from iort_contract.ros1.serialized import unpack
+from iort_contract.ros1.message import Messages, unpack
 from iort_contract.tables import NONFINITE, PREVIOUS, RECEIVED_MS
 
 # A piece becomes a row group; it ends when one of these is reached.

@@ -14,7 +14,7 @@ from iort_analysis.drives.motion import Motion, motion_among, pose_of, vesc_of, 
 from iort_analysis.drives.transform import with_derived
 from iort_analysis.samples.blocks import Block, ordered
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 
 
 def build(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.samples.blocks import Block, Column
 from iort_contract.catalog.derived import Vehicle
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 
 # The kinds of repair: a pause between samples, a sample at a time that was there already, a sensor that
 # reports its own failure, a value that stands still while the car moves, and a single value far from its

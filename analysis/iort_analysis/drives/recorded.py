@@ -11,7 +11,7 @@ import numpy as np
 from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_analysis.samples.blocks import EMPTY, Block, join
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH
 

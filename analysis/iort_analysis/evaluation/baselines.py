@@ -10,7 +10,7 @@ import numpy as np
 
 from iort_analysis.statistics.intervals import sides
 from iort_analysis.statistics.student import tail
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 # How many drives the catalogue's word on a healthy car's spread is worth.
 _PRIOR_DRIVES = 4

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from iort_analysis.statistics.intervals import sides
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:

@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from iort_analysis.evaluation.baselines import Baseline
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameter import Parameter
-from iort_contract.messages.analysis.findings import Estimate, Finding
+from iort_contract.catalog.analysis import KINDS, Parameter
+from iort_contract.messages.analysis import Estimate, Finding
 
 
 def changed(parameter: Parameter, found: Estimate, expected: Baseline, whose: str) -> str:

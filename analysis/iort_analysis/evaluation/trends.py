@@ -10,7 +10,7 @@ import numpy as np
 
 from iort_analysis.statistics.intervals import sides
 from iort_analysis.statistics.student import tail
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 US_PER_DAY = 86_400_000_000
 # The slopes between pairs take memory of the square of this.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 # Volts of a cell at rest by its charge.
 _POLYMER = (

@@ -24,8 +24,8 @@ from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
 from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, Part, fit, propagated
-from iort_contract.catalog.analysis.car import KNOWN
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.catalog.car import KNOWN
+from iort_contract.messages.analysis import Estimate
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, Prior, fit, propagated
 from iort_analysis.statistics.signals import averaged, binned, bridged, lagged
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from iort_analysis.results import Mined, Table
 from iort_analysis.samples.blocks import Column
 from iort_analysis.statistics.clusters import cluster, scaled
 from iort_analysis.statistics.intervals import share_of
-from iort_contract.catalog.analysis.parameters import STYLE_TABLE, STYLES
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.catalog.analysis import STYLE_TABLE, STYLES
+from iort_contract.messages.analysis import Estimate
 
 Floats = NDArray[np.float64]
 _WINDOW_S = 0.5

@@ -23,7 +23,7 @@ from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, fit_motor
 from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, Part, Prior, fit, propagated
 from iort_analysis.statistics.signals import binned, bridged, lagged
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 Array = NDArray[np.float64]
 

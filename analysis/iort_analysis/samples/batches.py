@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from iort_analysis.samples.blocks import EMPTY, Block, Column, column_of, join, joined, ordered
 from iort_analysis.samples.steps import Written, decoded, written
 from iort_contract.checks import shown
-from iort_contract.codec.columns import SCALES, check_sums, decimals_of, not_integers, plain_values
+from iort_contract.codec import SCALES, check_sums, decimals_of, not_integers, plain_values
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import (

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.codec.columns import EXACT
+from iort_contract.codec import EXACT
 from iort_contract.limits import Value
 
 Column: TypeAlias = NDArray[Any]

@@ -89,7 +89,7 @@ def joined_batches(one: Batches, other: Batches) -> Batches:
 
 
 def summarized(parts: Iterator[Batches], first: int, end: int, derive: Derive) -> Iterator[Block]:
-    """The seconds from ``first`` until ``end`` that have samples, flat as `iort_contract.codec.seconds` says.
+    """The seconds from ``first`` until ``end`` that have samples, flat as `iort_contract.codec` says.
 
     ``parts`` are all batches from `reach` on, and the one before them; ``derive`` makes the derived fields.
     """

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.samples.blocks import Block
 from iort_contract.checks import check_field
-from iort_contract.codec.columns import CODEC, EXACT, SCALES
+from iort_contract.codec import CODEC, EXACT, SCALES
 from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_BATCH_VALUES, MAX_FIELDS, ContractError
 from iort_contract.messages.batch import Envelope
 

@@ -19,7 +19,7 @@ from iort_analysis.statistics.intervals import sides
 from iort_analysis.statistics.normal import between
 from iort_analysis.statistics.signals import quantum
 from iort_analysis.statistics.student import quantile
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.statistics.signals import quantum
 from iort_analysis.statistics.student import quantile
-from iort_contract.messages.analysis.findings import INTERVAL
+from iort_contract.messages.analysis import INTERVAL
 
 
 @cache

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from iort_contract.messages.requests.ask import MAX_INLINE_BYTES
+from iort_contract.messages.questions import MAX_INLINE_BYTES
 from iort_contract.tables import ASKED_PREFIX
 
 

@@ -22,15 +22,15 @@ from iort_contract.checks import (
     shown,
     wire_column,
 )
-from iort_contract.codec.columns import (
+from iort_contract.codec import (
     CODEC,
     PLAIN_CODEC,
     SERIALIZED_CODEC,
+    check_effort,
     inflate,
     packed_samples,
     unpacked,
 )
-from iort_contract.codec.complexity_guard import check_effort
 from iort_contract.limits import (
     BATCH_VERSION,
     MAX_AHEAD_US,
@@ -41,8 +41,7 @@ from iort_contract.limits import (
     Value,
 )
 from iort_contract.ros1.columns import as_columns, from_columns, values_a_message, view
-from iort_contract.ros1.message import Messages
-from iort_contract.ros1.serialized import pack, unpack
+from iort_contract.ros1.message import Messages, pack, unpack
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
 from iort_contract.topics import RECORD, Topic, parse_topic
 
@@ -246,7 +245,7 @@ class Envelope(NamedTuple):
 class Opened(NamedTuple):
     """A batch whose envelope, times and field names are checked, and whose values are still encoded.
 
-    ``written`` holds each column as `iort_contract.codec.columns.unpacked` reads it. ``serialized`` holds ROS
+    ``written`` holds each column as `iort_contract.codec.unpacked` reads it. ``serialized`` holds ROS
     messages that were stored unchanged; ``about`` describes messages that became columns.
     """
 

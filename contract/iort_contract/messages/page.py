@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal, TypedDict, Union
 
 from iort_contract.limits import Value
-from iort_contract.messages.analysis.insights import (
+from iort_contract.messages.insights import (
     AnalysisAnswer,
     AnalysisStarted,
     DeltaAnswer,
@@ -191,7 +191,7 @@ class SettingsAnswer(TypedDict):
 
 
 class DriveLimitsEntry(TypedDict):
-    """What a stick drives, and how far: `iort_contract.messages.control.driving.DriveLimits`."""
+    """What a stick drives, and how far: `iort_contract.messages.commands.DriveLimits`."""
 
     command: str
     speed: str

@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import COMPACT, shown, wire_column
-from iort_contract.codec.columns import packed, unpacked
+from iort_contract.codec import packed, unpacked
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
     MAX_FIELD_CHARACTERS,

@@ -1,4 +1,4 @@
-"""A message as published, and its type, which is needed to decode it."""
+"""A message as published, and the type that decodes it; both as batches and streams carry them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import hashlib
 import struct
 from typing import Iterator, Mapping, NamedTuple, Sequence
 
-from iort_contract.limits import MessageError, Value
+from iort_contract.checks import COMPACT, json_object, shown
+from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_SERIALIZED_BYTES, ContractError, MessageError, Value
 from iort_contract.ros1.decode import Decoder, Large
 from iort_contract.ros1.definition import layout, parse
 
@@ -109,3 +110,123 @@ class Messages(NamedTuple):
     type_id: str
     layout: str
     raw: Sequence[bytes]
+
+
+# Longer messages differ in more than they share.
+_MAX_TURNED = 16 * 1024
+_MAX_HEAD_BYTES = 1024 * 1024
+
+
+def pack(messages: Messages) -> bytes:
+    """The messages as bytes; raises `ContractError` if they are too large for a batch."""
+    raws = messages.raw
+    total = sum(map(len, raws))
+    allowed = MAX_SERIALIZED_BYTES if len(raws) > 1 else MAX_COLUMNS_BYTES
+    if total > allowed:
+        raise ContractError(f"messages of a batch must be at most {allowed} bytes, got {total}")
+    sizes = set(map(len, raws))
+    data = b"".join(raws)
+    turned = len(sizes) == 1 and 0 < max(sizes) <= _MAX_TURNED
+    if turned:
+        (size,) = sizes
+        data = b"".join([data[at::size] for at in range(size)])
+    head = {
+        "type": messages.type_id,
+        "layout": messages.layout,
+        "sizes": max(sizes) if turned else list(map(len, raws)),
+    }
+    return COMPACT.encode(head).encode() + b"\n" + data
+
+
+def unpack(body: bytes, n: int) -> Messages:
+    """Decode ``n`` messages; raises `ContractError` for everything that `pack` cannot have written."""
+    end = body.find(b"\n", 0, _MAX_HEAD_BYTES)
+    if end < 0:
+        raise ContractError("messages must have a head")
+    head = json_object(body[:end], "the messages' head")
+    data = body[end + 1 :]
+    if n > 1 and len(data) > MAX_SERIALIZED_BYTES:
+        raise ContractError(
+            f"messages of a batch must be at most {MAX_SERIALIZED_BYTES} bytes, got {len(data)}"
+        )
+    kind, layout, sizes = head.get("type"), head.get("layout"), head.get("sizes")
+    if not isinstance(kind, str) or not isinstance(layout, str):
+        raise ContractError("messages must have a type and a layout")
+    if type(sizes) is int:
+        if not 0 < sizes <= _MAX_TURNED or len(data) != n * sizes:
+            raise ContractError(f"messages must be {n} of {shown(sizes)} bytes, got {len(data)} bytes")
+        turned = bytearray(len(data))
+        for at in range(sizes):
+            turned[at::sizes] = data[at * n : (at + 1) * n]
+        data, sizes = bytes(turned), [sizes] * n
+    return Messages(kind, layout, _parted(data, sizes, n))
+
+
+def _parted(data: bytes, sizes: object, n: int) -> Sequence[bytes]:
+    if not isinstance(sizes, list) or len(sizes) != n or not set(map(type, sizes)) <= {int} or min(sizes) < 0:
+        raise ContractError(f"the messages' sizes must be {n} integers")
+    if sum(sizes) != len(data):
+        raise ContractError(f"messages must be {sum(sizes)} bytes by their sizes, got {len(data)}")
+    parts, at = [], 0
+    for size in sizes:
+        parts.append(data[at : at + size])
+        at += size
+    return parts
+
+
+# A definition is one text, cut into pieces that a field may hold.
+_PIECE, _MAX_PIECES = 4000, 64
+# The form that a message had before a source made ROS 1's of it.
+ROS2 = "ros2"
+
+
+class MessageType(NamedTuple):
+    """The ROS 1 type of a stream's messages.
+
+    A source sends it once a run, as a sample of the stream `TYPES_STREAM`; readers need it to rebuild the
+    messages. ``kind`` is in ROS 1's form, ``package/Type``; ``definition`` is the text that a publisher sends
+    and a bag keeps, with all nested types. ``converted_from`` is `ROS2` for messages of ROS 2 that the source
+    has converted to this type, and empty for those that are as they were published.
+    """
+
+    stream: str
+    topic: str
+    kind: str
+    md5sum: str
+    definition: str
+    converted_from: str = ""
+
+    @property
+    def id(self) -> str:
+        """The id in batches of this type."""
+        return type_id(self.topic, self.kind, self.md5sum)
+
+    @property
+    def layout(self) -> str:
+        """The layout for decoding messages; empty for an invalid definition."""
+        return RosType(self.topic, self.kind, self.md5sum, self.definition).layout
+
+    def sample(self) -> dict[str, Value]:
+        """The type as a sample; raises `ContractError` if the definition is too long."""
+        pieces = [self.definition[i : i + _PIECE] for i in range(0, len(self.definition), _PIECE)]
+        if len(pieces) > _MAX_PIECES:
+            raise ContractError(
+                f"definition of {self.kind} must be at most {_PIECE * _MAX_PIECES} characters"
+            )
+        sample: dict[str, Value] = dict(self._asdict())
+        del sample["definition"]
+        if not self.converted_from:
+            del sample["converted_from"]
+        sample.update({f"definition.{i}": piece for i, piece in enumerate(pieces)})
+        return sample
+
+
+def message_type(sample: Mapping[str, Value]) -> MessageType:
+    """Decode a type; raises `ContractError` for everything that `MessageType.sample` cannot have written."""
+    texts = {name: value for name, value in sample.items() if isinstance(value, str)}
+    try:
+        stream, topic, kind, md5sum = (texts[name] for name in ("stream", "topic", "kind", "md5sum"))
+        pieces = [texts[f"definition.{i}"] for i in range(sum("definition." in name for name in texts))]
+    except KeyError as error:
+        raise ContractError(f"message type must have {error}") from error
+    return MessageType(stream, topic, kind, md5sum, "".join(pieces), texts.get("converted_from", ""))

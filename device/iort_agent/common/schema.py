@@ -16,7 +16,7 @@ import yaml
 
 from iort_agent.errors import ConfigError
 from iort_contract.limits import ContractError
-from iort_contract.messages.control.settings import Choice, Flag, Number
+from iort_contract.messages.shadow import Choice, Flag, Number
 
 T = TypeVar("T")
 # YAML may have read a value as another type than its writer meant.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
 
 from iort_agent.common.logs import Trouble
-from iort_contract.messages.control.shadow import OverShare
+from iort_contract.messages.shadow import OverShare
 
 T = TypeVar("T")
 

@@ -18,14 +18,15 @@ from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import Link, MqttMessage, OnMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.messages.control.commands import Command, decode_command
-from iort_contract.messages.control.driving import (
+from iort_contract.messages.commands import (
     NO_COMMAND,
     NO_GUARD,
     NO_ROS,
     SETTINGS_UNKNOWN,
     STOPPED,
+    Command,
     DriveLimits,
+    decode_command,
 )
 from iort_contract.ros1.definition import Definition
 from iort_contract.topics import ACCEPTED, CMD

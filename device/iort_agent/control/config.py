@@ -38,10 +38,16 @@ from iort_agent.errors import AskError
 from iort_agent.sources.ros1 import ros_name
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
-from iort_contract.messages.control.commands import FLEET_MAX_AGE_MS, MAX_LEASE_MS, MAX_VALID_MS
-from iort_contract.messages.control.driving import DriveLimits, check_limits, check_path
-from iort_contract.messages.control.settings import MOTION_STOPPED, SETTINGS
-from iort_contract.messages.requests.ask import INVALID, MAX_ASK_MS
+from iort_contract.messages.commands import (
+    FLEET_MAX_AGE_MS,
+    MAX_LEASE_MS,
+    MAX_VALID_MS,
+    DriveLimits,
+    check_limits,
+    check_path,
+)
+from iort_contract.messages.questions import INVALID, MAX_ASK_MS
+from iort_contract.messages.shadow import MOTION_STOPPED, SETTINGS
 from iort_contract.topics import check_stream
 
 ROBOT_IN_TOPIC = "{robot}"

@@ -33,8 +33,7 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from iort_contract.messages.control.commands import Command
-from iort_contract.messages.control.driving import (
+from iort_contract.messages.commands import (
     BEGIN_AGAIN,
     CLOCK_UNKNOWN,
     CLOSED,
@@ -46,6 +45,7 @@ from iort_contract.messages.control.driving import (
     REPEATED,
     STALE,
     SUPERSEDED,
+    Command,
 )
 
 # Repetitions of a stop after the first one.

@@ -27,7 +27,7 @@ from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_agent.ros1.json_message import decode, encode
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.questions import (
     ASK_FOLDER,
     INVALID,
     MAX_INLINE_BYTES,

@@ -19,10 +19,13 @@ from iort_agent.errors import ConfigError, UplinkError
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.checks import check_field
-from iort_contract.messages.control.commands import Command
-from iort_contract.messages.control.driving import NO_MOTION, DriveLimits
-from iort_contract.messages.control.settings import CHANGEABLE, FIELD_LIST, FIELDS, MOTION_STOPPED, SETTINGS
-from iort_contract.messages.control.shadow import (
+from iort_contract.messages.commands import NO_MOTION, Command, DriveLimits
+from iort_contract.messages.shadow import (
+    CHANGEABLE,
+    FIELD_LIST,
+    FIELDS,
+    MOTION_STOPPED,
+    SETTINGS,
     Outcome,
     OverShare,
     Rejection,

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
 
 from iort_agent.common.private_files import folder_of, open_below
 from iort_agent.errors import UploadError
-from iort_contract.messages.requests.files import MAX_FILE_BYTES, PART_BYTES, File
+from iort_contract.messages.files import MAX_FILE_BYTES, PART_BYTES, File
 
 _CHUNK_BYTES = 256 * 1024
 _AGAIN_S = 10.0

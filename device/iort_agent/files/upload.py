@@ -23,7 +23,7 @@ from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, changed, look_at, unreadable
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import ContractError
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     MAX_ADDRESSES,
     Address,
     FileAnswer,

@@ -9,7 +9,7 @@ from typing import Any, Mapping
 from iort_agent.common.schema import allowed, choice, items, number, setting
 from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.control.settings import FIELDS, SETTINGS, WATCHED
+from iort_contract.messages.shadow import FIELDS, SETTINGS, WATCHED
 from iort_contract.topics import PING_PATHS
 
 

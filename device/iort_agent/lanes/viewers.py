@@ -17,8 +17,8 @@ from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import Demand, LiveLane
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import LIVE_BROKER_EVERY_S, ContractError
-from iort_contract.messages.control.settings import ALWAYS
-from iort_contract.messages.viewing import MAX_VIEWERS, decode_lease, lease_topic
+from iort_contract.messages.live import MAX_VIEWERS, decode_lease, lease_topic
+from iort_contract.messages.shadow import ALWAYS
 
 _log = logging.getLogger(__name__)
 

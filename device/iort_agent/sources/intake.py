@@ -19,10 +19,9 @@ from iort_agent.ros1.types import installed
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import Decoder, Large, stamp_ns
 from iort_contract.ros1.definition import Definition, parse
-from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.ros1.message import MessageType, RosMessage, RosType
 from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status import ask
 from iort_agent.verbs.connectivity import check_connection
-from iort_contract.messages.control.driving import NO_MOTION
+from iort_contract.messages.commands import NO_MOTION
 
 _EXPIRES_SOON_S = 30 * 86_400
 _LEAST_FREE_BYTES = 50_000_000

@@ -26,8 +26,8 @@ from iort_agent.identity import Certificate, check_pair
 from iort_agent.mqtt.session import ForeignError, RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_contract.limits import ContractError
+from iort_contract.messages.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.messages.live import decode_pong, encode_ping
-from iort_contract.messages.requests.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.topics import FILE, PING, PONG, RULE, build_topic
 
 TIMEOUT_S = 5.0

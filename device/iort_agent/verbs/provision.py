@@ -23,7 +23,7 @@ from iort_agent.status import ask
 from iort_agent.verbs.registration import PENDING, SEAMS, Seams, load_claim, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
-from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
+from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
 from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)

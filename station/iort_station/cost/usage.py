@@ -15,8 +15,8 @@ import yaml
 from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
-from iort_contract.messages.control.settings import ALWAYS, WATCHED
-from iort_contract.messages.viewing import VIEW_RENEW_S
+from iort_contract.messages.live import VIEW_RENEW_S
+from iort_contract.messages.shadow import ALWAYS, WATCHED
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import MONTH_DAYS

@@ -9,13 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import NamedTuple
 
-from iort_contract.catalog.analysis.car import GROUPS
+from iort_contract.catalog.car import GROUPS
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import Estimate, Finding
-from iort_contract.messages.analysis.notes import Note, check_note_id
-from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, Note, check_note_id
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry

@@ -10,13 +10,19 @@ from functools import lru_cache
 from iort_analysis.samples.batches import RefusedItems, in_order, part
 from iort_analysis.samples.blocks import EMPTY, Block, join, values
 from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
-from iort_contract.catalog.ros_types import ROS_UNITS, TYPE_UNITS
-from iort_contract.catalog.streams import ACCOUNT_STREAM, CATALOG, OWN_STREAMS, TYPES_STREAM
+from iort_contract.catalog.streams import (
+    ACCOUNT_STREAM,
+    CATALOG,
+    OWN_STREAMS,
+    ROS_UNITS,
+    TYPE_UNITS,
+    TYPES_STREAM,
+)
 from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.definition import Fields, parse
+from iort_contract.ros1.message import MessageType, message_type
 from iort_contract.tables import STATS, STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import Recorded, last_reports

@@ -20,8 +20,7 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.message_type import MessageType
-from iort_contract.messages.requests.query import (
+from iort_contract.messages.questions import (
     FIRST_US,
     LAST_US,
     QueryAnswer,
@@ -30,6 +29,7 @@ from iort_contract.messages.requests.query import (
     encode_query_request,
     unpacked_samples,
 )
+from iort_contract.ros1.message import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud, invoke
 from iort_station.data import inventory

@@ -22,7 +22,7 @@ from iort_contract import expression
 from iort_contract.archive import ArchiveTable, Hour
 from iort_contract.catalog.derived import SOURCES
 from iort_contract.catalog.streams import ACCOUNT_STREAM
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import flat_second
 from iort_contract.dynamodb import (
     SummaryTable,
     TelemetryTable,

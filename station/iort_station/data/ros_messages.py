@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.limits import MessageError, Value
-from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER
 from iort_contract.ros1.definition import (
     HEADER_TYPE,
@@ -24,6 +23,7 @@ from iort_contract.ros1.definition import (
     md5sum,
     parse,
 )
+from iort_contract.ros1.message import MessageType
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.errors import StationError

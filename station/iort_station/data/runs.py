@@ -31,9 +31,9 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import plain, starting_between, whole
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
-from iort_contract.messages.analysis.findings import DriveKey
-from iort_contract.messages.analysis.insights import Extent
+from iort_contract.messages.analysis import DriveKey
 from iort_contract.messages.batch import BatchId, decode_batch
+from iort_contract.messages.insights import Extent
 from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud

@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 
 from iort_analysis.samples.blocks import Column, values
-from iort_contract.codec.columns import EXACT
+from iort_contract.codec import EXACT
 from iort_station.data import Result
 from iort_station.texts import visible
 

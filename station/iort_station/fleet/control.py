@@ -16,22 +16,25 @@ from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.control.commands import MAX_BY_CHARACTERS, Command, encode_command
-from iort_contract.messages.control.driving import DRIVEN_BY_ANOTHER, NO_LEASE
-from iort_contract.messages.control.settings import (
+from iort_contract.messages.commands import (
+    DRIVEN_BY_ANOTHER,
+    MAX_BY_CHARACTERS,
+    NO_LEASE,
+    Command,
+    encode_command,
+)
+from iort_contract.messages.shadow import (
     FIELDS,
     MOTION_STOPPED,
     SETTINGS,
-    Choice,
-    check_name,
-    check_setting,
-)
-from iort_contract.messages.control.shadow import (
     STOPS,
+    Choice,
     Desired,
     OverShare,
     Rejection,
     Reported,
+    check_name,
+    check_setting,
     decode_desired,
     decode_reported,
     nested,

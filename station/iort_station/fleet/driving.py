@@ -25,8 +25,7 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.streams import DRIVE_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.control.commands import Command
-from iort_contract.messages.control.driving import (
+from iort_contract.messages.commands import (
     CLOCK_UNKNOWN,
     DRIVE_ANSWER_MS,
     DRIVE_CLOCK_KEPT_MS,
@@ -41,6 +40,7 @@ from iort_contract.messages.control.driving import (
     REFUSALS,
     STOPPED,
     UNTIMELY,
+    Command,
     DriveLimits,
 )
 from iort_contract.messages.live import LiveSample

@@ -14,7 +14,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from urllib3.exceptions import HTTPError
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.requests.files import FILES_PREFIX, parse_file_key
+from iort_contract.messages.files import FILES_PREFIX, parse_file_key
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry

@@ -23,7 +23,7 @@ from cryptography.x509.oid import NameOID
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.messages.control.driving import DOWNLINK_NOTE, stick_downlink
+from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
 from iort_contract.tables import CERTIFICATE_ID, ONLINE, SERIAL, SESSION_VERSION
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError

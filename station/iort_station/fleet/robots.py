@@ -10,7 +10,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract.catalog.analysis.car import KNOWN
+from iort_contract.catalog.car import KNOWN
 from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.messages.control.driving import NO_MOTION, DriveLimits
-from iort_contract.messages.control.settings import MOTION_STOPPED
-from iort_contract.messages.control.shadow import (
+from iort_contract.messages.commands import NO_MOTION, DriveLimits
+from iort_contract.messages.shadow import (
+    MOTION_STOPPED,
     Pressed,
     encode_fleet_released,
     encode_release,

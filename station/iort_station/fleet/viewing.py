@@ -11,7 +11,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
+from iort_contract.messages.live import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry

@@ -16,7 +16,7 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 from urllib3.exceptions import HTTPError
 
-from iort_contract.messages.requests.files import PART_BYTES
+from iort_contract.messages.files import PART_BYTES
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet.files import StoredFile

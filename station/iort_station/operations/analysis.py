@@ -11,7 +11,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract.messages.analysis.run import AnalysisRequest, encode_request
+from iort_contract.messages.analysis import AnalysisRequest, encode_request
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

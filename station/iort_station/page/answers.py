@@ -11,9 +11,9 @@ from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
 from iort_contract.cloud import DRIVER, VIEWER
-from iort_contract.messages.control.commands import MAX_LEASE_MS
-from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
+from iort_contract.messages.commands import MAX_LEASE_MS
 from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, SettingKind, SettingsAnswer
+from iort_contract.messages.shadow import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud

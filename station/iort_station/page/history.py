@@ -13,9 +13,9 @@ from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
-from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Result, Selection, bags, export, inventory, tabular

@@ -14,10 +14,9 @@ from iort_analysis.errors import AnalysisError
 from iort_analysis.mining.laps.compare import compare
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, KINDS
-from iort_contract.catalog.analysis.parameters import GROUPS, LAPS_TABLE, PLACES_TABLE
-from iort_contract.messages.analysis.findings import Estimate, Finding
-from iort_contract.messages.analysis.insights import (
+from iort_contract.catalog.analysis import ANALYSIS_FAILED, GROUPS, KINDS, LAPS_TABLE, PLACES_TABLE
+from iort_contract.messages.analysis import AnalysedDrive, AnalysisRequest, Estimate, Finding
+from iort_contract.messages.insights import (
     AnalysisAnswer,
     AnalysisStarted,
     DeltaAnswer,
@@ -28,7 +27,6 @@ from iort_contract.messages.analysis.insights import (
     LapsAnswer,
     NotesAnswer,
 )
-from iort_contract.messages.analysis.run import AnalysedDrive, AnalysisRequest
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored

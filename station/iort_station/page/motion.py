@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.cloud import IOT, PUBNUB, VIEWER, client_prefix
+from iort_contract.messages.live import VIEW_LEASE_MS, Lease
 from iort_contract.messages.page import Identity, MotionAnswer, MotionEntry, SocketAnswer, ViewAnswer
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError

@@ -16,7 +16,7 @@ import pytest
 from typing_extensions import Self
 
 from iort_analysis.samples.blocks import Block, values
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import ROBOT, STREAMS

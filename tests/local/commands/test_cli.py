@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract.messages.requests.files import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud
 from iort_station.cost.usage import Usage

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from iort_agent.sources.sim.driver import HALL
-from iort_contract.messages.requests.files import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
 from local.demo.run import DOWNLINK

@@ -18,7 +18,7 @@ import pytest
 from iort_agent.sources import OK, Finding
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
-from iort_contract.messages.requests.files import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.data.recorded import topic_of
 from iort_station.operations import audit
 from local.cloud import ROOT

@@ -8,7 +8,7 @@ import pytest
 from botocore.exceptions import ClientError
 from typer.testing import CliRunner
 
-from iort_contract.messages.requests.files import FILES_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
 from iort_station.cli.main import app
 from iort_station.fleet import identity, registry, robots
 from local.deployment import deploy

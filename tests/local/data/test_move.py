@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from functions.upload import Bucket, metadata
 from iort_contract.cloud import IOT
 from iort_contract.messages.batch import BatchId
-from iort_contract.messages.requests.files import PART_BYTES, File, file_key
+from iort_contract.messages.files import PART_BYTES, File, file_key
 from iort_contract.tables import (
     BATCH,
     BY_LATER,

@@ -10,8 +10,8 @@ import pytest
 
 from functions.live import REFUSALS
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.files import decode_file_answer
 from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.messages.requests.files import decode_file_answer
 from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_topic
 from iort_station.operations import quarantine
 from iort_station.page.pubnub import Listener

@@ -14,7 +14,7 @@ import boto3
 import pytest
 from botocore.config import Config
 
-from iort_contract.messages.requests.files import PART_BYTES
+from iort_contract.messages.files import PART_BYTES
 from local.network import file_door
 from local.network.certificates import Authority, ServerCertificate
 from local.network.file_door import FileDoor

@@ -17,9 +17,8 @@ from iort_agent.errors import AskError
 from iort_agent.files.upload import downloader
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import DriveKey, Estimate
-from iort_contract.messages.analysis.run import AnalysedDrive
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate
+from iort_contract.messages.questions import (
     MALFORMED,
     MAX_INLINE_BYTES,
     NO_DATA,
@@ -30,7 +29,7 @@ from iort_contract.messages.requests.ask import (
     decode_answer,
     encode_ask,
 )
-from iort_contract.messages.requests.ask import Ask as Question
+from iort_contract.messages.questions import Ask as Question
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_station.fleet import robots
 from iort_station.operations import quarantine

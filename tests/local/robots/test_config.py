@@ -8,7 +8,7 @@ import pytest
 
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.control.driving import DRIVE_TYPE
+from iort_contract.messages.commands import DRIVE_TYPE
 from iort_contract.tables import ONLINE
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import TimeoutError  # noqa: A004 - as playwright names it
 
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.messages.control.commands import Command, encode_command
+from iort_contract.messages.commands import Command, encode_command
 from iort_contract.topics import CMD, build_topic
 from iort_station.page import answers as control
 from iort_station.page import motion

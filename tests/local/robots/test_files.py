@@ -27,7 +27,7 @@ from rosbags.rosbag1 import Reader
 from iort_agent.common.threads import SystemClock
 from iort_agent.files.file import read
 from iort_agent.files.upload import ByteRate, Outcome, Sender, trusting
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     FILES_PREFIX,
     PART_BYTES,
     Address,

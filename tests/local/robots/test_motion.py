@@ -13,7 +13,7 @@ import termios
 from pathlib import Path
 from typing import Any
 
-from iort_contract.messages.control.shadow import decode_reported
+from iort_contract.messages.shadow import decode_reported
 from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit

@@ -34,8 +34,8 @@ from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.account import lost
 from iort_contract.messages.batch import Batch, decode_batch
-from iort_contract.messages.control.driving import DRIVE_TYPE
-from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.messages.commands import DRIVE_TYPE
+from iort_contract.ros1.message import MessageType, message_type
 from testkit.agent import Loopback, Published
 
 T0 = 1_700_000_000_000_000

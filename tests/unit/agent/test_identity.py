@@ -41,7 +41,7 @@ from iort_agent.verbs.registration import (
     register_again,
 )
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.messages.control.driving import DRIVE_LEASE_MS
+from iort_contract.messages.commands import DRIVE_LEASE_MS
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:

@@ -32,7 +32,7 @@ from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import StatusServer, ask, fetch, render
 from iort_agent.verbs.check import check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
-from iort_contract.messages.control.driving import stick_downlink
+from iort_contract.messages.commands import stick_downlink
 from testkit.agent import Loopback, ManualClock
 from tests.unit.agent.test_agent import Rig, config_file, drive
 

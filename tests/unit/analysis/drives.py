@@ -13,7 +13,7 @@ from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.drives.drive import Drive
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 
 START_US = 1_700_000_000_000_000
 _STEP_US = 20_000

@@ -10,7 +10,7 @@ from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 
 START_US, HZ = 1_700_000_000_000_000, 50
 KEY = DriveKey("car7", START_US, "00c0ffee")

@@ -19,27 +19,26 @@ from iort_analysis.drives.recorded import recorded
 from iort_analysis.samples.batches import RefusedItems, blocks, part
 from iort_analysis.samples.seconds import batches_of
 from iort_contract.archive import ArchivedHour, Pending, archived_hour, parse_hour, parse_pending
-from iort_contract.codec.columns import DICTIONARY, packed, unpacked
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import DICTIONARY, flat_second, packed, unpacked
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.account import SourceAccount, StreamAccount, account
-from iort_contract.messages.analysis.findings import (
+from iort_contract.messages.analysis import (
+    AnalysedDrive,
+    AnalysisRequest,
     DriveKey,
     Estimate,
     Finding,
-    decode_finding,
-    encode_finding,
-)
-from iort_contract.messages.analysis.notes import Note, decode_note, encode_note
-from iort_contract.messages.analysis.run import (
-    AnalysedDrive,
-    AnalysisRequest,
+    Note,
     PlannedDrive,
     decode_analysed,
+    decode_finding,
+    decode_note,
     decode_planned,
     decode_request,
     encode_analysed,
+    encode_finding,
+    encode_note,
     encode_planned,
     encode_request,
 )
@@ -52,36 +51,19 @@ from iort_contract.messages.batch import (
     messages_of,
     run_ends,
 )
-from iort_contract.messages.control.commands import (
+from iort_contract.messages.commands import (
     Command,
+    DriveLimits,
     FleetMessage,
     decode_command,
     decode_fleet,
+    decode_limits,
     encode_command,
     encode_fleet,
+    encode_limits,
 )
-from iort_contract.messages.control.driving import DriveLimits, decode_limits, encode_limits
-from iort_contract.messages.control.shadow import decode_desired, decode_reported
-from iort_contract.messages.event import event_message, rule_event
-from iort_contract.messages.live import (
-    LiveSample,
-    decode_live,
-    decode_live_update,
-    decode_pong,
-    encode_live,
-    encode_ping,
-    live_update,
-)
-from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.messages.requests.ask import (
-    Answer,
-    Ask,
-    decode_answer,
-    decode_ask,
-    encode_answer,
-    encode_ask,
-)
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.envelope import event_message, rule_event
+from iort_contract.messages.files import (
     Address,
     File,
     FileAnswer,
@@ -93,21 +75,38 @@ from iort_contract.messages.requests.files import (
     file_key,
     parse_file_key,
 )
-from iort_contract.messages.requests.query import (
+from iort_contract.messages.live import (
+    Lease,
+    LiveSample,
+    decode_lease,
+    decode_live,
+    decode_live_update,
+    decode_pong,
+    encode_lease,
+    encode_live,
+    encode_ping,
+    live_update,
+)
+from iort_contract.messages.questions import (
+    Answer,
+    Ask,
     QueryAnswer,
     QueryRequest,
+    decode_answer,
+    decode_ask,
     decode_query_answer,
     decode_query_request,
+    encode_answer,
+    encode_ask,
     encode_query_answer,
     encode_query_request,
     packed_samples,
     unpacked_samples,
 )
-from iort_contract.messages.viewing import Lease, decode_lease, encode_lease
+from iort_contract.messages.shadow import decode_desired, decode_reported
 from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
 from iort_contract.ros1.definition import parse
-from iort_contract.ros1.message import Messages, RosType
-from iort_contract.ros1.serialized import pack, unpack
+from iort_contract.ros1.message import Messages, MessageType, RosType, message_type, pack, unpack
 from iort_contract.topics import parse_topic
 from iort_contract.track import parse_track, track_of
 from testkit.dynamodb import item_of

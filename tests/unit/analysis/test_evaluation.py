@@ -14,7 +14,7 @@ from iort_analysis.evaluation.combined import combined
 from iort_analysis.evaluation.evaluate import evaluate
 from iort_analysis.evaluation.trends import US_PER_DAY
 from iort_analysis.results import DriveResult, Event, Measured, Mined
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
+from iort_contract.messages.analysis import DriveKey, Estimate, Finding
 
 NAME = "battery_resistance_ohm"
 

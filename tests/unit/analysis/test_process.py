@@ -10,7 +10,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.process import analyse
 from iort_analysis.results import Event, Mined, encode_result
 from iort_analysis.samples.blocks import EMPTY, Block, objects
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 from tests.unit.analysis.simulated import KEY, START_US, VEHICLE, changed, streams
 
 MASS = Estimate(3.7, 3.5, 3.9, "kg")

@@ -13,7 +13,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import battery, motor
 from iort_analysis.process import MINERS
 from iort_analysis.samples.blocks import Block
-from iort_contract.messages.analysis.findings import DriveKey
+from iort_contract.messages.analysis import DriveKey
 from tests.recordings import recording
 from tests.unit.analysis.proven import proven
 

@@ -9,11 +9,10 @@ import pytest
 from bench.floors.functions import live as live_floor
 from bench.floors.functions import summarize as summarize_floor
 from functions.shared.summary import process
-from iort_contract.codec.columns import DICTIONARY
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import DICTIONARY, flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.live import LiveSample, decode_live_update, encode_live
 from iort_contract.tables import SECOND, STATS, TOPIC
 from testkit.car import RATE_HZ, simulated_drive

@@ -15,9 +15,8 @@ from bench.proof.judging import RIGHT, Car, coverage, detection, judge
 from bench.proof.truths import TRUTHS
 from iort_agent.sources.sim.faults import KINDS as FAULTS
 from iort_analysis.results import DriveResult, Event, Mined
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameters import PARAMETERS
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
+from iort_contract.messages.analysis import Estimate
 
 SECONDS = 60.0
 

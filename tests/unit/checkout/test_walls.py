@@ -72,7 +72,7 @@ def test_the_imports_keep_all_walls(house: Path) -> None:
         ("agent", "device/iort_agent/lanes/live.py", "iort_agent.config"),
         ("agent", "device/iort_agent/common/schema.py", "iort_agent.spool.memory"),
         ("station", "station/iort_station/data/recorded.py", "iort_station.cli.console"),
-        ("contract", "contract/iort_contract/codec/columns.py", "iort_contract.messages.batch"),
+        ("contract", "contract/iort_contract/codec.py", "iort_contract.messages.batch"),
         ("functions", "functions/live.py", "functions.alert"),
         ("circles", "device/iort_agent/sources/recording/player.py", "iort_agent.sources.recording.rosbag"),
     ],

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.catalog.derived import Vehicle, derive
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import flat_second
 from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.statistics import count_holes, missing_before, summarize_second
 

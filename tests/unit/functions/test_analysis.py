@@ -22,16 +22,18 @@ from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.archive import ArchivedHour, hour_of
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED, DRIVES_WAIT, SERIOUS
+from iort_contract.catalog.analysis import ANALYSIS_FAILED, DRIVES_WAIT, SERIOUS
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.cloud import PLANS_PREFIX, drive_prefix, plan_key, robots_key
 from iort_contract.dynamodb import TelemetryTable
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
-from iort_contract.messages.analysis.run import (
+from iort_contract.messages.analysis import (
     AnalysedDrive,
     AnalysisRequest,
+    DriveKey,
+    Estimate,
+    Finding,
     PlannedDrive,
     encode_analysed,
     encode_planned,

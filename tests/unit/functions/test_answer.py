@@ -18,10 +18,10 @@ from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import CALIBRATION, QUESTIONS, RACELINE, Question
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import DriveKey, Estimate
-from iort_contract.messages.analysis.run import AnalysedDrive
-from iort_contract.messages.event import rule_event
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.files import File, file_key
+from iort_contract.messages.questions import (
     FAILED,
     INVALID,
     MALFORMED,
@@ -40,7 +40,6 @@ from iort_contract.messages.requests.ask import (
     encode_answer,
     encode_ask,
 )
-from iort_contract.messages.requests.files import File, file_key
 from iort_contract.tables import ROBOT
 from iort_contract.topics import ANSWER, ASK, build_topic
 from iort_contract.track import parse_track

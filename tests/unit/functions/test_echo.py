@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from functions import echo
 from iort_contract.catalog.environments import EchoEnvironment
 from iort_contract.limits import ContractError
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.live import decode_pong, encode_ping
 from iort_contract.tables import PING_FIELDS, RECEIVED_MS, TOPIC
 from iort_contract.topics import LAMBDA, PING, PONG, build_topic

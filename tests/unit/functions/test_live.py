@@ -21,7 +21,7 @@ from iort_contract.catalog.metrics import metrics_of
 from iort_contract.cloud import channel as channel_of
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import LIVE_MAX_AGE_MS, MAX_PUBNUB_BYTES, SCHEMA_VERSION, ContractError
-from iort_contract.messages.event import event_message, rule_event
+from iort_contract.messages.envelope import event_message, rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BY_FUNCTION, MESSAGE_BASE64, RECEIVED_MS, TOPIC
 from iort_contract.topics import LIVE, build_topic

@@ -17,7 +17,7 @@ from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
 from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
-from iort_contract.messages.event import event_message
+from iort_contract.messages.envelope import event_message
 from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
 from iort_contract.tables import (
     AGENT_VERSION,

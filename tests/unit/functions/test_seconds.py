@@ -13,7 +13,7 @@ from functions.shared.seconds import SECOND_BATCHES, Reader
 from functions.shared.summary import process
 from functions.shared.tables import attribute
 from iort_contract import tables
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch, split_batch
 from iort_contract.statistics import missing_before, summarize_second

@@ -16,8 +16,7 @@ from functions import summarize
 from functions.shared import tables as tables_module
 from functions.shared.summary import process
 from functions.summarize import size_of
-from iort_contract.codec.columns import DICTIONARY
-from iort_contract.codec.seconds import flat_second
+from iort_contract.codec import DICTIONARY, flat_second
 from iort_contract.dynamodb import TableError, plain
 from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES
 from iort_contract.messages.batch import Batch, BatchId, encode_batch

@@ -18,8 +18,8 @@ from functions.shared.quotas import DAY, Quota
 from functions.upload import Bucket
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
-from iort_contract.messages.event import rule_event
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.files import (
     MAX_ADDRESSES,
     MAX_FILE_BYTES,
     PART_BYTES,

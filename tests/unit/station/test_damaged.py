@@ -20,7 +20,7 @@ from iort_analysis.samples.batches import RefusedItems
 from iort_contract.archive import ArchiveTable
 from iort_contract.dynamodb import TelemetryTable, plain
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.run import AnalysisRequest
+from iort_contract.messages.analysis import AnalysisRequest
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import BATCH, RECOMPUTE_FROM_S, TOPIC
 from iort_station import data

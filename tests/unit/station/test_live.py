@@ -17,8 +17,16 @@ from rich.console import Console
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.live import LiveSample, decode_live_update, encode_live, live_update
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, decode_lease, lease_topic
+from iort_contract.messages.live import (
+    VIEW_LEASE_MS,
+    Lease,
+    LiveSample,
+    decode_lease,
+    decode_live_update,
+    encode_live,
+    lease_topic,
+    live_update,
+)
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError

@@ -10,9 +10,8 @@ import pytest
 from moto import mock_aws
 
 from iort_analysis.samples.blocks import values
-from iort_contract.catalog.analysis.parameters import GROUPS
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
-from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.catalog.analysis import GROUPS
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate, Finding
 from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
 from iort_station.page import insights

@@ -174,7 +174,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
-    from iort_contract.messages.analysis.insights import InsightsAnswer
+    from iort_contract.messages.insights import InsightsAnswer
     from local.pubnub.standin import PubNubStandIn
 
 END = START + 90_000_000

@@ -18,7 +18,7 @@ from botocore.credentials import ReadOnlyCredentials
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import DRIVER, VIEWER
-from iort_contract.messages.viewing import lease_topic
+from iort_contract.messages.live import lease_topic
 from iort_contract.topics import CMD, LIVE, build_topic
 from iort_station.fleet.roles import Role
 from iort_station.page import motion

@@ -12,8 +12,14 @@ from itertools import count
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, decode_lease, lease_topic
+from iort_contract.messages.live import (
+    VIEW_LEASE_MS,
+    Lease,
+    LiveSample,
+    decode_lease,
+    encode_live,
+    lease_topic,
+)
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import live_topic
 from iort_station.cloud import Cloud

@@ -12,9 +12,9 @@ from typing import Any
 from iort_contract.catalog.questions import CALIBRATION
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
+from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
-from iort_contract.messages.requests.ask import Ask, decode_answer, encode_ask
-from iort_contract.messages.requests.files import File, FileRequest, encode_file_request, file_key
+from iort_contract.messages.questions import Ask, decode_answer, encode_ask
 from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import ANSWER, ASK, FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW, build_topic
 from iort_station.fleet import registry

@@ -6,8 +6,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
-from iort_contract.messages.analysis.run import AnalysisRequest
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
+from iort_contract.messages.analysis import AnalysisRequest
 from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.fleet import registry

@@ -7,7 +7,7 @@ import json
 import time
 from typing import Any
 
-from iort_contract.messages.event import rule_event
+from iort_contract.messages.envelope import rule_event
 from iort_contract.tables import BY_FUNCTION, TOPIC
 from iort_contract.topics import LAMBDA, PING, build_topic
 from testkit.target import Target, temporary_function

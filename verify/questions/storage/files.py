@@ -7,7 +7,7 @@ import http.client
 import json
 import time
 
-from iort_contract.messages.requests.files import FILES_PREFIX, PART_BYTES, File, part_range
+from iort_contract.messages.files import FILES_PREFIX, PART_BYTES, File, part_range
 from testkit.target import Target, temporary_function
 from testkit.waiting import until
 from verify.question import Seen, question

@@ -9,7 +9,7 @@ import numpy as np
 
 from iort_analysis.mining.anomalies.readings import Array
 from iort_analysis.statistics.intervals import sides
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 _LEAST = 30
 # Before and after a change there is at least this share of the series.

@@ -11,7 +11,7 @@ from iort_analysis.mining.anomalies.profile import matrix_profile
 from iort_analysis.mining.anomalies.readings import MOTOR, MOVING_KRPM, SPEED, Array, Mask, Readings
 from iort_analysis.results import Event, Mined
 from iort_analysis.statistics.signals import binned, bridged
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 KIND = "pattern_unusual"
 # Stretches of this time, in at most so many steps of at least this time.

@@ -16,7 +16,7 @@ from iort_analysis.mining.anomalies.readings import FULL_DUTY, MOVING_KRPM, Arra
 from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, fit
 from iort_analysis.statistics.signals import binned
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 VOLTAGE_DRIFT, CURRENT_DRIFT = "voltage_drift_v", "motor_current_drift_a"
 _STEP_S, _LEAST_S = 0.2, 180.0

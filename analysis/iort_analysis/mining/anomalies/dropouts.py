@@ -10,7 +10,7 @@ from iort_analysis.mining.anomalies.readings import BATTERY, VOLTAGE, Array, Rea
 from iort_analysis.results import Event, Mined
 from iort_analysis.statistics.fitting import fit
 from iort_analysis.statistics.signals import binned, bridged, smooth_basis
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 KIND = "cell_dropout"
 _STEP_S = 0.1

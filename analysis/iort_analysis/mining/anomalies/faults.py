@@ -7,7 +7,7 @@ import numpy as np
 from iort_analysis.drives.drive import Drive
 from iort_analysis.results import Event, Mined
 from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 KIND = "fault_reported"
 

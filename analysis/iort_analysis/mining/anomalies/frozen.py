@@ -8,7 +8,7 @@ import numpy as np
 
 from iort_analysis.drives.drive import FROZEN, Drive, Repair
 from iort_analysis.results import Event, Mined
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 KIND = "sensor_stuck"
 # So many fields at once are not their sensors' fault, but that of the link: `gaps` finds it.

@@ -10,7 +10,7 @@ from iort_analysis.drives.motion import motion_of
 from iort_analysis.results import Event, Mined
 from iort_analysis.samples.blocks import Block
 from iort_analysis.statistics.intervals import sides
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 KIND = "can_intermittent"
 # A gap is longer than so many intervals between samples, and shorter than a pause.

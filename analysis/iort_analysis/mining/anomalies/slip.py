@@ -11,7 +11,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.anomalies.readings import MOVING_KRPM, Array, Readings
 from iort_analysis.results import Mined
 from iort_analysis.statistics.intervals import mean_of, sides
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 SLIP = "slip_under_torque"
 # Distances over this time are compared: long enough for a pose with a centimetre's noise.

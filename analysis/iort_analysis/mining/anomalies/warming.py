@@ -16,7 +16,7 @@ from iort_analysis.results import Mined
 from iort_analysis.statistics.fitting import Fit, fit
 from iort_analysis.statistics.signals import binned, bridged, lagged
 from iort_contract.catalog.vesc import TEMPERATURES
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 TEMPERATURE_DRIFT, LAG = "temperature_drift_k", "controller_lag_s"
 _STEP_S, _LEAST_S = 2.0, 240.0

@@ -13,8 +13,8 @@ from iort_analysis.mining.laps.laps import Laps, best, find_laps, speed_mps
 from iort_analysis.mining.laps.path import Floats
 from iort_analysis.results import Mined, Table
 from iort_analysis.statistics.intervals import mean_of, sides
-from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PARAMETERS, PLACES_TABLE
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.catalog.analysis import LAPS_TABLE, PARAMETERS, PLACES_TABLE
+from iort_contract.messages.analysis import Estimate
 
 # What is above zero in every lap; and how sure laps are whose interval says otherwise.
 _POSITIVE, _UNSURE = ("lap_best_s", "lap_mean_s", "lap_distance_m"), 0.5

@@ -21,8 +21,7 @@ from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.control.commands import MAX_LEASE_MS
-from iort_contract.messages.control.driving import DRIVE_TYPE
+from iort_contract.messages.commands import DRIVE_TYPE, MAX_LEASE_MS
 from iort_contract.ros1.definition import Definition, parse
 from iort_contract.topics import check_stream
 from iort_contract.track import Track, parse_track

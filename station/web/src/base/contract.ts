@@ -662,7 +662,7 @@ export interface SettingsAnswer {
   readonly online: boolean;
 }
 
-/** What a stick drives, and how far: `iort_contract.messages.control.driving.DriveLimits`. */
+/** What a stick drives, and how far: `iort_contract.messages.commands.DriveLimits`. */
 export interface DriveLimitsEntry {
   readonly command: string;
   readonly speed: string;

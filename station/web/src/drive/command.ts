@@ -1,4 +1,4 @@
-// The commands of one hold of the stick, as `iort_contract.messages.control.commands` writes them.
+// The commands of one hold of the stick, as `iort_contract.messages.commands` writes them.
 
 import { DRIVE_LEASE_MS, DRIVE_MARGIN_MS, type DriveLimitsEntry, SCHEMA_VERSION } from "../base/contract";
 import type { Motion } from "./stick";

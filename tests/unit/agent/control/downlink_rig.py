@@ -20,7 +20,7 @@ from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.types import OnTrigger
 from iort_contract.limits import Value
-from iort_contract.messages.control.commands import Command, encode_command
+from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
 from testkit.agent import Loopback, ManualClock, link_of
 

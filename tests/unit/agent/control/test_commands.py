@@ -14,7 +14,7 @@ from iort_agent.control.commands import refuse_commands
 from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_contract.messages.control.commands import Command, encode_command
+from iort_contract.messages.commands import Command, encode_command
 from testkit.agent import Loopback, ManualClock, link_of
 from tests.unit.agent.control.downlink_rig import CONFIG, T0, Rig, doubles
 

@@ -20,7 +20,7 @@ import pytest
 from iort_agent.control import guard as guard_module
 from iort_agent.control.guard import Guard, StopFile
 from iort_agent.control.leases import STOP_AHEAD_MS
-from iort_contract.messages.control.driving import NO_GUARD
+from iort_contract.messages.commands import NO_GUARD
 from iort_contract.ros1.definition import parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles

@@ -10,8 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iort_agent.control.leases import STOP_AHEAD_MS, STOP_HOLD_S, STOP_REPEAT_S, STOP_REPEATS, Leases, Limits
-from iort_contract.messages.control.commands import Command
-from iort_contract.messages.control.driving import (
+from iort_contract.messages.commands import (
     BEGIN_AGAIN,
     CLOCK_UNKNOWN,
     CLOSED,
@@ -23,6 +22,7 @@ from iort_contract.messages.control.driving import (
     REPEATED,
     STALE,
     SUPERSEDED,
+    Command,
 )
 
 T0 = 1_700_000_000_000_000

@@ -25,8 +25,9 @@ from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
-from iort_contract.messages.control.commands import FleetMessage, decode_fleet, encode_fleet
-from iort_contract.messages.requests.ask import (
+from iort_contract.messages.commands import FleetMessage, decode_fleet, encode_fleet
+from iort_contract.messages.files import file_key
+from iort_contract.messages.questions import (
     MAX_INLINE_BYTES,
     OVER_QUOTA,
     Answer,
@@ -36,7 +37,6 @@ from iort_contract.messages.requests.ask import (
     decode_ask,
     encode_answer,
 )
-from iort_contract.messages.requests.files import file_key
 from iort_contract.ros1.definition import parse
 from testkit.agent import Loopback, ManualClock, link_of
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, T0, FakeGraph, Rig, doubles

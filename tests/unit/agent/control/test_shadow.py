@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from iort_agent.control.shadow import Shadow, _difference, _merged, overlay
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_contract.messages.control.commands import Command
-from iort_contract.messages.control.shadow import OverShare, Reported, decode_desired, encode_reported
+from iort_contract.messages.commands import Command
+from iort_contract.messages.shadow import OverShare, Reported, decode_desired, encode_reported
 from testkit.agent import Loopback, ManualClock, link_of
 
 BASE = RuntimeSettings(

@@ -20,8 +20,8 @@ from iort_agent.lanes.attachment import Attachments, thumbnail
 from iort_agent.sources.recording import BagConfig
 from iort_contract.limits import MAX_PUBNUB_BYTES, MessageError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, file_key
 from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.messages.requests.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, file_key
 from iort_contract.ros1.decode import Decoder, Large
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import Messages, RosMessage, RosType, filled

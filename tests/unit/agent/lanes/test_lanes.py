@@ -26,7 +26,7 @@ from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status import render
 from iort_contract.messages.batch import decode_batch
-from iort_contract.messages.control.settings import ALWAYS
+from iort_contract.messages.shadow import ALWAYS
 from iort_contract.topics import BROKER, LIVE
 from testkit.agent import Loopback, ManualClock, Published
 

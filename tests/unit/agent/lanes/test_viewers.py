@@ -9,9 +9,8 @@ from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.viewers import Viewers
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.limits import LIVE_MIN_RATE_HZ
-from iort_contract.messages.control.settings import ALWAYS, WATCHED
-from iort_contract.messages.live import LiveSample, decode_live
-from iort_contract.messages.viewing import MAX_VIEWERS, Lease, encode_lease, lease_topic
+from iort_contract.messages.live import MAX_VIEWERS, Lease, LiveSample, decode_live, encode_lease, lease_topic
+from iort_contract.messages.shadow import ALWAYS, WATCHED
 from testkit.agent import Loopback, ManualClock, link_of
 
 BROKER, DIRECT = "live/iort/car1/vesc", "$aws/rules/iort_live/live/iort/car1/vesc"

@@ -14,8 +14,7 @@ from iort_agent.errors import SourceError
 from iort_agent.sources.intake import Intake
 from iort_agent.sources.ros1 import Ros1Config, TopicConfig
 from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.ros1.message import RosMessage
+from iort_contract.ros1.message import MessageType, RosMessage, message_type
 from testkit.agent import ManualClock
 from tests.unit.contract.ros1.ros1_messages import LINE, STAMPED, header, u32
 

@@ -17,7 +17,7 @@ from iort_agent.sources.sim.driver import HALL, Circuit, Pose, wrapped
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import CATALOG, POSE_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
-from iort_contract.messages.control.driving import DRIVE_TYPE, DriveLimits
+from iort_contract.messages.commands import DRIVE_TYPE, DriveLimits
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import Rig
 

@@ -18,8 +18,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.mining import anomalies
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Block
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameters import PARAMETERS
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from tests.unit.analysis.simulated import HZ, KEY, START_US, changed, streams
 
 _CAR = 300  # apart from the cars of the proof

@@ -12,7 +12,7 @@ from iort_analysis.drives.transform import with_derived
 from iort_analysis.mining.battery import mine
 from iort_analysis.mining.charge import Spent, charge
 from iort_contract.catalog.derived import F1TENTH
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 from tests.unit.analysis.proven import proven
 
 

@@ -14,7 +14,7 @@ from iort_analysis.evaluation.combined import combined
 from iort_analysis.evaluation.discovery import false_discovery_rates
 from iort_analysis.evaluation.trends import US_PER_DAY, trend
 from iort_analysis.statistics.intervals import sides
-from iort_contract.messages.analysis.findings import Estimate
+from iort_contract.messages.analysis import Estimate
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=40))

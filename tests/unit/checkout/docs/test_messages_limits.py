@@ -8,9 +8,8 @@ from functions import live
 from functions.shared import seconds
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
-from iort_contract.messages import viewing
-from iort_contract.messages.control import commands
-from iort_contract.messages.requests import ask, files
+from iort_contract.messages import commands, files, questions
+from iort_contract.messages import live as viewing
 from iort_contract.ros1.message import MAX_LAYOUT
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
@@ -38,7 +37,7 @@ UNITS = {
 }
 
 # The modules that define limits.
-MODULES = (limits, commands, files, ask, viewing)
+MODULES = (limits, commands, files, questions, viewing)
 
 
 def test_each_limit_has_its_value_on_the_page() -> None:

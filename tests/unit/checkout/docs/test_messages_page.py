@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.codec import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
 from testkit.ros1_types import Message

@@ -17,7 +17,7 @@ from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POS
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
-from iort_contract.messages.control.commands import (
+from iort_contract.messages.commands import (
     Command,
     FleetMessage,
     decode_command,
@@ -25,31 +25,8 @@ from iort_contract.messages.control.commands import (
     encode_command,
     encode_fleet,
 )
-from iort_contract.messages.control.settings import CHANGEABLE
-from iort_contract.messages.control.shadow import decode_desired, decode_reported, encode_reported
-from iort_contract.messages.event import rule_event
-from iort_contract.messages.live import (
-    LiveSample,
-    Pong,
-    decode_live,
-    decode_pong,
-    encode_live,
-    encode_ping,
-    live_update,
-)
-from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.messages.requests.ask import (
-    OVER_QUOTA,
-    Answer,
-    Ask,
-    Content,
-    Refusal,
-    decode_answer,
-    decode_ask,
-    encode_answer,
-    encode_ask,
-)
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.files import (
     Address,
     File,
     FileAnswer,
@@ -60,7 +37,31 @@ from iort_contract.messages.requests.files import (
     encode_file_request,
     file_key,
 )
-from iort_contract.messages.viewing import Lease, decode_lease, encode_lease
+from iort_contract.messages.live import (
+    Lease,
+    LiveSample,
+    Pong,
+    decode_lease,
+    decode_live,
+    decode_pong,
+    encode_lease,
+    encode_live,
+    encode_ping,
+    live_update,
+)
+from iort_contract.messages.questions import (
+    OVER_QUOTA,
+    Answer,
+    Ask,
+    Content,
+    Refusal,
+    decode_answer,
+    decode_ask,
+    encode_answer,
+    encode_ask,
+)
+from iort_contract.messages.shadow import CHANGEABLE, decode_desired, decode_reported, encode_reported
+from iort_contract.ros1.message import MessageType, message_type
 from iort_contract.tables import (
     OVER_SHARE,
     PUT_OFF,

@@ -11,8 +11,7 @@ from iort_contract.catalog import metrics
 from iort_contract.catalog.metrics import METRICS, ROBOT_CHARTS
 from iort_contract.catalog.rules import RULES
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.live import encode_ping
-from iort_contract.messages.viewing import LEASE
+from iort_contract.messages.live import LEASE, encode_ping
 from iort_contract.tables import ENVELOPE, EXPIRES_S, MESSAGE_BASE64, PING_FIELDS, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import (
     ANSWER,

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from iort_contract.catalog.streams import AGENT_FIELDS, RTT_FIELDS
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.checks import wire_column
-from iort_contract.codec.columns import DICTIONARY, PLAIN_CODEC, packed, unpacked
+from iort_contract.codec import DICTIONARY, PLAIN_CODEC, packed, unpacked
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from tests.examples import examples

@@ -8,8 +8,7 @@ import zlib
 
 import pytest
 
-from iort_contract.codec.columns import PLAIN_CODEC
-from iort_contract.codec.complexity_guard import check_effort
+from iort_contract.codec import PLAIN_CODEC, check_effort
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import assume, given
 
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.codec.columns import inflate
+from iort_contract.codec import inflate
 from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, split_batch
 from iort_contract.messages.live import encode_live

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.codec.columns import PLAIN_CODEC
+from iort_contract.codec import PLAIN_CODEC
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError
 from iort_contract.messages.batch import decode_batch, encode_batch
 from iort_contract.messages.live import decode_live, encode_live

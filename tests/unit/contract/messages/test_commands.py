@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.control.commands import (
+from iort_contract.messages.commands import (
     Command,
     FleetMessage,
     decode_command,

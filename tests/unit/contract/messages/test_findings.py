@@ -6,16 +6,9 @@ import json
 
 import pytest
 
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.catalog.analysis.parameters import PARAMETERS
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.findings import (
-    DriveKey,
-    Estimate,
-    Finding,
-    decode_finding,
-    encode_finding,
-)
+from iort_contract.messages.analysis import DriveKey, Estimate, Finding, decode_finding, encode_finding
 
 FINDING = Finding(
     drive=DriveKey("car7", 1_700_000_000_000_000, "00c0ffee"),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.limits import MAX_NEXT_MS, MAX_PUBNUB_BYTES, ContractError
-from iort_contract.messages.event import event_message, rule_event
+from iort_contract.messages.envelope import event_message, rule_event
 from iort_contract.messages.live import (
     LiveSample,
     decode_live,

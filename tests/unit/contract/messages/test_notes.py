@@ -8,7 +8,7 @@ import pytest
 
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis.notes import MAX_NOTE_CHARACTERS, Note, decode_note, encode_note
+from iort_contract.messages.analysis import MAX_NOTE_CHARACTERS, Note, decode_note, encode_note
 from tests.unit.contract.messages.test_findings import FINDING
 
 FIRST_US = 1_700_000_000_000_000

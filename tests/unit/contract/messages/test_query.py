@@ -7,7 +7,7 @@ import json
 import pytest
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.requests.query import (
+from iort_contract.messages.questions import (
     FIRST_US,
     LAST_US,
     QueryAnswer,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
-from iort_contract.messages.viewing import VIEW_LEASE_MS, Lease, decode_lease, encode_lease, lease_topic
+from iort_contract.messages.live import VIEW_LEASE_MS, Lease, decode_lease, encode_lease, lease_topic
 from tests.unit.contract.contract_values import BOOT, boots, json_values
 
 GOOD = Lease(BOOT, 10, VIEW_LEASE_MS)

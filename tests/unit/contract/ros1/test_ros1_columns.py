@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.codec import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
     MAX_COLUMNS_BYTES,
@@ -24,13 +24,22 @@ from iort_contract.limits import (
     MessageError,
 )
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, messages_of, split_batch
-from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
 from iort_contract.ros1.decode import HEADER as HEAD
 from iort_contract.ros1.decode import Large
 from iort_contract.ros1.definition import layout, parse
-from iort_contract.ros1.message import MAX_LAYOUT, Messages, RosMessage, RosType, cut, filled, type_id
-from iort_contract.ros1.serialized import pack, unpack
+from iort_contract.ros1.message import (
+    MAX_LAYOUT,
+    Messages,
+    MessageType,
+    RosMessage,
+    RosType,
+    cut,
+    filled,
+    pack,
+    type_id,
+    unpack,
+)
 from tests.examples import examples
 from tests.unit.contract.contract_values import BOOT, json_values
 from tests.unit.contract.ros1.ros1_messages import HEADER, LINE, STAMPED, header, text, u32

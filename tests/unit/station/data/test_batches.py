@@ -18,7 +18,7 @@ from bench.meters.message_sizes import stored_bytes
 from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, decode_together, part
 from iort_analysis.samples.blocks import join
 from iort_contract.checks import wire_column
-from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
+from iort_contract.codec import CODEC, DICTIONARY, PLAIN_CODEC, packed
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch

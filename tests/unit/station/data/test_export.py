@@ -23,10 +23,9 @@ from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.recording import BagConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.message_type import MessageType
-from iort_contract.messages.requests.files import ATTACHMENT_FIELDS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.ros1.decode import Large
-from iort_contract.ros1.message import Messages, RosType, cut
+from iort_contract.ros1.message import Messages, MessageType, RosType, cut
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import Export, write

@@ -10,11 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_analysis.evaluation.combined import combined
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import DriveKey, Estimate, Finding
-from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate, Finding
 from iort_contract.page import history_link
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app

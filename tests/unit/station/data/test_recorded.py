@@ -22,8 +22,7 @@ from iort_analysis.samples.blocks import values
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.messages.account import StreamAccount
 from iort_contract.messages.batch import Batch, RunEnd
-from iort_contract.messages.message_type import MessageType
-from iort_contract.ros1.message import Messages, RosType
+from iort_contract.ros1.message import Messages, MessageType, RosType
 from iort_contract.tables import RECOMPUTE_FROM_S
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract.messages.control.commands import Command, decode_command
-from iort_contract.messages.control.driving import DRIVEN_BY_ANOTHER, NO_LEASE
-from iort_contract.messages.control.shadow import OverShare, Reported, decode_desired, decode_reported
+from iort_contract.messages.commands import DRIVEN_BY_ANOTHER, NO_LEASE, Command, decode_command
+from iort_contract.messages.shadow import OverShare, Reported, decode_desired, decode_reported
 from iort_station.cli.verbs.fleet.send import commands
 from iort_station.errors import StationError
 from iort_station.fleet.control import State, _check_clock, outcome, over_share, settled, slept

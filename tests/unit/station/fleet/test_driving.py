@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.control.commands import Command, decode_command, encode_command
-from iort_contract.messages.control.driving import DriveLimits
+from iort_contract.messages.commands import Command, DriveLimits, decode_command, encode_command
 from iort_contract.messages.live import LiveSample
 from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
 from iort_station.cli.verbs.fleet.drive import _Seat

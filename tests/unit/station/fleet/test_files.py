@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract.messages.requests.files import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
 from iort_station.cloud import Cloud

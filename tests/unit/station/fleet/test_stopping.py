@@ -15,7 +15,7 @@ from botocore.exceptions import ClientError
 from typer.testing import CliRunner
 
 from iort_agent.control.shadow import _merged
-from iort_contract.messages.control.driving import NO_MOTION, DriveLimits, encode_limits
+from iort_contract.messages.commands import NO_MOTION, DriveLimits, encode_limits
 from iort_station.cli.verbs.fleet.robots import commands as robots
 from iort_station.cli.verbs.fleet.stop import commands
 from iort_station.errors import StationError

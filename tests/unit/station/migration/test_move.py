@@ -21,8 +21,7 @@ from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import ArchivedHour, archived_hour, parse_hour
 from iort_contract.dynamodb import TableError
 from iort_contract.findings_table import FindingsTable
-from iort_contract.messages.analysis.findings import Finding
-from iort_contract.messages.analysis.run import AnalysedDrive
+from iort_contract.messages.analysis import AnalysedDrive, Finding
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError

@@ -12,7 +12,7 @@ from iort_analysis.samples.batches import RefusedItems, blocks
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
-from iort_contract.messages.control.commands import (
+from iort_contract.messages.commands import (
     Command,
     FleetMessage,
     decode_command,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from iort_contract.catalog.analysis.car import GROUPS
-from iort_contract.messages.analysis.findings import encode_estimate
+from iort_contract.catalog.car import GROUPS
+from iort_contract.messages.analysis import encode_estimate
 from iort_station.cli.console import Lines, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say

@@ -8,9 +8,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract.catalog.analysis.kinds import KINDS
-from iort_contract.messages.analysis.findings import Estimate, Finding, encode_finding
-from iort_contract.messages.analysis.run import AnalysedDrive, encode_analysed
+from iort_contract.catalog.analysis import KINDS
+from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, encode_analysed, encode_finding
 from iort_contract.page import history_link
 from iort_station.cli import completion
 from iort_station.cli.console import errors, out, print_json

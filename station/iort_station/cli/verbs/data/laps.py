@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract.catalog.analysis.parameters import LAPS_TABLE, PARAMETERS, PLACES_TABLE
-from iort_contract.messages.analysis.findings import encode_estimate
+from iort_contract.catalog.analysis import LAPS_TABLE, PARAMETERS, PLACES_TABLE
+from iort_contract.messages.analysis import encode_estimate
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson, Force, Robot, When, ranged, to_file
 from iort_station.cli.progress import reading

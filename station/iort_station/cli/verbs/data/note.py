@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from iort_contract.messages.analysis.notes import MAX_NOTE_CHARACTERS, Note
+from iort_contract.messages.analysis import MAX_NOTE_CHARACTERS, Note
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot, When, ranged
 from iort_station.cli.words import examples, say

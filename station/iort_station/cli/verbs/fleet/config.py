@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from iort_contract.messages.control.shadow import Rejection
+from iort_contract.messages.shadow import Rejection
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot
 from iort_station.cli.words import examples

@@ -21,15 +21,21 @@ from rich.text import Text
 
 from iort_contract.cloud import DRIVER
 from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
-from iort_contract.messages.control.commands import encode_command
-from iort_contract.messages.control.driving import (
+from iort_contract.messages.commands import (
     DRIVE_MAX_AGE_MS,
     DRIVE_MAX_RTT_MS,
     DRIVE_RATE_HZ,
     DriveLimits,
+    encode_command,
 )
-from iort_contract.messages.live import decode_live
-from iort_contract.messages.viewing import VIEW_LEASE_MS, VIEW_RENEW_S, Lease, encode_lease, lease_topic
+from iort_contract.messages.live import (
+    VIEW_LEASE_MS,
+    VIEW_RENEW_S,
+    Lease,
+    decode_live,
+    encode_lease,
+    lease_topic,
+)
 from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
 from iort_station.cli.console import out
 from iort_station.cli.keys import Keys, keys_of

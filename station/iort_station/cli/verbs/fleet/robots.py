@@ -10,8 +10,8 @@ import typer
 from botocore.exceptions import ClientError
 from rich.table import Table
 
-from iort_contract.catalog.analysis.car import KNOWN
-from iort_contract.messages.control.driving import NO_MOTION
+from iort_contract.catalog.car import KNOWN
+from iort_contract.messages.commands import NO_MOTION
 from iort_contract.tables import (
     ADMISSION,
     ADMIT_CLAIM,

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from iort_contract.messages.control.commands import MAX_LEASE_MS, MAX_VALID_MS
+from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.topics import ACCEPTED
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, Robot

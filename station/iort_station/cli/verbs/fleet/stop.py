@@ -15,8 +15,7 @@ from typing import Annotated, NoReturn
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.messages.control.commands import MAX_LEASE_MS
-from iort_contract.messages.control.driving import DRIVE_LEASE_MS
+from iort_contract.messages.commands import DRIVE_LEASE_MS, MAX_LEASE_MS
 from iort_contract.messages.page import RobotPresence
 from iort_contract.tables import ONLINE
 from iort_station.cli import completion

@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 
 from iort_analysis.drives.finding import LONGEST_US
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import MAX_AHEAD_US, ContractError
-from iort_contract.messages.analysis.run import AnalysisRequest, decode_request, encode_request
+from iort_contract.messages.analysis import AnalysisRequest, decode_request, encode_request
 from iort_station.cli import completion
 from iort_station.cli.console import errors, tell
 from iort_station.cli.options import AsJson, When, ranged

@@ -2,23 +2,31 @@
 
 A column is a list whose first entry is its decimals. After a number follow the first value and the step from
 each value to the next, as integers: the values times ten to the power of the decimals. After null follow the
-plain values. In `PLAIN_CODEC` a column was the plain values only.
-"""
+plain values. In `PLAIN_CODEC` a column was the plain values only."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 import zlib
+from functools import lru_cache
 from itertools import accumulate
 from operator import sub
-from typing import Any, Mapping, Sequence, cast
+from typing import Any, List, Mapping, Sequence, Union, cast
 
 from iort_contract.checks import COMPACT, shown, wire_column
-from iort_contract.limits import MAX_COLUMNS_BYTES, ContractError, Value
+from iort_contract.limits import (
+    MAX_BATCH_VALUES,
+    MAX_COLUMNS_BYTES,
+    MAX_FIELDS,
+    MAX_SAMPLES,
+    ContractError,
+    Value,
+)
+from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
 # Codecs of new batches and of stored ones, which stay readable for ever. `SERIALIZED_CODEC` keeps ROS
-# messages byte for byte: contract/iort_contract/ros1/serialized.py.
+# messages byte for byte: contract/iort_contract/ros1/message.py.
 CODEC, SERIALIZED_CODEC, PLAIN_CODEC = "steps", "ros1", "columns+zlib+base64"
 # A step has half the characters of its value, and takes as much memory.
 _MOST_BYTES = {
@@ -180,3 +188,81 @@ def unpacked(name: str, column: Any, n: int) -> list[Value]:
         # A whole number is an integer on the wire, whatever its neighbours are.
         return [int(value) if value.is_integer() else value for value in floats]
     return cast("list[Value]", floats)
+
+
+# The times, the values, and each field's name and decimals.
+_MOST_COMMAS = MAX_SAMPLES + MAX_BATCH_VALUES + 2 * MAX_FIELDS
+# Each text value, each name, and the two names of the body itself.
+_MOST_QUOTES = 2 * (MAX_BATCH_VALUES + MAX_FIELDS + 2)
+# Between two commas is a number, of 25 characters at most, perhaps with white space. A number of thousands of
+# digits takes a tenth of a millisecond, and the body may hold a thousand of them.
+_MOST_BETWEEN = 200
+# A body below this size is always cheap.
+_LITTLE = 2 * MAX_BATCH_VALUES
+
+
+def check_effort(body: bytes) -> None:
+    """Refuse JSON that costs more to decode than the largest allowed batch.
+
+    It may still be invalid; the decoder checks that.
+    """
+    if len(body) <= _LITTLE:
+        return
+    if b"\\" in body:
+        body = body.replace(b"\\\\", b"").replace(b'\\"', b"")
+    if body.count(b'"') > _MOST_QUOTES:
+        raise ContractError(f"samples must hold at most {MAX_BATCH_VALUES} values, got too many texts")
+    outside = b"".join(body.split(b'"')[::2])
+    if (
+        outside.count(b"{") > 2
+        or outside.count(b"[") > MAX_FIELDS + 1
+        or outside.count(b",") > _MOST_COMMAS
+        or max(map(len, outside.split(b","))) > _MOST_BETWEEN
+    ):
+        raise ContractError(
+            f"samples must be columns of numbers and texts, of at most {MAX_BATCH_VALUES} values"
+        )
+
+
+# A field's entry in a second: `STATS`, or one value if all four are equal. A column that is not numeric has
+# only its last value.
+Statistics = Union[List[Value], Value]
+_TAKEN = frozenset({TOPIC, SECOND, EXPIRES_S, OMITTED})
+_SUFFIXES = tuple(f"_{statistic}" for statistic in STATS)
+
+
+def packed_second(counts: Mapping[str, Value], fields: Mapping[str, Statistics]) -> dict[str, Statistics]:
+    """The second as stored: its counts, and each field's statistics by its name.
+
+    A single value of a column that is not numeric becomes ``<field>_last``. A field whose name is taken stays
+    flat.
+    """
+    packed: dict[str, Statistics] = dict(fields)
+    taken = _TAKEN.union(counts)
+    flat: dict[str, Statistics] = dict(counts)
+    while odd := [name for name, found in packed.items() if name in taken or type(found) is not list]:
+        for name in odd:
+            flat.update(_flat(name, packed.pop(name)))
+        # A field may have the name of another field's statistic.
+        taken |= flat.keys()
+    return {**flat, **packed}
+
+
+def flat_second(packed: Mapping[str, Any]) -> dict[str, Any]:
+    """The second with ``<field>_min``, ``_mean``, ``_max`` and ``_last``, for any types of values."""
+    flat: dict[str, Any] = {}
+    for name, value in packed.items():
+        flat.update(_flat(name, value) if isinstance(value, list) else {name: value})
+    return flat
+
+
+def _flat(name: str, statistics: Any) -> dict[str, Any]:
+    if not isinstance(statistics, list):
+        return {name + _SUFFIXES[-1]: statistics}
+    values = statistics * len(STATS) if len(statistics) == 1 else statistics
+    return dict(zip(_names(name), values))
+
+
+@lru_cache(maxsize=4096)
+def _names(field: str) -> tuple[str, ...]:
+    return tuple([field + suffix for suffix in _SUFFIXES])

@@ -1,17 +1,105 @@
 """The named shadow of a robot: the settings that the operator desires, and what the agent reports.
 
-The operator, the cloud and the robot write it, so a reader ignores what has another form.
-"""
+The operator, the cloud and the robot write it, so a reader ignores what has another form."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Iterator, Mapping, NamedTuple
+from typing import Any, Iterator, Mapping, NamedTuple, Sequence
 
-from iort_contract.messages.control.driving import DriveLimits, decode_limits, encode_limits
-from iort_contract.messages.control.settings import FIELDS, MOTION_STOPPED, SETTINGS
+from iort_contract.checks import check_field, shown
+from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
+from iort_contract.messages.commands import DriveLimits, decode_limits, encode_limits
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
-from iort_contract.topics import COMMANDS
+from iort_contract.topics import COMMANDS, check_stream
+
+LOG_LEVELS = ("debug", "info", "warning", "error")
+# When the live lane sends at its full rate.
+WATCHED, ALWAYS = "watched", "always"
+FIELDS = "fields"
+MOTION_STOPPED = "motion.stopped"
+FIELD_LIST = "a list of field names; an empty one means all fields"
+
+
+@dataclass(frozen=True)
+class Flag:
+    """True or false."""
+
+    @property
+    def allowed(self) -> str:
+        return "true or false"
+
+    def accepts(self, value: Any) -> bool:
+        return isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number from ``low`` to ``high``."""
+
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def allowed(self) -> str:
+        return f"a number from {self.low:g} to {self.high:g} ({self.unit})"
+
+    def accepts(self, value: Any) -> bool:
+        return (
+            not isinstance(value, bool) and isinstance(value, (int, float)) and self.low <= value <= self.high
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of some names."""
+
+    names: Sequence[str]
+
+    @property
+    def allowed(self) -> str:
+        return f"one of {', '.join(self.names)}"
+
+    def accepts(self, value: Any) -> bool:
+        return value in self.names
+
+
+SETTINGS: Mapping[str, Flag | Number | Choice] = {
+    "record.enabled": Flag(),
+    "live.enabled": Flag(),
+    "live.rate_hz": Number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, "Hz"),
+    "live.when": Choice((WATCHED, ALWAYS)),
+    "ping.rate_hz": Number(0, 20, "Hz"),
+    "log_level": Choice(LOG_LEVELS),
+    # The emergency stop.
+    MOTION_STOPPED: Flag(),
+}
+CHANGEABLE = (*SETTINGS, f"{FIELDS}.<stream>")
+
+
+def check_name(name: str) -> None:
+    """Raise `ContractError` for a setting that no agent knows."""
+    if name.startswith(f"{FIELDS}."):
+        check_stream(name[len(FIELDS) + 1 :])
+    elif name not in SETTINGS:
+        raise ContractError(f"{shown(name)} cannot be changed; must be one of {', '.join(CHANGEABLE)}")
+
+
+def check_setting(name: str, value: Any) -> None:
+    """Raise `ContractError` for a name or value that no agent accepts.
+
+    An agent also refuses a selection of fields that its stream does not have.
+    """
+    check_name(name)
+    if name not in SETTINGS:
+        if not isinstance(value, list):
+            raise ContractError(f"{name} must be {FIELD_LIST}, got {shown(value)}")
+        for field in value:
+            check_field(field)
+    elif not SETTINGS[name].accepts(value):
+        raise ContractError(f"{name} must be {SETTINGS[name].allowed}, got {shown(value)}")
+
 
 REJECTED, DRIVE, MOVES, STOPS = "rejected", "drive", "moves", "stops"
 # Larger than any count, and than any time of a calendar.

@@ -1,7 +1,6 @@
 """The messages to the live page about the analysis: findings, drives, laps, and people's notes beside them.
 
-They are sent as in `page`.
-"""
+They are sent as in `page`."""
 
 from __future__ import annotations
 

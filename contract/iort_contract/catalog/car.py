@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iort_contract.catalog.analysis.parameter import Parameter
+from iort_contract.catalog.entries import Parameter
 
 
 class Known(NamedTuple):

@@ -1,1 +1,0 @@
-"""Encoding of numeric columns in a batch, and limits on the cost of decoding."""

@@ -1,1 +1,0 @@
-"""The analysis' messages: a run, its findings, people's notes beside them, and all of it for the page."""

@@ -1,1 +1,0 @@
-"""What operators and robots tell a robot to do: commands, driving, and settings by the shadow."""
