@@ -72,7 +72,7 @@ class _Account(NamedTuple):
     @property
     def state(self) -> RunState:
         """How the run went on."""
-        if any(one.ended for one in self.streams.values()):
+        if any(stream.ended for stream in self.streams.values()):
             return "ended"
         return "running" if time.time() * 1e6 - self.received_us < _SILENT_US else "cut off"
 
@@ -96,27 +96,26 @@ def runs(
     """
     if streams is None:
         streams = [name for name in inventory.check_recorded(cloud, robot) if name not in OWN_STREAMS]
-    recorded = (Recorded(cloud, robot, name, origin=origin) for name in (ACCOUNT_STREAM, *streams))
-    reports, *readers = map(_Reader, recorded)
+    reports, *readers = (_Reader(cloud, robot, name, origin=origin) for name in (ACCOUNT_STREAM, *streams))
 
     def parts(reader: _Reader) -> list[Part]:
-        return list(islice(reader.parts(start_us, end_us), count + 1))
+        return list(islice(reader.runs(start_us, end_us), count + 1))
 
     with ThreadPoolExecutor(_READERS) as pool:
         wholes = pool.map(_Reader.whole, readers)
-        reported, *found = pool.map(parts, [reports, *readers])
-        accounts = {one.part.last.boot: one for one in pool.map(reports.account, reversed(reported))}
+        reported, *recorded = pool.map(parts, [reports, *readers])
+        accounts = {last.part.last.boot: last for last in pool.map(reports.account, reversed(reported))}
     extents = {stream: whole.extent for stream, whole in zip(streams, wholes, strict=True) if whole}
-    made = _by_run(dict(zip(streams, found, strict=True)), accounts)
-    made.sort(key=lambda run: run["to_us"], reverse=True)
-    goes_on = None if end_us is None else reports.boot_from(end_us)
-    for i, run in enumerate(made):
-        if run["run"] == goes_on:
-            # The report of its end is not read.
+    entries = _by_run(dict(zip(streams, recorded, strict=True)), accounts)
+    entries.sort(key=lambda run: run["to_us"], reverse=True)
+    next_batch = None if end_us is None else reports.after(end_us)
+    for i, run in enumerate(entries):
+        if next_batch is not None and run["run"] == next_batch.boot:
+            # It goes on, and the report of its end is not read.
             run["state"] = "unknown"
         elif i and run["state"] == "running":
             run["state"] = "cut off"
-    return {"runs": made[:count], "older": len(made) > count, "streams": extents}
+    return {"runs": entries[:count], "older": len(entries) > count, "streams": extents}
 
 
 @dataclass(frozen=True)
@@ -159,20 +158,29 @@ def overview(cloud: Cloud, robot: str, *, origin: Origin | None = None) -> list[
     return [described(stream) for stream in streams if stream in answer["streams"]]
 
 
-def _by_run(found: dict[str, list[Part]], accounts: dict[str, _Account]) -> list[Run]:
+def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Account]) -> list[Run]:
     """The runs with what each recorded of every stream, in no order."""
-    made: dict[str, Run] = {}
-    for boot, one in accounts.items():
+    entries = {
+        boot: _run(boot, account.part, account)
+        for boot, account in accounts.items()
         # A run with samples is shown for its samples' times, which may be those of a recording.
-        if not any(stream.stored for stream in one.streams.values()):
-            made[boot] = _run(boot, one.part, one)
-    for stream, parts in found.items():
+        if not any(stream.stored for stream in account.streams.values())
+    }
+    for stream, parts in recorded.items():
         for part in parts:
             boot = part.last.boot
-            run = made.setdefault(boot, _run(boot, part, accounts.get(boot)))
-            _widen(run, part)
-            run["streams"].setdefault(stream, _run_part(stream, part, accounts.get(boot)))
-    return list(made.values())
+            reported = accounts.get(boot)
+            run = entries.setdefault(boot, _run(boot, part, reported))
+            run["from_us"] = min(run["from_us"], part.first.t_us)
+            run["to_us"] = max(run["to_us"], part.to_us)
+            counted = None if reported is None else reported.streams.get(stream)
+            entry: RunPart = {
+                **part.extent,
+                "batches": part.last.seq - part.first.seq + 1,
+                "samples": None if counted is None else counted.stored,
+            }
+            run["streams"].setdefault(stream, entry)
+    return list(entries.values())
 
 
 def _run(boot: str, part: Part, reported: _Account | None) -> Run:
@@ -186,43 +194,21 @@ def _run(boot: str, part: Part, reported: _Account | None) -> Run:
     }
 
 
-def _run_part(stream: str, part: Part, reported: _Account | None) -> RunPart:
-    counted = None if reported is None else reported.streams.get(stream)
-    return {
-        **part.extent,
-        "batches": part.last.seq - part.first.seq + 1,
-        "samples": None if counted is None else counted.stored,
-    }
-
-
-def _widen(extent: Extent, part: Part) -> None:
-    extent["from_us"] = min(extent["from_us"], part.first.t_us)
-    extent["to_us"] = max(extent["to_us"], part.to_us)
-
-
-class _Reader:
+class _Reader(Recorded):
     """Reads single batches of a stream."""
-
-    def __init__(self, recorded: Recorded) -> None:
-        self._recorded = recorded
 
     def whole(self) -> Part | None:
         """All that is stored of the stream; None if nothing is."""
-        first, last = self._recorded.after(None), self._recorded.before(None)
+        first, last = self.after(None), self.before(None)
         return None if first is None or last is None else Part(first, last, self._end_us(last))
 
-    def parts(self, start_us: int | None, end_us: int | None) -> Iterator[Part]:
+    def runs(self, start_us: int | None, end_us: int | None) -> Iterator[Part]:
         """What each run recorded in a range, newest first; the first one may begin before the range."""
-        last = self._recorded.before(end_us)
+        last = self.before(end_us)
         while last is not None and (start_us is None or last.t_us + MAX_BATCH_SPAN_US > start_us):
             first, before = self._first_of(last)
             yield Part(first, last, self._end_us(last))
             last = before
-
-    def boot_from(self, t_us: int) -> str | None:
-        """The run of the first batch from a time on."""
-        found = self._recorded.after(t_us)
-        return None if found is None else found.boot
 
     def account(self, part: Part) -> _Account:
         """The last report of a run."""
@@ -231,7 +217,7 @@ class _Reader:
         received_us = 0
         # An agent that does not batch sends a report in several messages.
         keys = starting_between(part.last.t_us - MAX_BATCH_SPAN_US, part.last.t_us)
-        for items in self._recorded.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
+        for items in self.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
             for item in items:
                 with suppress(ContractError):
                     batch = decode_batch(plain(item))
@@ -239,12 +225,12 @@ class _Reader:
                         continue
                     received_us = (whole(item, RECEIVED_MS) or 0) * 1000
                     for i in range(len(batch.times_us)):
-                        one = account({name: column[i] for name, column in batch.columns.items()})
-                        if isinstance(one, StreamAccount):
-                            streams[one.stream] = one
+                        row = account({name: column[i] for name, column in batch.columns.items()})
+                        if isinstance(row, StreamAccount):
+                            streams[row.stream] = row
                         else:
-                            losses[one.source] = sum(lost(one.counts).values())
-        refused = sum(one.refused for one in streams.values())
+                            losses[row.source] = sum(lost(row.counts).values())
+        refused = sum(stream.refused for stream in streams.values())
         return _Account(part, streams, refused + sum(losses.values()), received_us)
 
     def _first_of(self, last: BatchId) -> tuple[BatchId, BatchId | None]:
@@ -256,23 +242,23 @@ class _Reader:
                 at_us, jump_us = known.t_us - jump_us, 2 * jump_us
             else:
                 at_us = (other_us + known.t_us + 1) // 2
-            found = self._recorded.after(max(0, at_us)) or known
-            if found.boot != last.boot:
-                other_us = found.t_us
+            batch = self.after(max(0, at_us)) or known
+            if batch.boot != last.boot:
+                other_us = batch.t_us
                 continue
-            before = self._recorded.before(found.t_us)
+            before = self.before(batch.t_us)
             if before is None or before.boot != last.boot:
-                return found, before
+                return batch, before
             known = before
-        return known, self._recorded.before(known.t_us)
+        return known, self.before(known.t_us)
 
     def _end_us(self, last: BatchId) -> int:
-        times_us = self._recorded.block(last, lambda _name: False).times_us
+        times_us = self.block(last, lambda _name: False).times_us
         return int(times_us[-1] if len(times_us) else last.t_us) + 1
 
 
 class RunLaps(NamedTuple):
-    """What was found in a run, or in the part of it that a range has."""
+    """The laps of a run, or in the part of it that a range has."""
 
     run: str
     start_us: int
@@ -290,8 +276,8 @@ def laps_of_runs(
     progress: PageProgress | None = None,
 ) -> Iterator[RunLaps]:
     """The laps of the newest ``count`` runs in a range, the oldest first."""
-    found = runs(cloud, robot, start_us=start_us, end_us=end_us, count=count)["runs"]
-    for run in reversed(found):
+    newest = runs(cloud, robot, start_us=start_us, end_us=end_us, count=count)["runs"]
+    for run in reversed(newest):
         first_us = max(run["from_us"], start_us or 0)
         last_us = run["to_us"] if end_us is None else min(run["to_us"], end_us)
         mined = laps_within(cloud, robot, first_us, last_us, progress=progress)
