@@ -6,7 +6,7 @@ import re
 import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import NamedTuple
 
 from iort_contract.catalog.car import GROUPS
@@ -28,12 +28,12 @@ def findings(
     most: int | None = None,
 ) -> list[Finding]:
     """Findings about drives that begin in a range, the newest first; of all robots without one."""
-    found = [
-        one
+    newest = [
+        finding
         for name in robots_of(cloud, robot)
-        for one in islice(findings_table(cloud).findings(name, start_us, end_us), most)
+        for finding in islice(findings_table(cloud).findings(name, start_us, end_us), most)
     ]
-    return sorted(found, key=lambda one: one.id, reverse=True)[:most]
+    return sorted(newest, key=lambda finding: finding.id, reverse=True)[:most]
 
 
 def drives(
@@ -45,12 +45,12 @@ def drives(
     most: int | None = None,
 ) -> list[AnalysedDrive]:
     """Analysed drives that begin in a range, the newest first; of all robots without one."""
-    found = [
-        one
+    newest = [
+        drive
         for name in robots_of(cloud, robot)
-        for one in findings_table(cloud).drives(name, start_us, end_us, most=most)
+        for drive in findings_table(cloud).drives(name, start_us, end_us, most=most)
     ]
-    return sorted(found, key=lambda one: str(one.drive), reverse=True)[:most]
+    return sorted(newest, key=lambda drive: str(drive.drive), reverse=True)[:most]
 
 
 def findings_table(cloud: Cloud) -> FindingsTable:
@@ -75,12 +75,12 @@ def notes(
     most: int | None = None,
 ) -> list[Note]:
     """Notes about a range, the newest first; of all robots without one."""
-    found = [
+    newest = [
         note
         for name in robots_of(cloud, robot)
         for note in findings_table(cloud).notes(name, start_us, end_us, most=most)
     ]
-    return sorted(found, key=lambda note: note.id, reverse=True)[:most]
+    return sorted(newest, key=lambda note: note.id, reverse=True)[:most]
 
 
 def write_note(cloud: Cloud, robot: str, text: str, *, by: str, t_us: int | None = None) -> Note:
@@ -135,7 +135,7 @@ def calibration(drives: Sequence[AnalysedDrive]) -> Calibration:
 
     found: dict[str, Calibrated] = {}
     missing: dict[str, str] = {}
-    for parameter in (one for group in GROUPS.values() for one in group):
+    for parameter in chain.from_iterable(GROUPS.values()):
         name = parameter.name
         known = [drive.estimates[name] for drive in drives if name in drive.estimates]
         if known:

@@ -228,7 +228,7 @@ def _within(block: Block, selection: Selection) -> Block:
 
 def _without_absent(block: Block, counts: Counter[str]) -> Block:
     """The block with null for values of sensors that are not fitted, which ``counts`` counts by field."""
-    found: dict[str, Column] = {}
+    changed: dict[str, Column] = {}
     for name in block.columns.keys() & ABSENT_FROM.keys():
         column = block.columns[name]
         numbers = column.dtype.kind == "f"
@@ -237,10 +237,10 @@ def _without_absent(block: Block, counts: Counter[str]) -> Block:
         else:
             mask = np.array([absent(name, value) for value in column.tolist()], dtype=np.bool_)
         if mask.any():
-            found[name] = column.copy()
-            found[name][mask] = np.nan if numbers else None
+            changed[name] = column.copy()
+            changed[name][mask] = np.nan if numbers else None
             counts[name] += int(mask.sum())
-    return Block(block.times_us, {**block.columns, **found}) if found else block
+    return Block(block.times_us, {**block.columns, **changed}) if changed else block
 
 
 def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:

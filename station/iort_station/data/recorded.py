@@ -50,7 +50,7 @@ from iort_contract.tables import (
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection, derive, holds
-from iort_station.errors import StationError, unknown
+from iort_station.errors import unknown
 from iort_station.fleet import registry
 
 
@@ -92,10 +92,8 @@ def archive_of(cloud: Cloud, topic: str) -> Archive:
 
 
 def stores(cloud: Cloud) -> Stores:
-    """Where a deployment's recordings are. One from before the archive has no table of it."""
-    manifest = None
-    with suppress(StationError):
-        manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
+    """Where a deployment's recordings are."""
+    manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
     return Stores(
         telemetry_table(cloud), manifest, lambda: (cloud.client("s3"), cloud.output("storage", "FilesBucket"))
     )
@@ -108,13 +106,13 @@ def last_reports(cloud: Cloud, robot: str) -> Iterator[Item]:
     last: dict[str, BatchId] = {}
     for item in recorded.headers(starting_between(None, None)):
         with suppress(ContractError):
-            one = batch_id(item[BATCH]["S"])
+            report = batch_id(item[BATCH]["S"])
             # Its number decides, since the car's clock may be set back.
-            if one.boot not in last or last[one.boot].seq <= one.seq:
-                last[one.boot] = one
-    for one in last.values():
+            if report.boot not in last or last[report.boot].seq <= report.seq:
+                last[report.boot] = report
+    for report in last.values():
         # An agent that does not batch sends a report in several messages.
-        keys = starting_between(one.t_us - MAX_BATCH_SPAN_US, one.t_us)
+        keys = starting_between(report.t_us - MAX_BATCH_SPAN_US, report.t_us)
         for items in recorded.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
             yield from items
 

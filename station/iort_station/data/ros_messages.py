@@ -37,13 +37,13 @@ _ROS2_TIMES = re.compile(r"\bbuiltin_interfaces/(?:msg/)?(Time|Duration)\b")
 def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, MessageType]]:
     """The types that a robot has declared for a stream's messages, by id, and the time of the first
     declaration."""
-    found: dict[str, tuple[int, MessageType]] = {}
+    declared_types: dict[str, tuple[int, MessageType]] = {}
     for t_us, kind in inventory.types_of(cloud, robot):
         if kind.stream == stream:
-            first_us, before = found.get(kind.id, (t_us, kind))
+            first_us, before = declared_types.get(kind.id, (t_us, kind))
             # Some publishers send no definition.
-            found[kind.id] = first_us, before if before.definition.strip() else kind
-    return found
+            declared_types[kind.id] = first_us, before if before.definition.strip() else kind
+    return declared_types
 
 
 def made_of(stream: str, columns: Mapping[str, Any]) -> MessageType:
