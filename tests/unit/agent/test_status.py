@@ -91,9 +91,9 @@ def test_rates_and_silence() -> None:
     clock = ManualClock()
     rates, counts = Rates(clock), {"vesc": StreamCounts(samples=0)}
     counts["vesc"].samples = 50
-    clock.advance(1)
+    clock.advance(1.5)
     rates.update(counts)
-    assert (rates.per_s["vesc"], rates.silent_s("vesc")) == (50, 0)
+    assert (rates.per_s["vesc"], rates.silent_s("vesc")) == (33.33, 0)
     for _ in range(7):
         clock.advance(1)
         rates.update(counts)

@@ -32,6 +32,7 @@ FOLDERS = (
     "stacks",
     "analysis",
     "station",
+    "testkit",
     "tests",
 )
 ADDED = ("A field", "A derived field", "A rule", "A function")
