@@ -15,7 +15,7 @@ setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py
 
 demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong LIVE=pubnub REPORT=report.json PORT=8080
-	@$(BIN)/python -m local.demo.run $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
+	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
 		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT)) \
 		$(if $(LIVE),--live $(LIVE))
 
@@ -27,13 +27,13 @@ up: setup ## run a cloud of your own that is kept, until Ctrl-C: STATE=folder LI
 	@exec $(BIN)/python -m local.up.run $(UP_OPTIONS)
 
 down: ## stop the cloud of `make up`, which is kept: STATE=folder
-	@$(BIN)/python -m local.up.down $(STATE_OPTION)
+	@$(BIN)/python -m local.up.commands down $(STATE_OPTION)
 
 up-service: setup ## let systemd run `make up`, also after a reboot; options as for up, REMOVE=1
 	@$(BIN)/python -m local.up.service $(UP_OPTIONS) $(if $(REMOVE),--remove)
 
 up-password: setup ## set the password of the page that PAGE= opens: STATE=folder
-	@$(BIN)/python -m local.up.password $(STATE_OPTION)
+	@$(BIN)/python -m local.up.commands password $(STATE_OPTION)
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder

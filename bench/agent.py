@@ -34,7 +34,7 @@ from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
-from local.errors import LocalError
+from local.processes import LocalError
 from testkit import machine
 from testkit.command import Table, made, parser, write
 from testkit.ros import PYTHONPATH, RosError, RosGraph, python_with_rospy

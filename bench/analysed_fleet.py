@@ -33,7 +33,7 @@ from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.operations import analysis
 from local.cloud import EmbeddedCloud
-from local.errors import LocalError
+from local.processes import LocalError
 from testkit import machine
 from testkit.command import made, parser, progress, steps, write
 from testkit.waiting import InstrumentError

@@ -23,7 +23,7 @@ from rich.console import Console
 from bench.load.fleet.figures import Fleet, limits, table
 from bench.load.fleet.run import measure
 from local.cloud import EmbeddedCloud
-from local.errors import LocalError
+from local.processes import LocalError
 from testkit.command import made, parser, steps, write
 from testkit.waiting import InstrumentError
 

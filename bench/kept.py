@@ -19,7 +19,7 @@ from rich.console import Console
 
 from bench.keeping import kills, report, week
 from iort_station.errors import StationError
-from local.errors import LocalError
+from local.processes import LocalError
 from testkit import machine
 from testkit.command import made, parser, steps, wound_up, write
 from testkit.waiting import InstrumentError

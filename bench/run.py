@@ -28,7 +28,7 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.errors import StationError
-from local.errors import LocalError
+from local.processes import LocalError
 from testkit import ROOT, machine
 from testkit.command import confirm, wound_up
 from testkit.target import AWS, EMBEDDED, Target, open_target

@@ -30,16 +30,14 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.kept import LEDGER, announced
 from iort_station.page.page import PubNubKeys, store_keys
+from local import deployment
 from local.deployment import ROOT, deploy
-from local.emulator import first_calls, patched
-from local.errors import EmulatorError, LocalError
-from local.keeping.ledger import settle
+from local.emulator import package
 from local.network.certificates import Authority, ServerCertificate
-from local.network.file_door import FileDoor
-from local.network.listen import Listen
-from local.network.relay import Relay
-from local.processes import Child
-from local.pubnub.standin import PubNubStandIn
+from local.network.servers import FileDoor, Listen, Relay
+from local.persistence.ledger import settle
+from local.processes import Child, EmulatorError, LocalError
+from local.pubnub import PubNubStandIn
 from local.state import StateFolder
 
 FOLDER = ROOT / EMBEDDED.parent
@@ -151,9 +149,9 @@ class EmbeddedCloud:
         if self.live == PUBNUB:
             store_keys(self.cloud, self.keys)
         self._progress("functions")
-        first_calls.warm_up(self.cloud, self.live)
+        deployment.warm_up(self.cloud, self.live)
         if self.kept:
-            first_calls.end_sessions(self.cloud, began_ms)
+            deployment.end_sessions(self.cloud, began_ms)
         if self.listen:
             door = FileDoor(
                 self.listen.address,
@@ -258,7 +256,7 @@ class EmbeddedCloud:
             # small objects, and it grows by 0.4 MB in each hour of `make bench-kept`.
             "MALLOC_MMAP_THRESHOLD_": "65536",
             "MALLOC_TRIM_THRESHOLD_": "131072",
-            "PYTHONPATH": str(patched.folder()),
+            "PYTHONPATH": str(package.folder()),
         }
         log = self.folder / "emulator.log"
         if self.kept and log.exists():

@@ -1,4 +1,4 @@
-"""Child processes that end with us, and whose log says why they stopped."""
+"""Child processes that end with us and whose log says why they stopped; the embedded cloud's errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from local.errors import LocalError
+# The errors that the embedded cloud raises on purpose.
+
+
+class LocalError(Exception):
+    """The embedded cloud cannot do what was asked. The text says why and what to do."""
+
+
+class EmulatorError(LocalError):
+    """The emulator ended, and nobody has stopped it; errors of its clients come from this."""
+
 
 _PR_SET_PDEATHSIG = 1
 _TERMINATE_S = 10.0

@@ -102,7 +102,7 @@ class Ingest(PlatformStack):
 
 
 # The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a defect that
-# nobody would see, so synth refuses it. The lists are what the pinned ministack and local/gaps/ implement;
+# nobody would see, so synth refuses it. The lists are what the pinned ministack and local/emulator/fixes do;
 # tests/stacks/test_portable.py holds them against both.
 
 RULE_ACTIONS = frozenset({"lambda", "republish", "dynamoDBv2", "sns", "sqs"})

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from local.emulator import patched
+from local.emulator import package
 from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
 # The duration of an example depends only on the machine.
@@ -37,7 +37,7 @@ GROUPS = {
     "tests/local/faults/": "cloud of the faults",
     "tests/ros/mixed/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
-    "tests/local/gaps/": "cloud of the robots",
+    "tests/local/emulator/": "cloud of the robots",
     "tests/local/network/test_network.py": "kept cloud",
     "tests/local/network/": "cloud of the robots",
     "tests/local/identity/": "cloud of the robots",
@@ -78,7 +78,7 @@ def pytest_configure() -> None:
     # Threads of PubNub's SDK outlive their client, and would log into later tests.
     logging.getLogger("pubnub").propagate = False
     if find_spec("ministack"):
-        patched.use()
+        package.use()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -17,8 +17,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files, identity, robots
 from local.deployment import ROOT
-from local.errors import LocalError
-from local.processes import run
+from local.processes import LocalError, run
 from stacks.settings import DEV
 from testkit.waiting import InstrumentError, until
 from verify.preflight.deployed import STACKS, stack

@@ -22,7 +22,8 @@ _INTRODUCTION = """\
 
 Each row is a behaviour of AWS that the code relies on and that the embedded cloud imitates. *Documented*
 names AWS' page. *Assumed* means that AWS does not document it. *Measured* means that `make verify-aws` has
-seen it in an account; tests/local/gaps/test_verify.py then expects the same answer from the embedded cloud.
+seen it in an account; tests/local/emulator/test_verify.py then expects the same answer from the embedded
+cloud.
 How to ask your own account: [deploy](../how-to/deploy.md#ask-your-account). `python -m verify.page`
 writes the first table from verify/questions/; the second is written by hand.
 """

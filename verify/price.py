@@ -9,7 +9,7 @@ from iort_station.cost.prices import MONTH_HOURS, PRICES
 
 # A run takes about an hour (nobody has measured it); what is metered by the hour is counted for two.
 _HOURS = 2.0
-# More than all questions together send and invoke (tests/local/gaps/test_verify.py counts them).
+# More than all questions together send and invoke (tests/local/emulator/test_verify.py counts them).
 MESSAGES, INVOCATIONS, WRITES = 5_000, 2_000, 5_000
 _ALARMS, _METRICS, _DASHBOARDS = 40, 200, 3
 _GB_SECONDS = INVOCATIONS * 0.5 * 1.0

@@ -28,7 +28,7 @@ from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF
 from iort_station.errors import StationError
 from local.deployment import ROOT
-from local.errors import LocalError
+from local.processes import LocalError
 from stacks.settings import Settings
 from testkit import machine
 from testkit.command import confirm, wound_up

@@ -22,9 +22,9 @@ from rich.console import Console
 
 from bench.load.course import LEASE_S, ROBOT, Course
 from bench.load.tries import Heard, Try
-from local.errors import LocalError
 from local.figures import Spread
 from local.network.proxy import FREEZE, PASS
+from local.processes import LocalError
 from testkit.chromium import Tabs
 from testkit.command import Table, made, parser, write
 from testkit.ros import python_with_rospy

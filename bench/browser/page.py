@@ -24,7 +24,7 @@ from rich.console import Console
 from bench.load.cars import RATE_HZ
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit import chromium, machine
 from testkit.command import Table, made, parser, write
 from testkit.waiting import InstrumentError

@@ -29,8 +29,8 @@ from iort_station.page.answers import actions, answers
 from iort_station.page.requests import Handler
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.errors import LocalError
 from local.figures import Spread
+from local.processes import LocalError
 from testkit import chromium
 from testkit.car import AgentProcess
 from testkit.command import Table, made, parser, write

@@ -1,4 +1,4 @@
-"""The emulator's process: ministack with its gaps closed, configured by ministack's own environment.
+"""The emulator's process: ministack with its fixes, configured by ministack's own environment.
 
 The file `IORT_LEDGER` keeps its state, as safely as `IORT_LEDGER_SYNC` says (off, normal or full). Without
 them the state ends with the process.
@@ -17,12 +17,12 @@ from typing import NoReturn, cast
 from ministack import app
 from ministack.services import iot
 
-from local import gaps
-from local.gaps.functions.async_invocations import AsyncInvocations
-from local.gaps.metrics import alarm_timer
-from local.keeping import kept, presence, streams
-from local.keeping.gate import Gate
-from local.keeping.ledger import Ledger, LedgerError, Sync
+from local.emulator import fixes
+from local.emulator.fixes import alarms
+from local.emulator.fixes.invocations import AsyncInvocations
+from local.persistence import install, streams
+from local.persistence.gate import Gate
+from local.persistence.ledger import Ledger, LedgerError, Sync
 
 
 def main() -> None:
@@ -35,15 +35,15 @@ def main() -> None:
         sys.exit(f"{error}; `iort restore` brings a backup back")
     # Nothing may be acknowledged any more.
     ledger.on_broken = partial(_end, status=os.EX_IOERR)
-    # Before the gaps, which read streams.
+    # Before the fixes, which read streams.
     streams.install(ledger)
-    gaps.install()
+    fixes.install()
     if path:
-        kept.install(ledger, AsyncInvocations().queue)
-        presence.install()
+        install.install(ledger, AsyncInvocations().queue)
+        install.number_connections()
     Gate(ledger).install()
     iot.mtls_start = _listening(iot.mtls_start)
-    alarm_timer.start(os.environ["MINISTACK_REGION"])
+    alarms.start(os.environ["MINISTACK_REGION"])
     app.main()
 
 

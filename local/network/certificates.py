@@ -16,7 +16,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from iort_station.output import write_private
-from local.errors import LocalError
+from local.processes import LocalError
 
 # A server's certificate in the network, and what is left of it when it gets a new one.
 LASTS_S = 90 * 86_400.0

@@ -1,7 +1,6 @@
 """`make up`: the project's stacks in an embedded cloud that is kept, until Ctrl-C or `make down`.
 
-python -m local.up.run --state ~/.local/share/iort/cloud --listen 192.168.1.10,iort.lab
-"""
+python -m local.up.run --state ~/.local/share/iort/cloud --listen 192.168.1.10,iort.lab"""
 
 from __future__ import annotations
 
@@ -10,6 +9,8 @@ import os
 import platform
 import resource
 import signal
+import socket
+import ssl
 import sys
 import threading
 import time
@@ -17,23 +18,101 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.metadata import version
+from types import TracebackType
 from typing import Any, NoReturn
 
 from botocore.exceptions import BotoCoreError, ClientError
+from typing_extensions import Self
 
 from iort_contract.cloud import IOT
 from iort_station import kept
-from iort_station.cloud import EMBEDDED_VARIABLE
+from iort_station.cloud import EMBEDDED_VARIABLE, Cloud
 from iort_station.errors import StationError
+from iort_station.fleet import registry
 from iort_station.output import write_private
+from iort_station.page import answers as control
+from iort_station.page.answers import actions, answers
+from iort_station.page.history import downloads
+from iort_station.page.motion import prompt, reaching
+from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.errors import EmulatorError, LocalError
-from local.network.listen import Listen, is_ipv6
-from local.settings import FILE, NO, Settings
-from local.state import VERSION, StateFolder
-from local.up import notify, options
-from local.up.login import first_password
-from local.up.pages import Pages
+from local.network.servers import Listen, is_ipv6
+from local.processes import EmulatorError, LocalError
+from local.state import FILE, NO, VERSION, Settings, StateFolder
+from local.up import commands
+from local.up.network_page import SOCKET, NetworkPage, Password, first_password
+
+# systemd's notifications: whoever waits for the service knows when it is ready (sd_notify(3)).
+
+
+def tell(state: str) -> None:
+    """Tell systemd a state, such as READY=1; without systemd nothing happens."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        # An @ stands for the abstract namespace.
+        systemd.connect(address.replace("@", "\0", 1) if address.startswith("@") else address)
+        systemd.sendall(state.encode())
+
+
+# The pages of a kept cloud: one for this machine, and with ``PAGE=`` one for a network.
+
+
+class Pages:
+    """Serves within a ``with`` block. ``new_password`` is set if the network's page has got its first one."""
+
+    def __init__(self, embedded: EmbeddedCloud, listen: Listen | None) -> None:
+        self._embedded, self._listen = embedded, listen
+        self._exit = ExitStack()
+        self.new_password: str | None = None
+        self.here: PageServer
+        self.network: NetworkPage | None = None
+
+    def __enter__(self) -> Self:
+        embedded, listen = self._embedded, self._listen
+        with ExitStack() as stack:
+            port = embedded.state.port("page", embedded.host)
+            self.here = PageServer(port=port, invitations=kept.pages(), **shown(embedded.cloud))
+            embedded.state.serve(stack, "page", self.here)
+            if listen is not None:
+                port = embedded.state.port("network page", listen.address)
+                password = Password(embedded.folder)
+                self.new_password = password.make()
+                # The broker is at the page's own address, behind the same login.
+                socket = f"wss://{listen.at(port)}{SOCKET}"
+                self.network = NetworkPage(
+                    listen,
+                    port,
+                    password=password,
+                    gateway=embedded.cloud.endpoint_url or "",
+                    trusts=ssl.create_default_context(cafile=embedded.cloud.ca_bundle),
+                    context=embedded.certificate("page", listen.hosts).context(),
+                    **shown(replace(embedded.cloud, websocket=socket)),
+                )
+                embedded.state.serve(stack, "network page", self.network)
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.close()
+
+
+def shown(cloud: Cloud) -> dict[str, Any]:
+    """What a page shows and does, as `iort dashboard` on this machine."""
+    return {
+        "namespace": cloud.namespace,
+        **reaching(cloud, IOT),
+        # Robots come while it runs.
+        "vehicles": lambda: registry.vehicles(prompt(cloud)),
+        "answers": answers(cloud),
+        "downloads": downloads(cloud),
+        "open_actions": actions(cloud),
+        "actions": control.keyed_actions(cloud),
+    }
+
 
 _LISTEN, _PAGE = "LISTEN", "PAGE"
 _HOSTS = ("listen", "page")
@@ -46,7 +125,7 @@ _MOST_LOG_BYTES = 20 * 1024 * 1024
 
 def main() -> None:
     """Run until SIGINT, SIGTERM or SIGHUP. The exit status is 0 then, and 1 if the cloud cannot run."""
-    parser = options.parser("up", "Run the stacks in a cloud of your own, which is kept.", remembered=True)
+    parser = commands.parser("up", "Run the stacks in a cloud of your own, which is kept.", remembered=True)
     given, stopped = parser.parse_args(), threading.Event()
 
     def stop(_signal: int, _frame: object) -> NoReturn:
@@ -120,7 +199,7 @@ class _Kept:
             self._write(embedded, page)
             embedded.show_page(pages.here.url)
             _say(f"\n{self._told(embedded, pages)}\n")
-            notify.tell("READY=1")
+            tell("READY=1")
             self._watch(embedded, page)
 
     def _watch(self, embedded: EmbeddedCloud, page: Listen | None) -> None:

@@ -10,11 +10,10 @@ from pathlib import Path
 from string import Template
 
 from local.deployment import ROOT
-from local.errors import LocalError
-from local.settings import NO
-from local.state import StateFolder
-from local.up import options
-from local.up.login import Password, first_password
+from local.processes import LocalError
+from local.state import NO, StateFolder
+from local.up import commands
+from local.up.network_page import Password, first_password
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -47,7 +46,7 @@ WantedBy=$wanted
 
 def main() -> None:
     """Write the unit, and start it: a service of the machine for root, and of the user for others."""
-    parser = options.parser(
+    parser = commands.parser(
         "up-service", "Run `make up` as a service of systemd.", remembered=True, more="[REMOVE=1]"
     )
     parser.add_argument(
@@ -56,7 +55,7 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="print the unit, and change nothing")
     given = parser.parse_args()
     of_machine = os.geteuid() == 0
-    text = unit(options.flags(given), of_machine=of_machine)
+    text = unit(commands.flags(given), of_machine=of_machine)
     try:
         if given.print:
             _say(text)

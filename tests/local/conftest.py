@@ -24,7 +24,7 @@ from iort_station.fleet import robots
 from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from testkit.waiting import until
 from tests.local.pubnub.pubnub_sdk import sdk

@@ -15,7 +15,7 @@ from typing import Any
 from cfnlint.schema.manager import PROVIDER_SCHEMA_MANAGER
 
 from local.deployment import ROOT, sources
-from local.made_once import kept
+from local.emulator.package import artifact
 
 _HASH = re.compile(r"[0-9A-F]{8}$")
 
@@ -59,7 +59,9 @@ def synthesize(**given: Any) -> Synthesized:
 @cache
 def _synthesized(settings: str) -> Synthesized:
     folder = ROOT / "build" / "templates" / hashlib.sha256(settings.encode()).hexdigest()[:8]
-    made = kept(folder, settings, [*sources(ROOT), Path(__file__)], lambda into: _synthesize(into, settings))
+    made = artifact(
+        folder, settings, [*sources(ROOT), Path(__file__)], lambda into: _synthesize(into, settings)
+    )
     facts = json.loads((made / "facts.json").read_text())
     namespace = facts["namespace"]
     templates = {

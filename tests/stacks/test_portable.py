@@ -147,15 +147,15 @@ def test_cdk_synth_fails_with_the_reason(refused, tmp_path):
 
 @pytest.fixture(scope="module")
 def embedded():
-    """The features of the pinned ministack with its gaps closed, read in a separate process, because
+    """The features of the pinned ministack with its fixes, read in a separate process, because
     the import changes it."""
     program = """
 import json
-from local import gaps
-from local.emulator import patched
-patched.use()
+from local.emulator import fixes
+from local.emulator import package
+package.use()
 from ministack.services import iot
-gaps.install()
+fixes.install()
 ours = ["${topic()}", "a/${topic(3)}/b", "${ topic( 2 ) }"]
 topics = [*ours, "${clientid()}", "${id}", "${topic(1)}/${newuuid()}"]
 print(json.dumps({

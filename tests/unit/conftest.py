@@ -66,7 +66,7 @@ def tables():
     One stack is synthesized, not the app, and only if its sources have changed since the last time.
     """
     from local.deployment import ROOT, sources
-    from local.made_once import kept
+    from local.emulator.package import artifact
 
     def synthesize(folder):
         from aws_cdk import App, assertions
@@ -79,7 +79,7 @@ def tables():
         (folder / "tables.json").write_text(json.dumps(template.find_resources("AWS::DynamoDB::Table")))
 
     found = json.loads(
-        (kept(ROOT / "build" / "tables", "tables", sources(ROOT), synthesize) / "tables.json").read_text()
+        (artifact(ROOT / "build" / "tables", "tables", sources(ROOT), synthesize) / "tables.json").read_text()
     )
     return {logical: resource["Properties"] for logical, resource in found.items()}
 

@@ -16,7 +16,7 @@ from iort_contract.messages.live import LiveSample, live_update
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
 GAIN = F1TENTH.speed_to_erpm_gain

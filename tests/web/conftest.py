@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from iort_station.page.server import PageServer
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from tests.web.cars import GAIN, PUBLISH_KEY, SUBSCRIBE_KEY, Car
 

@@ -145,7 +145,7 @@ if TYPE_CHECKING:
 
     from iort_contract.messages.insights import Extent
     from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 
 class View(NamedTuple):

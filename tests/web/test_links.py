@@ -16,7 +16,7 @@ from iort_contract.messages.live import VIEW_LEASE_MS, VIEW_RENEW_S
 from iort_station.page.background import BackgroundServer
 from iort_station.page.server import PageServer
 from local.network.certificates import Authority
-from local.network.relay import Relay
+from local.network.servers import Relay
 from testkit.waiting import GUARD_S, until
 from tests.browser import show
 from tests.web.cars import SUBSCRIBE_KEY, Car
@@ -131,7 +131,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 HIDE = """(hidden) => {
   Object.defineProperty(document, "hidden", { value: hidden, configurable: true });

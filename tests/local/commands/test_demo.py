@@ -24,7 +24,7 @@ TIMEOUT_S = 400
 
 def demo(folder: Path, *arguments: str, terminal: int | None = None) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "local.demo.run", "--folder", str(folder), *arguments],
+        [sys.executable, "-m", "local.demo", "--folder", str(folder), *arguments],
         cwd=ROOT,
         stdin=subprocess.DEVNULL if terminal is None else terminal,
         stdout=subprocess.PIPE if terminal is None else terminal,

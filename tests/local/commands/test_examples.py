@@ -16,7 +16,7 @@ from iort_agent.sources.sim.driver import HALL
 from iort_contract.messages.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
-from local.demo.run import DOWNLINK
+from local.demo import DOWNLINK
 from testkit.waiting import until
 from tests.local.conftest import recorded
 from tests.local.robots.test_shadow import driving

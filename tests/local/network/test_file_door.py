@@ -15,9 +15,9 @@ import pytest
 from botocore.config import Config
 
 from iort_contract.messages.files import PART_BYTES
-from local.network import file_door
+from local.network import servers
 from local.network.certificates import Authority, ServerCertificate
-from local.network.file_door import FileDoor
+from local.network.servers import FileDoor
 from testkit.waiting import GUARD_S, until
 
 HOST = "127.0.0.2"
@@ -138,7 +138,7 @@ def test_a_header_that_no_signature_covers_copies_nothing(send, presigned, embed
 
 @pytest.mark.parametrize("bound", ["UPLOAD_URL_S", "_PART_S"])
 def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, monkeypatch, bound):
-    monkeypatch.setattr(file_door, bound, 0.3)
+    monkeypatch.setattr(servers, bound, 0.3)
     trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
     connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
     connection.putrequest("PUT", presigned())
@@ -185,27 +185,27 @@ def test_addresses_with_many_requests_leave_places_to_others(door, presigned, em
         slow.sendall(head.encode())
 
     with ExitStack() as stack:
-        for _ in range(file_door._MOST_OF_ONE):
+        for _ in range(servers._MOST_OF_ONE):
             begin(stack, "127.0.0.8")
-        until(lambda: door._passing.total() == file_door._MOST_OF_ONE)
+        until(lambda: door._passing.total() == servers._MOST_OF_ONE)
         # All that one may have, though half of the places are free.
         assert send("PUT", presigned(), own="127.0.0.8")[0] == 503
-        for _ in range(file_door._MOST_OF_ONE - 1):
+        for _ in range(servers._MOST_OF_ONE - 1):
             begin(stack, "127.0.0.9")
         begin(stack, "127.0.0.10")
-        until(lambda: door._passing.total() == file_door._MOST - file_door._FIRST)
+        until(lambda: door._passing.total() == servers._MOST - servers._FIRST)
         # All that are for requests after the first; the first request of another address.
         assert send("PUT", presigned(), own="127.0.0.9")[0] == 503
         assert send("PUT", presigned(), own="127.0.0.7")[0] == 200
-        for number in range(file_door._FIRST):
+        for number in range(servers._FIRST):
             begin(stack, f"127.0.1.{number + 1}")
-        until(lambda: door._passing.total() == file_door._MOST)
+        until(lambda: door._passing.total() == servers._MOST)
         assert send("PUT", presigned(), own="127.0.0.7")[0] == 503
     until(lambda: send("PUT", presigned(), own="127.0.0.8")[0] == 200)
 
 
 def test_a_connection_that_never_asks_is_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr(file_door, "_IDLE_S", 0.2)
+    monkeypatch.setattr(servers, "_IDLE_S", 0.2)
     authority = Authority()
     certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
     certificate.renew()

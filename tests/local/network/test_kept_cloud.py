@@ -19,13 +19,12 @@ from iort_station.errors import StationError
 from iort_station.kept import owner
 from iort_station.page.background import BackgroundServer
 from local.deployment import ROOT
-from local.errors import LocalError
 from local.network.certificates import Authority, ServerCertificate
-from local.network.listen import Listen
-from local.processes import Child
+from local.network.servers import Listen
+from local.processes import Child, LocalError
 from local.state import USUAL_PORTS, StateFolder
 from local.up import service
-from local.up.down import stop
+from local.up.commands import stop
 from testkit.waiting import GUARD_S
 
 
@@ -55,7 +54,7 @@ def test_down_of_another_users_cloud_says_so(tmp_path, monkeypatch):
     def refuses(_folder):
         raise PermissionError(13, "Permission denied", "cloud.lock")
 
-    monkeypatch.setattr("local.up.down.owner", refuses)
+    monkeypatch.setattr("local.up.commands.owner", refuses)
     with pytest.raises(LocalError, match="is another user's, who must stop its cloud"):
         stop(tmp_path)
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from argon2 import PasswordHasher
 
-from local.errors import LocalError
-from local.keeping import ledger
 from local.network.certificates import Authority, ServerCertificate
+from local.persistence import ledger
+from local.processes import LocalError
 from local.state import StateFolder
-from local.up import options, run
-from local.up.login import Password
+from local.up import commands, run
+from local.up.network_page import Password
 
 HOST = "127.0.0.1"
 NOBODY = 65_534
@@ -152,7 +152,7 @@ def as_nobody(folder):
 def test_a_remembered_address_that_this_machine_has_not_is_told_with_its_file(folder):
     settings = json.loads((folder / "settings.json").read_text())
     (folder / "settings.json").write_text(json.dumps({**settings, "listen": "192.0.2.1"}))
-    given = options.parser("up", "", remembered=True).parse_args(["--state", str(folder)])
+    given = commands.parser("up", "", remembered=True).parse_args(["--state", str(folder)])
     with pytest.raises(LocalError) as error:
         run._Kept(given, threading.Event()).run()
     told = str(error.value)

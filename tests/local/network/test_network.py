@@ -16,7 +16,7 @@ import pytest
 from iort_station import kept
 from local.deployment import ROOT
 from local.processes import Child
-from local.up.down import stop
+from local.up.commands import stop
 from local.up.service import NAME
 from testkit.waiting import GUARD_S, until
 from tests.local.network.booted import booted

@@ -13,11 +13,10 @@ from argon2 import PasswordHasher
 
 from iort_contract.cloud import IOT
 from local.network.certificates import LASTS_S, ServerCertificate
-from local.network.listen import Listen
+from local.network.servers import Listen
 from local.up import network_page
-from local.up.login import TRIES, Password
-from local.up.network_page import COOKIE, SOCKET, NetworkPage
-from local.up.pages import shown
+from local.up.network_page import COOKIE, SOCKET, TRIES, NetworkPage, Password
+from local.up.run import shown
 from testkit.ports import free_port
 from testkit.waiting import GUARD_S, until
 

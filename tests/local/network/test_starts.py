@@ -11,9 +11,9 @@ import threading
 import pytest
 
 from local.cloud import EmbeddedCloud
-from local.errors import LocalError
-from local.up import options, run
-from tests.local.keeping.emulators import Emulator
+from local.processes import LocalError
+from local.up import commands, run
+from tests.local.persistence.emulators import Emulator
 
 
 def test_an_emulator_whose_broker_cannot_listen_ends(tmp_path):
@@ -42,7 +42,9 @@ def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_fe
 
     monkeypatch.setattr(run, "EmbeddedCloud", Killed)
     monkeypatch.setattr("local.cloud.deploy", deploy)
-    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
+    given = commands.parser("up", "", remembered=True).parse_args(
+        ["--state", str(tmp_path), "--ports", "any"]
+    )
     with pytest.raises(
         LocalError, match=r"(?s)emulator was ended by SIGKILL.*It ended 3 times within 10 min"
     ):
@@ -65,7 +67,9 @@ def test_a_cloud_that_loses_its_port_at_the_first_start_takes_and_keeps_another(
 
     monkeypatch.setattr(run, "EmbeddedCloud", Second)
     monkeypatch.setattr("local.cloud.deploy", deploy)
-    given = options.parser("up", "", remembered=True).parse_args(["--state", str(tmp_path), "--ports", "any"])
+    given = commands.parser("up", "", remembered=True).parse_args(
+        ["--state", str(tmp_path), "--ports", "any"]
+    )
     with pytest.raises(LocalError, match="cdk deploy failed"):
         run._Kept(given, threading.Event()).run()
     with others[0] as other:

@@ -12,7 +12,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations import cloudwatch
-from local.emulator import first_calls
+from local import deployment
 from testkit.mqtt import Robot
 from testkit.waiting import until
 from tests.local.conftest import run_agent
@@ -170,7 +170,7 @@ def test_the_first_calls_of_a_cloud_count_as_no_refusal_and_warn_of_nothing(embe
 
     refusals = [name for name in METRICS if name.endswith("Refused")]
     asked, before = counted("FilesAsked"), [counted(name) for name in refusals]
-    first_calls.warm_up(cloud, embedded.live)
+    deployment.warm_up(cloud, embedded.live)
     until(lambda: counted("FilesAsked") == asked + 1)
     assert [counted(name) for name in refusals] == before
     warned = [

@@ -11,8 +11,7 @@ from ministack.core.responses import request_scope
 from ministack.services import cloudwatch, iot, lambda_svc, sqs
 
 from functions.shared.metrics import emit
-from local.gaps.metrics import alarm_state, embedded_metrics, lambda_metrics, metric_search, queue_metrics
-from local.gaps.parts import points
+from local.emulator.fixes import alarms, metrics
 
 
 @pytest.fixture(autouse=True)
@@ -23,8 +22,8 @@ def empty():
 
 
 def values(namespace, name, **dimensions):
-    points = cloudwatch._metrics.get((namespace, name, cloudwatch._dims_key(dimensions))) or []
-    return sorted(point["Value"] for point in points for _ in range(int(point["Count"])))
+    alarms = cloudwatch._metrics.get((namespace, name, cloudwatch._dims_key(dimensions))) or []
+    return sorted(point["Value"] for point in alarms for _ in range(int(point["Count"])))
 
 
 def test_wrapped_functions_accept_the_wrappers_arguments():
@@ -43,7 +42,7 @@ def test_a_printed_metric_line_is_recorded(capsys, monkeypatch):
     monkeypatch.setenv("NAMESPACE", "lab2")
     emit("health", robot="car7", BatteryVolts=[11.5, 11.25], FaultSamples=3)
     log = f"START\n{capsys.readouterr().out}" + '{"_aws": broken\n{"_aws": {}}\nnot a metric'
-    embedded_metrics.record_log(log)
+    metrics.record_log(log)
     whole = {"Deployment": "lab2", "Function": "health"}
     assert values("iort", "BatteryVolts", **whole) == [11.25, 11.5]
     assert values("iort", "BatteryVolts", **whole, Robot="car7") == [11.25, 11.5]
@@ -52,31 +51,29 @@ def test_a_printed_metric_line_is_recorded(capsys, monkeypatch):
 
 def test_a_minute_of_many_values_keeps_their_count_within_bounds():
     for value in range(1000):
-        points.record("iort", "CarToLambdaMs", value, "Milliseconds")
+        alarms.record("iort", "CarToLambdaMs", value, "Milliseconds")
     assert len(values("iort", "CarToLambdaMs")) == 1000
     # The test may run past the end of a minute.
     assert len(cloudwatch._metrics["iort", "CarToLambdaMs", ""]) <= 2 * 120
 
 
 def test_a_search_finds_a_metric_of_any_action_type():
-    points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_record", ActionType="DynamoDBv2")
-    points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_live", ActionType="Lambda")
+    alarms.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_record", ActionType="DynamoDBv2")
+    alarms.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_live", ActionType="Lambda")
     search = (
         "SEARCH('{AWS/IoT,ActionType,RuleName} MetricName=\"Failure\" RuleName=\"iort_record\"', 'Sum', 60)"
     )
-    (query,) = metric_search.expand({"Id": "a", "Expression": search, "Label": "failed"})
+    (query,) = metrics.expand({"Id": "a", "Expression": search, "Label": "failed"})
     assert (query["Id"], query["Label"], "Expression" in query) == ("a", "failed", False)
     assert query["MetricStat"]["Metric"]["Dimensions"] == [
         {"Name": "ActionType", "Value": "DynamoDBv2"},
         {"Name": "RuleName", "Value": "iort_record"},
     ]
-    assert not list(
-        metric_search.expand({"Id": "a", "Expression": search.replace("iort_record", "iort_echo")})
-    )
+    assert not list(metrics.expand({"Id": "a", "Expression": search.replace("iort_record", "iort_echo")}))
     plain = {"Id": "b", "MetricStat": {}}
-    assert list(metric_search.expand(plain)) == [plain]
+    assert list(metrics.expand(plain)) == [plain]
     sums = {"Id": "c", "Expression": "a + b"}
-    assert list(metric_search.expand(sums)) == [sums]
+    assert list(metrics.expand(sums)) == [sums]
 
 
 ALARM = {
@@ -102,25 +99,25 @@ def test_an_alarm_needs_all_periods_and_its_own_dimensions():
     cloudwatch._metric_bucket(("iort", "FaultSamples", "Deployment=lab2")).append(
         {"Timestamp": now_s, "Value": 9.0, "Count": 1.0, "Unit": "Count", "Dimensions": {}}
     )
-    assert not alarm_state.breaching(ALARM, now_s)
+    assert not alarms.breaching(ALARM, now_s)
     point(now_s, 1.0)
-    assert not alarm_state.breaching(ALARM, now_s)
+    assert not alarms.breaching(ALARM, now_s)
     point(now_s - 60, 1.0)
-    assert alarm_state.breaching(ALARM, now_s)
+    assert alarms.breaching(ALARM, now_s)
     # The alarm is over: a minute without data does not breach.
-    assert not alarm_state.breaching(ALARM, now_s + 180)
+    assert not alarms.breaching(ALARM, now_s + 180)
     below = {**ALARM, "ComparisonOperator": "LessThanThreshold", "Threshold": 0.5}
-    assert not alarm_state.breaching(below, now_s)
+    assert not alarms.breaching(below, now_s)
 
 
 def test_an_alarm_goes_off_and_ends():
     alarm = {**ALARM, "StateValue": "INSUFFICIENT_DATA", "EvaluationPeriods": 1, "AlarmActions": []}
     point(time.time(), 4.0)
-    alarm_state.evaluate(alarm)
+    alarms.evaluate(alarm)
     assert alarm["StateValue"] == "ALARM"
     assert "FaultSamples" in alarm["StateReason"]
     cloudwatch._metrics.clear()
-    alarm_state.evaluate(alarm)
+    alarms.evaluate(alarm)
     assert alarm["StateValue"] == "OK"
     states = [json.loads(entry["HistoryData"]) for entry in cloudwatch._history_entries()]
     assert [state["newState"]["stateValue"] for state in states] == ["ALARM", "OK"]
@@ -130,15 +127,15 @@ def test_an_alarm_from_before_a_start_stays_as_long_as_its_lost_points_could_kee
     raised_s = time.time() - 30
     alarm = {**ALARM, "StateValue": "ALARM", "EvaluationPeriods": 2, "AlarmActions": []}
     alarm["StateUpdatedTimestamp"] = raised_s
-    alarm_state.evaluate(alarm, since_s=raised_s + 10)
+    alarms.evaluate(alarm, since_s=raised_s + 10)
     assert alarm["StateValue"] == "ALARM"
-    alarm_state.evaluate(alarm, since_s=raised_s - 100)
+    alarms.evaluate(alarm, since_s=raised_s - 100)
     assert alarm["StateValue"] == "OK"
 
 
 @pytest.mark.parametrize("failed", [False, True])
 def test_an_invocation_is_counted(failed):
-    execute = lambda_metrics.counting_invocations(lambda *_: {"error": failed})
+    execute = metrics.counting_invocations(lambda *_: {"error": failed})
     newest = {"dynamodb": {"ApproximateCreationDateTime": time.time() - 60}}
     execute({}, {"FunctionName": "f"}, {"Records": [newest]}, "id", time.time())
     assert values("AWS/Lambda", "Invocations", FunctionName="f") == [1]
@@ -153,7 +150,7 @@ def test_waiting_messages_are_counted():
         url = sqs._act_create_queue({"QueueName": "counted"}, "")["QueueUrl"]
         try:
             sqs._act_send_message({"MessageBody": "text"}, url)
-            queue_metrics.count()
+            metrics.count()
         finally:
             sqs._act_delete_queue({"QueueUrl": url}, "")
         assert values("AWS/SQS", "ApproximateNumberOfMessagesVisible", QueueName="counted") == [1]

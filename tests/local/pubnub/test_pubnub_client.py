@@ -16,7 +16,7 @@ import pytest
 from functions.shared import pubnub_client
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
 from iort_contract.limits import MAX_PUBNUB_BYTES
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from testkit.waiting import GUARD_S
 

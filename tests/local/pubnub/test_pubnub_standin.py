@@ -15,8 +15,8 @@ import pytest
 from pubnub.pubnub import SubscribeListener
 
 from iort_station.page.pubnub import Listener
-from local.pubnub import standin as server
-from local.pubnub.standin import PubNubStandIn
+from local import pubnub as server
+from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
 

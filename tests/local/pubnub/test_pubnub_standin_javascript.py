@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, publish
 

@@ -12,7 +12,7 @@ import pytest
 from pubnub.exceptions import PubNubException
 
 from iort_contract.limits import MAX_PUBNUB_BYTES
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from tests.local.pubnub.pubnub_sdk import WAIT_S, ask, poll, publish
 
 

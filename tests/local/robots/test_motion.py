@@ -17,7 +17,7 @@ from iort_contract.messages.shadow import decode_reported
 from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit
-from local.demo.run import DOWNLINK
+from local.demo import DOWNLINK
 from testkit.waiting import until
 from tests.local.robots.test_shadow import Shadow, driving
 

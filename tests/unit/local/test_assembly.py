@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from local import deployment, made_once
+from local import deployment
+from local.emulator import package
 
 
 @pytest.fixture
@@ -68,4 +69,4 @@ def test_a_failed_synthesis_is_not_kept(checkout):
 def test_old_assemblies_are_removed(assembly, checkout):
     for i in range(8):
         assembly(f"n{i}")
-    assert len(list((checkout / "build").iterdir())) == made_once._KEPT
+    assert len(list((checkout / "build").iterdir())) == package._KEPT

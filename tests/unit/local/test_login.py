@@ -7,9 +7,9 @@ import io
 import pytest
 from argon2 import PasswordHasher
 
-from local.errors import LocalError
-from local.up import login
-from local.up.login import Password, Sessions, Tries, first_password
+from local.processes import LocalError
+from local.up import network_page
+from local.up.network_page import Password, Sessions, Tries, first_password
 
 # A real hash takes 64 MB and a tenth of a second.
 QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
@@ -76,41 +76,41 @@ def test_a_long_guess_is_not_hashed_and_a_damaged_file_lets_nobody_in(tmp_path):
 def test_an_address_waits_after_its_tries_and_others_do_not():
     now = Now()
     tries = Tries(now)
-    assert [tries.wait_s("192.0.2.1") for _ in range(login.TRIES)] == [0.0] * login.TRIES
-    assert tries.wait_s("192.0.2.1") == pytest.approx(login.TRY_S)
+    assert [tries.wait_s("192.0.2.1") for _ in range(network_page.TRIES)] == [0.0] * network_page.TRIES
+    assert tries.wait_s("192.0.2.1") == pytest.approx(network_page.TRY_S)
     assert tries.wait_s("192.0.2.2") == 0.0
-    now.s += login.TRY_S
+    now.s += network_page.TRY_S
     assert tries.wait_s("192.0.2.1") == 0.0
     assert tries.wait_s("192.0.2.1") > 0.0
 
 
 def test_the_addresses_of_one_ipv6_network_share_their_tries():
     tries = Tries(Now())
-    assert [tries.wait_s(f"2001:db8::{i}") for i in range(login.TRIES)] == [0.0] * login.TRIES
+    assert [tries.wait_s(f"2001:db8::{i}") for i in range(network_page.TRIES)] == [0.0] * network_page.TRIES
     assert tries.wait_s("2001:db8::ffff") > 0.0
 
 
 def test_some_addresses_together_leave_tries_to_others():
     tries = Tries(Now())
     busy = [f"192.0.2.{i}" for i in range(10)]
-    made = sum(tries.wait_s(address) == 0.0 for address in busy for _ in range(login.TRIES))
-    assert made < login.ALL_TRIES < len(busy) * login.TRIES
+    made = sum(tries.wait_s(address) == 0.0 for address in busy for _ in range(network_page.TRIES))
+    assert made < network_page.ALL_TRIES < len(busy) * network_page.TRIES
     assert tries.wait_s(busy[0]) > 0.0
     assert tries.wait_s("198.51.100.1") == 0.0
 
 
 def test_all_addresses_together_have_an_end_too():
     tries = Tries(Now())
-    waits = [tries.wait_s(f"192.0.2.{i}") for i in range(login.ALL_TRIES + 1)]
-    assert waits[:-1] == [0.0] * login.ALL_TRIES
-    assert waits[-1] == pytest.approx(login.ALL_TRY_S)
+    waits = [tries.wait_s(f"192.0.2.{i}") for i in range(network_page.ALL_TRIES + 1)]
+    assert waits[:-1] == [0.0] * network_page.ALL_TRIES
+    assert waits[-1] == pytest.approx(network_page.ALL_TRY_S)
 
 
 def test_a_session_ends_when_nobody_uses_it():
     now = Now()
     sessions = Sessions(now)
     used, left = sessions.begin(), sessions.begin()
-    now.s += login.SESSION_S - 1
+    now.s += network_page.SESSION_S - 1
     assert sessions.goes_on(used)
     now.s += 2
     assert sessions.goes_on(used)
@@ -121,7 +121,7 @@ def test_a_session_ends_when_nobody_uses_it():
 
 
 def test_sessions_are_bounded_and_the_longest_unused_ends_first(monkeypatch):
-    monkeypatch.setattr(login, "_MOST_SESSIONS", 2)
+    monkeypatch.setattr(network_page, "_MOST_SESSIONS", 2)
     sessions = Sessions(Now())
     first, second = sessions.begin(), sessions.begin()
     assert sessions.goes_on(first)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from local.pubnub.history import History, Message, Subscription
+from local.pubnub import History, Message, Subscription
 
 
 def message(token, channel, size=1):

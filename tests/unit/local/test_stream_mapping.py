@@ -1,6 +1,6 @@
 """Lambda 2 under the stream's mapping: the summary is right and no record is lost after any fault.
 
-`local.gaps.parts.stream_mapping` follows AWS' documentation. Hypothesis makes histories of poison, throttled
+`local.emulator.fixes.stream_model` follows AWS' pages. Hypothesis makes histories of poison, throttled
 tables, time-outs, lost acknowledgements and repeated batches, and runs the real handler on them.
 """
 
@@ -16,7 +16,7 @@ from functions.shared import tables as tables_module
 from functions.shared.summary import process
 from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
-from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard, Stream
+from local.emulator.fixes.stream_model import Answer, Condition, Settings, Shard, Stream
 from testkit.dynamodb import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 from tests.examples import examples
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from local.gaps.parts.turns import Turns
+from local.emulator.fixes.invocations import Turns
 
 
 def test_callers_with_waiting_calls_take_turns():

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from botocore.exceptions import ClientError
 from rich.console import Console
 
-from local.errors import LocalError
+from local.processes import LocalError
 from stacks.settings import Settings
 from testkit.command import wound_up
 from verify.deployment import CHANGES, Deployment

@@ -1,4 +1,4 @@
-"""Another answer changes a verdict: tests/local/gaps/test_verify_differs.py has clouds that give one."""
+"""Another answer changes a verdict: tests/local/emulator/test_verify_differs.py has clouds that give one."""
 
 from __future__ import annotations
 

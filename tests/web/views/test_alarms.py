@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 
 def test_every_view_counts_the_alarms_and_each_says_what_to_do(
@@ -95,7 +95,7 @@ def test_live_values_raise_the_alarms_of_cars(open_page: Callable[..., Page], pu
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 WIDGET = {
     "number": 3,
@@ -175,7 +175,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
     from iort_contract.messages.insights import InsightsAnswer
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 END = START + 90_000_000
 

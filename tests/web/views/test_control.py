@@ -19,7 +19,7 @@ from tests.web.lab import NOW_S, Lab
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 
 class Robot:
@@ -277,7 +277,7 @@ def test_only_a_browser_that_was_invited_may_act(
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 

@@ -18,7 +18,7 @@ from tests.web.lab import Lab
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 OFF_MS = 1_700_000_000_000
 REGISTERED = {
@@ -160,7 +160,7 @@ def test_cars_are_found_sorted_and_grouped_and_the_address_says_so(
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 DEFAULT = ["speed", "battery", "currents", "duty", "speed-current", "g-g", "trajectory", "delay"]
 TITLES = "[...document.querySelectorAll('#car .board .charts > :not([hidden])')].map((e) => e.ariaLabel)"

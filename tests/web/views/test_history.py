@@ -29,7 +29,7 @@ from tests.web.lab import VIEWS, Lab
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 SECOND = 1_000_000
 FIRST_S, SECOND_S = 60, 30

@@ -12,7 +12,7 @@ import pytest
 from iort_contract.catalog.vesc import TEMPERATURES
 from iort_contract.limits import Value
 from iort_station.page.server import PageServer
-from local.pubnub.standin import PubNubStandIn
+from local.pubnub import PubNubStandIn
 from testkit.waiting import until
 from tests.browser import drawn, plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car

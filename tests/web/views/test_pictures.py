@@ -22,7 +22,7 @@ from tests.web.lab import VIEWS, Lab
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"
@@ -180,7 +180,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 AXE = Path(__file__).parents[3] / "node_modules" / "axe-core" / "axe.min.js"
 DESKTOP = {"viewport": {"width": 1280, "height": 900}}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
     from iort_station.page.server import PageServer
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 _RANGES = [f"car-1/2026-05-04T1{i}:00:00.000Z/2026-05-04T1{i}:01:00.000Z" for i in range(6)]

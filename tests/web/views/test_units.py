@@ -22,7 +22,7 @@ from tests.web.lab import VIEWS, Lab
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub.standin import PubNubStandIn
+    from local.pubnub import PubNubStandIn
 
 OFFSET_ERPM = 461.4
 VEHICLE = {"speed_to_erpm_gain": GAIN, "speed_to_erpm_offset": OFFSET_ERPM}

@@ -113,7 +113,7 @@ def _said(target: Target, like: str, began_ms: int) -> list[Mapping[str, Any]]:
         "left": 0,
     },
     source=f"{_GUIDE}/services-dynamodb-errors.html",
-    relied_on_by=("stacks/processing.py", "functions/quarantine.py", "local/gaps/parts/stream_mapping.py"),
+    relied_on_by=("stacks/processing.py", "functions/quarantine.py", "local/emulator/fixes/stream_model.py"),
 )
 def bisected(target: Target) -> Seen:
     """If the function fails on a batch of the stream, the batch is split until the poisoned record is
@@ -175,7 +175,7 @@ def put_off(target: Target) -> Seen:
     "stream.reported",
     expected={"times_reported": 1, "comes_next": [_REPORTED], "again_before_it": [], "in_quarantine": 0},
     source=f"{_GUIDE}/services-ddb-batchfailurereporting.html",
-    relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/gaps/parts/stream_mapping.py"),
+    relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/emulator/fixes/stream_model.py"),
 )
 def reported(target: Target) -> Seen:
     """If the function's answer names a record in batchItemFailures, the records before it are done, and the

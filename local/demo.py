@@ -1,0 +1,335 @@
+"""`make demo`: a car drives through the embedded cloud, and the demo counts the samples that arrive.
+
+python -m local.demo --duration 20 --bag drive.bag --report report.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+from botocore.exceptions import BotoCoreError, ClientError
+from rich.console import Console
+
+from iort_agent.common.schema import Place
+from iort_agent.common.threads import SystemClock
+from iort_agent.errors import ConfigError, SourceError
+from iort_agent.sources.recording import BagConfig, BagSource
+from iort_agent.sources.sim.driver import HALL
+from iort_agent.sources.sim.faults import fault_rule
+from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT, PUBNUB
+from iort_contract.messages.commands import MAX_LEASE_MS, stick_downlink
+from iort_contract.topics import PING_PATHS
+from iort_station import kept
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.fleet.viewing import Viewer
+from iort_station.operations import audit
+from iort_station.page import answers as control
+from iort_station.page.answers import actions, answers
+from iort_station.page.history import downloads
+from iort_station.page.listening import listening
+from iort_station.page.live import Listening
+from iort_station.page.motion import reaching
+from iort_station.page.server import PageServer
+from local.cloud import FOLDER, EmbeddedCloud
+from local.deployment import ROOT
+from local.figures import Figures, Spread, round_trips
+from local.processes import Child, LocalError
+
+
+def read() -> argparse.Namespace:
+    """The options; ends the process with an error if one is wrong."""
+    parser = argparse.ArgumentParser(
+        prog="make demo",
+        usage="make demo [DURATION=20] [BAG=drive.bag] [FAULTS=kind:strength] [LIVE=pubnub] [REPORT=r.json] "
+        "[PORT=8080]",
+        description="A car drives through the embedded cloud, and the demo counts the samples that arrive.",
+    )
+    parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
+    parser.add_argument(
+        "--bag", type=Path, metavar="FILE", help="drive a recording instead of a simulated car"
+    )
+    parser.add_argument(
+        "--faults", type=_faults, default=[], metavar="KIND:STRENGTH,...", help="of the simulated car"
+    )
+    parser.add_argument(
+        "--live",
+        choices=[IOT, PUBNUB],
+        default=IOT,
+        help="the way of live messages: AWS IoT's own, or PubNub's with a stand-in (default: %(default)s)",
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write the figures as JSON")
+    parser.add_argument("--port", type=int, default=0, help="the page's port (default: a free one)")
+    parser.add_argument(
+        "--folder", type=Path, default=FOLDER, help="where the embedded cloud keeps its state"
+    )
+    options = parser.parse_args()
+    if options.bag is not None and not options.bag.exists():
+        parser.error(f"BAG must exist, got {options.bag}")
+    if options.bag is not None:
+        try:
+            with BagSource(BagConfig(path=options.bag), SystemClock()).open() as messages:
+                next(messages, None)
+        except SourceError as error:
+            parser.error(f"BAG={error}")
+        if options.faults:
+            parser.error("FAULTS are those of a simulated car: give no BAG")
+    if options.report is not None and not options.report.absolute().parent.is_dir():
+        parser.error(f"REPORT must be in an existing folder, got {options.report}")
+    if options.report is not None and options.report.is_dir():
+        parser.error(f"REPORT must be a file, got the folder {options.report}")
+    if not 0 <= options.port <= 65535:
+        parser.error(f"PORT must be 1 to 65535, got {options.port}")
+    try:
+        socket.create_server(("127.0.0.1", options.port)).close()
+    except OSError as error:
+        parser.error(f"PORT must be free, got {options.port}: {error.strerror}; give none for a free one")
+    return options
+
+
+def _faults(value: str) -> list[dict[str, Any]]:
+    """Faults as in a car.yaml, from a text such as ``worn_battery:strong,payload:1.2``."""
+    faults: list[dict[str, Any]] = []
+    for part in value.split(","):
+        kind, _, strength = part.partition(":")
+        fault: dict[str, Any] = {"kind": kind}
+        if strength:
+            with suppress(ValueError):
+                fault["strength"] = float(strength)
+            fault.setdefault("strength", strength)
+        try:
+            fault_rule(fault, Place(Path("FAULTS")))
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        faults.append(fault)
+    return faults
+
+
+def _positive(value: str) -> float:
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= 86_400:
+        raise argparse.ArgumentTypeError(f"DURATION must be over 0 and at most 86400 s, got {value}")
+    return seconds
+
+
+ROBOT = "car1"
+_SOURCE_RATE_HZ = 50
+# Ten pings a second of half a kilobyte over each path.
+_PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
+# `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`, and the stick of page and terminal.
+# Nobody is hurt by a long lease.
+DOWNLINK = stick_downlink(MAX_LEASE_MS)
+_STANDS_S = 60.0
+_STATUS_S = 1.0
+_LOOK_S = 1.0
+
+
+def main() -> None:
+    """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
+    given = read()
+    stopped = threading.Event()
+
+    def interrupt(_signal: int, _frame: object) -> NoReturn:
+        # Python drops an exception that is raised while it forks, so the event is set too.
+        stopped.set()
+        raise KeyboardInterrupt
+
+    # Every signal that stops the demo stops the processes that it started.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)
+    console = Console()
+    try:
+        figures = _Demo(given, console, stopped).run()
+    except (LocalError, StationError) as error:
+        console.print(f"demo: {error}", style="red", markup=False, highlight=False)
+        sys.exit(2)
+    except (BotoCoreError, ClientError) as error:
+        console.print(f"demo: the embedded cloud refused a call: {error}", style="red", markup=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped; nothing is left running")
+        sys.exit(130)
+    if stopped.is_set():
+        console.print("stopped; nothing is left running")
+    sys.exit(1 if figures.samples_lost else 0)
+
+
+class _Demo:
+    def __init__(self, given: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
+        self._options, self._console, self._stopped = given, console, stopped
+        self._began = time.monotonic()
+
+    def run(self) -> Figures:
+        with ExitStack() as stack:
+            live = self._options.live
+            embedded = stack.enter_context(
+                EmbeddedCloud(self._options.folder, live=live, progress=self._step)
+            )
+            vehicles = {ROBOT: dict(robots.F1TENTH)}
+            page = stack.enter_context(
+                PageServer(
+                    namespace=embedded.namespace,
+                    **reaching(embedded.cloud, live),
+                    vehicles=vehicles,
+                    answers=answers(embedded.cloud),
+                    downloads=downloads(embedded.cloud),
+                    track=HALL if self._options.bag is None else None,
+                    open_actions=actions(embedded.cloud),
+                    actions=control.keyed_actions(embedded.cloud),
+                    port=self._options.port,
+                    invitations=kept.pages(),
+                )
+            )
+            embedded.show_page(page.url)
+            listener = stack.enter_context(listening(embedded.cloud, live, robot=ROBOT))
+            self._step("car")
+            bundle = robots.add(
+                embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
+            )
+            self._console.print(
+                f"\n[bold]Watch the car:[/bold] {page.invitation(f'#/car/{ROBOT}')}",
+                highlight=False,
+                soft_wrap=True,
+            )
+            ports = (page.port, *embedded.page_ports)
+            forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+            self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", highlight=False)
+            report = self._drive(embedded, bundle, listener)
+            figures = self._count(embedded, report, listener)
+            self._console.print(figures.as_table())
+            if self._options.report is not None:
+                self._options.report.write_text(json.dumps(figures.as_json(), indent=2) + "\n")
+            if sys.stdin.isatty() and sys.stdout.isatty():
+                # Ctrl-C after the figures is no failure.
+                with suppress(KeyboardInterrupt):
+                    self._stay(embedded, bundle, page.invitation())
+            return figures
+
+    def _step(self, name: str) -> None:
+        self._console.print(f"{time.monotonic() - self._began:5.1f} s  {name}", highlight=False)
+
+    def _settings(self) -> dict[str, Any]:
+        source: dict[str, Any]
+        if self._options.bag is not None:
+            source = {"type": "bag", "path": str(self._options.bag.resolve())}
+        else:
+            faults = {"faults": self._options.faults} if self._options.faults else {}
+            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ, **faults}
+        duration_s = self._options.duration
+        if duration_s is None and self._options.bag is None:
+            duration_s = 60.0
+        if duration_s is not None:
+            source["duration_s"] = duration_s
+        settings = {"sources": [source], "ping": _PING}
+        return settings if self._options.bag is not None else {**settings, "downlink": DOWNLINK}
+
+    def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
+        report = embedded.folder / "agent-report.json"
+        # The figures are of a car that somebody looks at from its start.
+        viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=embedded.live == IOT)
+        with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
+            began = time.monotonic()
+            with self._console.status("starting the agent") as status:
+                while self._running(agent):
+                    embedded.emulator.check()
+                    status.update(self._status_line(embedded, listener, time.monotonic() - began))
+            if not report.exists():
+                raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+            if agent.poll():
+                self._console.print(
+                    f"the agent reports a failure:\n{agent.tail()}", style="red", markup=False
+                )
+        written: dict[str, Any] = json.loads(report.read_text())
+        return written
+
+    def _running(self, agent: Child) -> bool:
+        """Wait a second; whether the agent still runs. Raises KeyboardInterrupt if the demo was stopped."""
+        if self._stopped.is_set():
+            raise KeyboardInterrupt
+        return agent.wait(_STATUS_S) is None
+
+    def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
+        stored = sum(len(b.times_us) for b in audit.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        heard = list(listener.heard)
+        delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
+        return (
+            f"driving {seconds:3.0f} s, stored {stored:,} samples, live {len(heard):,} updates, delay {delay}"
+            + (f", {listener.malformed} malformed" if listener.malformed else "")
+        )
+
+    def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:
+        """Read the tables until Lambda 2 has summarised every sample, or has done nothing for a minute."""
+        streams = [name for name in report["streams"] if name not in OWN_STREAMS]
+        sent = sum(report["streams"][name]["samples"] for name in streams)
+        before, deadline = -1, 0.0
+        while True:
+            found = [audit.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            summarized = sum(one.samples_summarized for one in found)
+            stored = sum(one.samples_stored for one in found)
+            if summarized > before:
+                before, deadline = summarized, time.monotonic() + _STANDS_S
+            if summarized >= sent or time.monotonic() > deadline:
+                break
+            # No event tells that the stream of Lambda 2 is empty.
+            threading.Event().wait(0.2)
+        return Figures(
+            samples_sent=sent,
+            samples_stored=stored,
+            samples_summarized=summarized,
+            live_published=report["live_published"],
+            live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
+            rtt_ms=round_trips(audit.batches(embedded.cloud, ROBOT, RTT_STREAM)),
+            car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),
+        )
+
+    def _stay(self, embedded: EmbeddedCloud, bundle: robots.Bundle, url: str) -> None:
+        """Let the car drive on until Ctrl-C, for the page."""
+        settings = self._settings()
+        settings["sources"][0].pop("duration_s", None)
+        if self._options.bag is not None:
+            settings["sources"][0]["loop"] = True
+        robots.configure(bundle, settings)
+        self._console.print(
+            f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False, soft_wrap=True
+        )
+        with _agent(embedded, bundle) as agent:
+            while self._running(agent):
+                embedded.emulator.check()
+            raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+
+
+@contextmanager
+def _agent(embedded: EmbeddedCloud, bundle: robots.Bundle, *arguments: str) -> Iterator[Child]:
+    command = [str(Path(sys.executable).parent / "iort-agent"), "--config", str(bundle.config), *arguments]
+    agent = Child(
+        "the agent",
+        command,
+        environment={"PATH": "", "HOME": str(embedded.folder)},
+        cwd=ROOT,
+        log=embedded.folder / "agent.log",
+    )
+    try:
+        yield agent
+    finally:
+        agent.interrupt()
+        agent.wait(15.0)
+        agent.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Gaps of the MQTT broker: who is served, and on which port."""

@@ -1,1 +1,0 @@
-"""Gaps of AWS Lambda: asynchronous events, stream mappings, logs."""

@@ -1,1 +1,0 @@
-"""Gaps of CloudWatch: metrics that nobody records, SEARCH, alarms."""

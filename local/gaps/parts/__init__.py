@@ -1,1 +1,0 @@
-"""Parts of gaps: a model of stream mappings, fair threads, points of metrics."""

@@ -1,1 +1,0 @@
-"""Gaps of DynamoDB: the speed of a Query and of numbers."""

@@ -1,1 +1,0 @@
-"""The state of ministack's services, as documents in the ledger."""
