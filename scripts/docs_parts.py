@@ -24,8 +24,9 @@ import iort_station.errors
 from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_agent.sources.sim import faults as sim_faults
-from iort_contract.catalog.analysis import KINDS, PARAMETERS, Parameter
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.entries import Parameter
 from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC

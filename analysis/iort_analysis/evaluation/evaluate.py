@@ -11,7 +11,8 @@ from iort_analysis.evaluation.baselines import Baseline, baseline, fleet_baselin
 from iort_analysis.evaluation.discovery import false_discovery_rates
 from iort_analysis.evaluation.trends import US_PER_DAY, trend
 from iort_analysis.results import DriveResult, Event, Measured
-from iort_contract.catalog.analysis import KINDS, PARAMETERS, Parameter
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
+from iort_contract.catalog.entries import Parameter
 from iort_contract.messages.analysis import DriveKey, Estimate, Finding
 
 # A finding counts up to this rate of false discoveries among those of one evaluation.

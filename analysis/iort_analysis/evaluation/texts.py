@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 from iort_analysis.evaluation.baselines import Baseline
-from iort_contract.catalog.analysis import KINDS, Parameter
+from iort_contract.catalog.analysis import KINDS
+from iort_contract.catalog.entries import Parameter
 from iort_contract.messages.analysis import Estimate, Finding
 
 
