@@ -1,6 +1,6 @@
-"""Later: summarises batches that Lambda 2 put off because their robot was over its share.
+"""Later: summarises batches that `summarize` put off because their robot was over its share.
 
-A message names the batches; the telemetry table holds them. They get the same treatment as in Lambda 2. A
+A message names the batches; the telemetry table holds them. They get the same treatment as there. A
 failed message comes again.
 """
 

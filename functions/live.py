@@ -1,4 +1,4 @@
-"""Lambda 1: sends a car's newest sample from the live rule to the car's PubNub channel."""
+"""Live: sends a car's newest sample from the live rule to the car's PubNub channel."""
 
 from __future__ import annotations
 

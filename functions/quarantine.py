@@ -71,7 +71,7 @@ class Entry:
 def entries(body: str, records: Records) -> list[Entry]:
     """The quarantined messages in one queue message.
 
-    The queue message is a rule's error document, a record that Lambda 2 refused, a failed asynchronous
+    The queue message is a rule's error document, a record that `summarize` refused, a failed asynchronous
     invocation, a failed batch of the stream (``records`` fetches its records), or the keys of put-off batches
     that failed. Any other message is kept as it is.
     """

@@ -1,4 +1,4 @@
-"""Lambda 2: reads batches from the telemetry table's stream, and writes one item a second to the summary
+"""Summarize: reads batches from the telemetry table's stream, and writes one item a second to the summary
 table.
 
 Batches of a robot over its share are put off to `functions.later`.
@@ -18,16 +18,17 @@ from botocore.exceptions import BotoCoreError, ClientError
 from functions.shared import clients
 from functions.shared.clients import connect, variables
 from functions.shared.metrics import emit
+from functions.shared.quotas import DAY, Quota
 from functions.shared.share import Change, PutOff, Share, Told, robot_of_change
 from functions.shared.summary import Bounds, processed, recompute, stored_tables
 from iort_contract.catalog.environments import SummarizeEnvironment
-from iort_contract.tables import PUT_OFF_TO_S, RECOMPUTE_FROM_S, RECORD_BYTES, RECORD_DAY, REPLAY, ROBOT
+from iort_contract.tables import PUT_OFF_TO_S, RECOMPUTE_FROM_S, RECORD_BYTES, RECORD_DAY, REPLAY
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
 
 
-# What each robot records a day, counted by Lambda 2 from the batches that it reads anyway.
+# What each robot records a day, counted from the batches that it reads anyway.
 #
 # AWS IoT has no limit of a day, so nothing is refused: a robot over its bytes is named in the log and counted
 # for an alarm. Counts wait in the environment's memory and are added to the robot's row every few minutes, so
@@ -45,7 +46,8 @@ class Volume:
     """The bytes of each robot's day in its row of the registry; ``most`` is what it may record."""
 
     def __init__(self, client: DynamoDBClient, table: str, most: int) -> None:
-        self._client, self._table, self._most = client, table, most
+        named = (RECORD_DAY, RECORD_BYTES)
+        self._quota = Quota(client, table=table, named=named, period=DAY, most=most)
         self._waiting: dict[str, tuple[float, int]] = {}
 
     def note(self, changes: Iterable[Change], now_s: float) -> None:
@@ -58,44 +60,20 @@ class Volume:
                 self._waiting[robot] = (since_s, size + size_of(image))
         for robot, (since_s, size) in list(self._waiting.items()):
             crowded = len(self._waiting) > _ROBOTS
-            if crowded or now_s - since_s >= EVERY_S or size * PARTS >= self._most:
+            if crowded or now_s - since_s >= EVERY_S or size * PARTS >= self._quota.most:
                 del self._waiting[robot]
                 self._add(robot, size, now_s)
 
     def _add(self, robot: str, size: int, now_s: float) -> None:
-        day = {":day": {"S": time.strftime("%Y-%m-%d", time.gmtime(now_s))}, ":size": {"N": str(size)}}
         try:
-            total = self._update(robot, day, "ADD #bytes :size", "#day = :day") or self._update(
-                robot,
-                day,
-                "SET #day = :day, #bytes = :size",
-                "attribute_exists(#robot) AND (attribute_not_exists(#day) OR #day <> :day)",
-            )
+            total = self._quota.count(robot, size, now_s)
         except (BotoCoreError, ClientError) as error:
             # No batch waits for a count.
             _log.warning("%d bytes of %s are not counted: %s", size, robot, error)
             return
-        if total > self._most:
-            _log.warning("%s has recorded %d bytes today, more than its %d", robot, total, self._most)
+        if total > self._quota.most:
+            _log.warning("%s has recorded %d bytes today, more than its %d", robot, total, self._quota.most)
             emit("summarize", RobotsOverVolume=1)
-
-    def _update(self, robot: str, values: Mapping[str, Any], change: str, condition: str) -> int:
-        """The bytes of the day after the change; 0 if the condition does not hold."""
-        names = {"#day": RECORD_DAY, "#bytes": RECORD_BYTES, "#robot": ROBOT}
-        used = {name: value for name, value in names.items() if name in change + condition}
-        try:
-            answer = self._client.update_item(
-                TableName=self._table,
-                Key={ROBOT: {"S": robot}},
-                UpdateExpression=change,
-                ConditionExpression=condition,
-                ExpressionAttributeNames=used,
-                ExpressionAttributeValues=values,
-                ReturnValues="UPDATED_NEW",
-            )
-        except self._client.exceptions.ConditionalCheckFailedException:
-            return 0
-        return int(answer["Attributes"][RECORD_BYTES]["N"])
 
 
 def size_of(image: Mapping[str, Mapping[str, Any]]) -> int:

@@ -161,7 +161,7 @@ class Analysis(PlatformStack):
                     self,
                     "MachineLog",
                     retention=logs.RetentionDays.ONE_MONTH,
-                    removal_policy=self.settings.removal_policy,
+                    removal_policy=self.removal_policy,
                     **self.encryption.log,
                 ),
                 # With the errors of every child, and without what it was given.

@@ -21,6 +21,7 @@ from aws_cdk import (
     Duration,
     IgnoreMode,
     ILocalBundling,
+    RemovalPolicy,
     Size,
     Stack,
 )
@@ -40,6 +41,11 @@ from stacks.settings import ALL_LOGS, ROOT, Settings
 
 # A principal that may use the service's resource may use the key through these: decision 11.
 SERVICES = ("dynamodb", "s3", "sns", "sqs")
+
+
+def _removal_policy(settings: Settings) -> RemovalPolicy:
+    """Of resources that hold data."""
+    return RemovalPolicy.RETAIN if settings.protected else RemovalPolicy.DESTROY
 
 
 class Encryption:
@@ -111,7 +117,7 @@ def _key(stack: Stack, settings: Settings) -> kms.Key:
         description=f"Encrypts what the deployment {settings.namespace} keeps",
         enable_key_rotation=True,
         pending_window=Duration.days(30 if settings.protected else 7),
-        removal_policy=settings.removal_policy,
+        removal_policy=_removal_policy(settings),
     )
 
     def let(
@@ -155,6 +161,7 @@ class PlatformStack(Stack):
         )
         self.settings = settings
         self.encryption = encryption or Encryption()
+        self.removal_policy = _removal_policy(settings)
 
 
 # Exactly the files that a function imports; see the wiring tests.
@@ -218,7 +225,7 @@ def function(
         stack,
         f"{name}Log",
         retention=logs.RetentionDays.ONE_MONTH,
-        removal_policy=stack.settings.removal_policy,
+        removal_policy=stack.removal_policy,
         **stack.encryption.log,
     )
     # A role of its own instead of AWSLambdaBasicExecutionRole, which may write to every log.
@@ -308,7 +315,7 @@ def queue(
         enforce_ssl=True,
         # The maximum.
         retention_period=Duration.days(14),
-        removal_policy=stack.settings.removal_policy,
+        removal_policy=stack.removal_policy,
         # AWS advises six times the function's timeout.
         visibility_timeout=Duration.seconds(6 * reader_timeout_s) if reader_timeout_s else None,
         dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=_ATTEMPTS, queue=failures)

@@ -1,5 +1,5 @@
-"""The functions that compute: Lambda 1 live, Lambda 2 summarize, and later, echo, upload, query and alert,
-each with its own role and log."""
+"""The functions that compute: live, summarize, later, echo, upload, query, alert and answer, each with its
+own role and log."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class Processing(PlatformStack):
     ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
-        live = {"live": self._live()} if settings.has_lambda_1 else {}
-        # The keys of waiting batches, whose robot is over its share of Lambda 2.
+        live = {"live": self._live()} if settings.has_live else {}
+        # The keys of waiting batches, whose robot is over its share.
         put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
         self._summarize(put_off)
         self._later(put_off)

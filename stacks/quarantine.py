@@ -1,7 +1,7 @@
 """The quarantine: one queue that takes every failure, and a table that keeps it.
 
-A rule's error action, a stream batch that Lambda 2 gave up, a failed asynchronous invocation and a record
-that Lambda 2 refused all go to ``rejected``; the function moves them into the quarantine table. After five
+A rule's error action, a stream batch that Summarize gave up, a failed asynchronous invocation and a record
+that Summarize refused all go to ``rejected``; the function moves them into the quarantine table. After five
 failed attempts a message goes to ``last``, the dead-letter queue, which only the operator reads. A failure
 there cannot come back to the beginning.
 """

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn
 
-from aws_cdk import App, RemovalPolicy
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V, RULES, Call, Rule
@@ -17,6 +16,10 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_contract.topics import check_namespace, check_robot
+
+if TYPE_CHECKING:
+    # Only here: it takes seconds to load.
+    from aws_cdk import App
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -293,8 +296,8 @@ class Settings(BaseModel):
 
     @property
     def reserved_for_live(self) -> int:
-        """Reserved concurrency of Lambda 1, 0 for none: a small account has nothing to reserve from, and
-        without PubNub nothing calls it."""
+        """Reserved concurrency of the function Live, 0 for none: a small account has nothing to reserve from,
+        and without PubNub nothing calls it."""
         if self.live_concurrency is None:
             allowed = self.account_concurrency >= UNRESERVED + _RESERVED_FOR_LIVE
             called = self.live_transport == PUBNUB
@@ -314,9 +317,9 @@ class Settings(BaseModel):
         return AtOnce(max(LEAST_OF_A_QUEUE, hundredth), max(1, hundredth), max(1, 4 * hundredth))
 
     @property
-    def has_lambda_1(self) -> bool:
-        """Whether Lambda 1 exists. On AWS it stays without its rule, which costs nothing, so that one
-        deployment is enough to change the way; the embedded cloud is always new."""
+    def has_live(self) -> bool:
+        """Whether the function Live exists. On AWS it stays without its rule, which costs nothing, so that
+        one deployment is enough to change the way; the embedded cloud is always new."""
         return self.live_transport == PUBNUB or not self.embedded
 
     @property
@@ -356,11 +359,6 @@ class Settings(BaseModel):
         """Whether any setting of the whole account is on."""
         return not self.embedded and (self.device_defender or bool(self.iot_log_level))
 
-    @property
-    def removal_policy(self) -> RemovalPolicy:
-        """The removal policy of resources that hold data."""
-        return RemovalPolicy.RETAIN if self.protected else RemovalPolicy.DESTROY
-
     @classmethod
     def from_context(cls, app: App) -> Settings:
         """Read ``-c key=value`` and cdk.json; raises `SettingsError` for an invalid value."""
@@ -385,7 +383,7 @@ class Settings(BaseModel):
                 "context site_robots must name the robots that anybody may see, as car1,car2, or be * for "
                 "all, got none: the page is open to everybody with site and live_transport=iot, or embedded"
             )
-        needed = [settings.layer] if settings.has_lambda_1 else []
+        needed = [settings.layer] if settings.has_live else []
         needed += [] if settings.embedded else [settings.analysis_layer]
         if missing := [folder for folder in needed if not folder.is_dir()]:
             raise SettingsError(f"layer {missing[0]} is missing: run `make layer`")

@@ -33,7 +33,7 @@ class Site(PlatformStack):
             encryption=s3.BucketEncryption.S3_MANAGED,
             enforce_ssl=True,
             minimum_tls_version=1.2,
-            removal_policy=settings.removal_policy,
+            removal_policy=self.removal_policy,
         )
         self.distribution = cloudfront.Distribution(
             self,

@@ -71,7 +71,7 @@ class Storage(PlatformStack):
             billing_mode=dynamodb.BillingMode.PAY_PER_REQUEST,
             time_to_live_attribute=EXPIRES_S if expires else None,
             stream=stream,
-            removal_policy=self.settings.removal_policy,
+            removal_policy=self.removal_policy,
             deletion_protection=self.settings.protected,
             point_in_time_recovery_specification=dynamodb.PointInTimeRecoverySpecification(
                 point_in_time_recovery_enabled=self.settings.protected
@@ -159,7 +159,7 @@ class Storage(PlatformStack):
             versioned=protected,
             # CloudFormation deletes only an empty bucket, so `iort files empty` comes first. The CDK's own
             # way deploys a function that may delete every object, for good.
-            removal_policy=self.settings.removal_policy,
+            removal_policy=self.removal_policy,
             **self.encryption.bucket,
         )
         CfnOutput(self, "FilesBucket", value=bucket.bucket_name)

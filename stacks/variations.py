@@ -49,7 +49,7 @@ LONGEST_NAMESPACE = "n" * 16
 EVERYTHING: dict[str, Any] = {
     **{name: value for flip in FLIPS.values() for name, value in flip.items()},
     **KEY,
-    # Lambda 1 is one of the resources.
+    # The function Live is one of the resources.
     "live_transport": PUBNUB,
 }
 # `keep_customer_key` has no effect beside `customer_key`.

@@ -88,15 +88,12 @@ class Marks:
         """Mark one, or move its mark to a later time; returns when it is due."""
         due_ms = pending.due_ms(now_ms)
         # A row with a later time stays.
-        with suppress(self._client.exceptions.ConditionalCheckFailedException):
-            self._client.update_item(
-                TableName=self._table,
-                Key=pending.key,
-                UpdateExpression="SET #due = :due, #first = if_not_exists(#first, :due)",
-                ConditionExpression="attribute_not_exists(#due) OR #due < :due",
-                ExpressionAttributeNames={"#due": DUE_MS, "#first": FIRST_DUE_MS},
-                ExpressionAttributeValues={":due": {"N": str(due_ms)}},
-            )
+        self._update(
+            pending,
+            "SET #due = :due, #first = if_not_exists(#first, :due)",
+            "attribute_not_exists(#due) OR #due < :due",
+            due=due_ms,
+        )
         return due_ms
 
     def due_ms(self, pending: Pending) -> int | None:
@@ -121,14 +118,7 @@ class Marks:
         """Remove a mark whose work is done. One that was not due, or has moved, stays and begins anew."""
         if due_ms is None or (due_ms <= now_ms and self.remove(pending, due_ms)):
             return
-        with suppress(self._client.exceptions.ConditionalCheckFailedException):
-            self._client.update_item(
-                TableName=self._table,
-                Key=pending.key,
-                UpdateExpression="SET #first = #due",
-                ConditionExpression="#first < #due",
-                ExpressionAttributeNames={"#due": DUE_MS, "#first": FIRST_DUE_MS},
-            )
+        self._update(pending, "SET #first = #due", "#first < #due")
 
     def every(self) -> Iterator[tuple[Pending, Item]]:
         """All marks, oldest hours first."""
@@ -137,17 +127,26 @@ class Marks:
         for item in heapq.merge(*of_partitions, key=lambda item: str(item[HOUR]["S"])):
             yield parse_pending(item), item
 
-    def keep(self, pending: Pending, **values: Any) -> None:
+    def keep(self, pending: Pending, **values: int) -> None:
         """Add numbers to a mark that is there."""
-        names = {f"#{name}": name for name in values}
+        change = "SET " + ", ".join(f"{name} = :{name}" for name in values)
+        self._update(pending, change, "attribute_exists(#due)", **values)
+
+    def _update(self, pending: Pending, change: str, condition: str, **values: int) -> None:
+        """Change a mark if the condition holds."""
+        names = {"#due": DUE_MS, "#first": FIRST_DUE_MS}
+        more: dict[str, Any] = {}
+        if values:
+            numbers = {f":{name}": {"N": str(value)} for name, value in values.items()}
+            more["ExpressionAttributeValues"] = numbers
         with suppress(self._client.exceptions.ConditionalCheckFailedException):
             self._client.update_item(
                 TableName=self._table,
                 Key=pending.key,
-                UpdateExpression="SET " + ", ".join(f"#{name} = :{name}" for name in values),
-                ConditionExpression="attribute_exists(#due)",
-                ExpressionAttributeNames={**names, "#due": DUE_MS},
-                ExpressionAttributeValues={f":{name}": {"N": str(value)} for name, value in values.items()},
+                UpdateExpression=change,
+                ConditionExpression=condition,
+                ExpressionAttributeNames={k: v for k, v in names.items() if k in change + condition},
+                **more,
             )
 
 

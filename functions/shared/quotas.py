@@ -1,10 +1,11 @@
-"""A robot's quota: a count of a day or an hour in its row of the robots table."""
+"""What a robot may use: a count of a day or an hour in its row of the registry, a token bucket in memory."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from iort_contract.tables import ROBOT
@@ -17,7 +18,7 @@ DAY, HOUR = "%Y-%m-%d", "%Y-%m-%dT%H"
 
 
 class Quota:
-    """Counts up to ``most`` in each ``period``, which is `DAY` or `HOUR`.
+    """Counts in each ``period``, which is `DAY` or `HOUR`, towards the ``most`` that a robot may use.
 
     ``named`` are the attributes of the robot's row: the period that is counted, and the count.
     """
@@ -25,42 +26,47 @@ class Quota:
     def __init__(
         self, client: DynamoDBClient, *, table: str, named: tuple[str, str], period: str, most: int
     ) -> None:
-        self._client, self._table, self._named, self._period = client, table, named, period
-        self.most = most
+        self._client, self._table, self._period, self.most = client, table, period, most
+        self._names = {"#period": named[0], "#count": named[1], "#robot": ROBOT}
 
     def take(self, robot: str, amount: int, now_s: float) -> bool:
         """Count the amount and return True if it fits in this period's quota. An unregistered robot has
         none."""
         if amount > self.most:
             return False
-        period, count = self._named
-        names = {"#period": period, "#count": count}
-        values = {
-            ":now": {"S": time.strftime(self._period, time.gmtime(now_s))},
-            ":amount": {"N": str(amount)},
-        }
-        return self._update(
-            robot,
-            UpdateExpression="ADD #count :amount",
-            ConditionExpression="#period = :now AND #count <= :left",
-            ExpressionAttributeNames=names,
-            ExpressionAttributeValues={**values, ":left": {"N": str(self.most - amount)}},
-        ) or self._update(
-            robot,
-            UpdateExpression="SET #period = :now, #count = :amount",
-            ConditionExpression=(
-                "attribute_exists(#robot) AND (attribute_not_exists(#period) OR #period <> :now)"
-            ),
-            ExpressionAttributeNames={**names, "#robot": ROBOT},
-            ExpressionAttributeValues=values,
-        )
+        left = {":left": {"N": str(self.most - amount)}}
+        return self._add(robot, amount, now_s, " AND #count <= :left", left) is not None
 
-    def _update(self, robot: str, **update: Any) -> bool:
+    def count(self, robot: str, amount: int, now_s: float) -> int:
+        """Count the amount; return what the period has now, 0 for an unregistered robot."""
+        return self._add(robot, amount, now_s) or 0
+
+    def _add(
+        self, robot: str, amount: int, now_s: float, fits: str = "", left: Mapping[str, Any] | None = None
+    ) -> int | None:
+        now = {"S": time.strftime(self._period, time.gmtime(now_s))}
+        values = {":now": now, ":amount": {"N": str(amount)}}
+        count = self._update(robot, "ADD #count :amount", f"#period = :now{fits}", {**values, **(left or {})})
+        if count is not None:
+            return count
+        another = "attribute_exists(#robot) AND (attribute_not_exists(#period) OR #period <> :now)"
+        return self._update(robot, "SET #period = :now, #count = :amount", another, values)
+
+    def _update(self, robot: str, change: str, condition: str, values: Mapping[str, Any]) -> int | None:
+        """The count after the change; None if the condition does not hold."""
         try:
-            self._client.update_item(TableName=self._table, Key={ROBOT: {"S": robot}}, **update)
+            answer = self._client.update_item(
+                TableName=self._table,
+                Key={ROBOT: {"S": robot}},
+                UpdateExpression=change,
+                ConditionExpression=condition,
+                ExpressionAttributeNames={k: v for k, v in self._names.items() if k in change + condition},
+                ExpressionAttributeValues=values,
+                ReturnValues="UPDATED_NEW",
+            )
         except self._client.exceptions.ConditionalCheckFailedException:
-            return False
-        return True
+            return None
+        return int(answer["Attributes"][self._names["#count"]]["N"])
 
 
 # Robots beyond this number have spent nothing worth keeping.

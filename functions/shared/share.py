@@ -1,4 +1,5 @@
-"""A robot's share of Lambda 2. Batches beyond it wait for another function, and delay no other robot."""
+"""A robot's share of the processor in `summarize`. Batches beyond it wait for `later`,
+and delay no other robot."""
 
 from __future__ import annotations
 

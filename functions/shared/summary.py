@@ -1,4 +1,4 @@
-"""An event of Lambda 2, from its records to the summary table, for every caller."""
+"""An event of `summarize` or `later`, from its records to the summary table, for every caller."""
 
 from __future__ import annotations
 
@@ -327,7 +327,7 @@ def _summarized(
 def stored_tables() -> Tables:
     """The tables of this environment's deployment."""
     given = variables(LaterEnvironment)
-    # Requests come from this code only. Validating them took a third of Lambda 2's CPU time; the User-Agent,
+    # Requests come from this code only. Validating them took a third of the CPU time; the User-Agent,
     # made anew for each request, a fifth of it for a driving car.
     client = quick(connect("dynamodb", config=Config(parameter_validation=False, user_agent="iort")))
     tables = Tables(

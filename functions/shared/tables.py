@@ -63,7 +63,7 @@ def attribute(value: Statistics) -> dict[str, Any]:
 
 
 class Tables:
-    """The tables of Lambda 2; ``client`` is a boto3 DynamoDB client or a fake of it."""
+    """The tables of summaries; ``client`` is a boto3 DynamoDB client or a fake of it."""
 
     def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str, archive: str = "") -> None:
         self._client = client

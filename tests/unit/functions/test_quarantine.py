@@ -106,67 +106,59 @@ def none(_info):
 # --- what a message of the queue holds --------------------------------------------------------------
 
 
-def test_a_rules_error_document_is_kept():
-    (entry,) = entries(rule_error(), none)
-    assert (entry.source, entry.topic, entry.robot) == (f"{BY_RULE} iort_record", TOPIC_OF_CAR, "car")
-    assert entry.payload == RAW
-    assert "DynamoDBv2Action: The provided key element" in entry.reason
+ODD = {**image(7), "boot": {"S": "\x00\udfff and \ufffe, which SQS does not carry"}}
+LIVE_EVENT = {"topic": build_topic("live", "car", "vesc"), "v": 9}
+RULE_RECORD, INVOKED = f"{BY_RULE} iort_record", f"{BY_FUNCTION} iort-processing-Live-1"
+PREFIX, LEFT = "$aws/rules/iort_record/", "RetryAttemptsExhausted; the records have left the stream"
+EXHAUSTED = "Lambda 2 failed: RetryAttemptsExhausted"
+REFUSAL = "DynamoDBv2Action: The provided key element does not match the schema"
 
 
-def test_a_record_that_lambda_2_refused_is_kept():
-    odd = {**image(7), "boot": {"S": "\x00\udfff and \ufffe, which SQS does not carry"}}
-    body = message(Refused("5", "schema version 9", odd))
+def said(topic, robot, source=BY_STREAM, reason=REFUSAL):
+    return source, topic, robot, reason
+
+
+# The queue's message and the stream's records; what the entries say, and their payloads.
+KEPT = {
+    "a rule's error": (rule_error(), none, said(TOPIC_OF_CAR, "car", RULE_RECORD), [RAW]),
+    # AWS' documentation does not say whether the error document has Basic Ingest's prefix.
+    "prefix": (rule_error(topic=PREFIX + TOPIC_OF_CAR), none, said(TOPIC_OF_CAR, "car", RULE_RECORD), [RAW]),
+    "refused": (message(Refused("5", "v 9", ODD)), none, said(TOPIC_OF_CAR, "car", reason="v 9"), [ODD]),
+    "retries": (failed_batch(), records, said(TOPIC_OF_CAR, "car", reason=EXHAUSTED), [image(2), image(3)]),
+    "left the stream": (failed_batch(), none, said("", NO_ROBOT, reason=LEFT), [json.loads(failed_batch())]),
+    "an invocation": (
+        *(invocation(LIVE_EVENT), none),
+        *(said(LIVE_EVENT["topic"], "car", INVOKED, "RetriesExhausted: boom"), [LIVE_EVENT]),
+    ),
+    # Topics without a robot, invalid ones that name it, and prefixes that stay.
+    **{
+        f"topic {topic}": (rule_error(topic=topic), none, said(topic, robot, RULE_RECORD), [RAW])
+        for topic, robot in {
+            **dict.fromkeys(("", "dt", "dt/iort", "dt/iort//vesc", "other/iort/car/a"), NO_ROBOT),
+            "$aws/events/presence/connected/car": NO_ROBOT,
+            f"$aws/rules/iort_live/{TOPIC_OF_CAR}": NO_ROBOT,
+            "dt/iort/car/a/b": "car",
+            "dt/iort/c r/vesc": "c r",
+            "dt/iort/car": "car",
+        }.items()
+    },
+    "two prefixes": (
+        *(rule_error(topic=PREFIX * 2 + TOPIC_OF_CAR), none),
+        *(said(PREFIX + TOPIC_OF_CAR, NO_ROBOT, RULE_RECORD), [RAW]),
+    ),
+}
+
+
+@pytest.mark.parametrize(("body", "stream", "texts", "payloads"), KEPT.values(), ids=KEPT)
+def test_a_message_of_the_queue_is_kept(body, stream, texts, payloads):
     body.encode("ascii")
-    (entry,) = entries(body, none)
-    assert (entry.source, entry.topic, entry.reason) == (BY_STREAM, TOPIC_OF_CAR, "schema version 9")
-    assert json.loads(entry.payload.decode("utf-8", "surrogatepass")) == odd
+    rows = entries(body, stream)
+    assert {(row.source, row.topic, row.robot, row.reason) for row in rows} == {texts}
+    assert [row.payload if row.payload == RAW else _content(row.payload) for row in rows] == payloads
 
 
-def test_records_that_exhausted_the_streams_retries_are_kept():
-    found = entries(failed_batch(), records)
-    assert [json.loads(entry.payload) for entry in found] == [image(2), image(3)]
-    assert {(entry.source, entry.robot) for entry in found} == {(BY_STREAM, "car")}
-    assert all("RetryAttemptsExhausted" in entry.reason for entry in found)
-
-
-def test_a_stream_batch_with_expired_records_is_kept_by_its_position():
-    (entry,) = entries(failed_batch(), none)
-    assert json.loads(entry.payload)["DDBStreamBatchInfo"] == INFO
-    assert "left the stream" in entry.reason
-
-
-def test_a_failed_asynchronous_invocation_is_kept():
-    event = {"topic": build_topic("live", "car", "vesc"), "v": 9}
-    (entry,) = entries(invocation(event), none)
-    assert entry.source == f"{BY_FUNCTION} iort-processing-Live-1"
-    assert (entry.robot, json.loads(entry.payload)) == ("car", event)
-    assert entry.reason == "RetriesExhausted: boom"
-
-
-def test_basic_ingests_prefix_is_removed_from_the_topic():
-    """AWS' documentation does not say whether the error document has the prefix."""
-    (told,) = entries(rule_error(topic=f"$aws/rules/iort_record/{TOPIC_OF_CAR}"), none)
-    (not_told,) = entries(rule_error(), none)
-    assert told == not_told
-    assert (told.topic, told.robot, told.id) == (TOPIC_OF_CAR, "car", not_told.id)
-    # Another rule's prefix stays, and only the first prefix is removed.
-    for odd in ("$aws/rules/iort_live/", "$aws/rules/iort_record/$aws/rules/iort_record/"):
-        (entry,) = entries(rule_error(topic=odd + TOPIC_OF_CAR), none)
-        assert entry.robot == NO_ROBOT
-
-
-@pytest.mark.parametrize(
-    "topic", ["", "dt", "dt/iort", "dt/iort//vesc", "$aws/events/presence/connected/car", "other/iort/car/a"]
-)
-def test_a_message_with_a_topic_without_a_robot_is_kept(topic):
-    (entry,) = entries(rule_error(topic=topic), none)
-    assert (entry.robot, entry.topic, entry.payload) == (NO_ROBOT, topic, RAW)
-
-
-def test_an_otherwise_invalid_topic_still_names_the_robot():
-    for topic in ("dt/iort/car/a/b", "dt/iort/c r/vesc", "dt/iort/car"):
-        (entry,) = entries(rule_error(topic=topic), none)
-        assert entry.robot == topic.split("/")[2]
+def _content(payload):
+    return json.loads(payload.decode("utf-8", "surrogatepass"))
 
 
 documents = st.recursive(
