@@ -23,7 +23,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files
-from verify.preflight.command import context, options
+from verify.preflight.__main__ import context, options
 from verify.preflight.deployed import stack
 
 # Five minutes, and one for clock differences.

@@ -22,7 +22,7 @@ from stacks.settings import DEV
 from testkit.waiting import InstrumentError, until
 from verify.preflight.deployed import STACKS, stack
 from verify.preflight.finding import listed
-from verify.questions.identity.certificates import POLICY
+from verify.questions.identity import POLICY
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0

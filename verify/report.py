@@ -2,6 +2,7 @@
 
 `make verify-aws KEEP=1` keeps AWS' answers in the repository: tests compare the embedded cloud with them, and
 docs/explanation/assumptions.md names who measured them and when.
+`python -m verify.report` writes the table of the questions into that page.
 """
 
 from __future__ import annotations
@@ -9,14 +10,18 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from math import ceil
 from pathlib import Path
 from typing import Any
 
+from iort_station.cost.prices import MONTH_HOURS, PRICES
+from local.deployment import ROOT
 from testkit.command import Table
 from testkit.waiting import InstrumentError
-from verify.question import NOTE, Answer, Verdict, compared
+from verify.question import NOTE, Answer, Question, Verdict, compared
+from verify.questions import ALL
 
 KEPT = Path(__file__).resolve().parent / "aws.json"
 # An account number, an access key's id, PubNub's keys, a private key, a session token.
@@ -143,3 +148,119 @@ def _notes(answer: Answer) -> str:
 
 def _cell(text: str) -> str:
     return " ".join(text.split())[:400]
+
+
+PAGE = ROOT / "docs" / "explanation" / "assumptions.md"
+BY_HAND = "## Not asked\n"
+_HEAD = ["behaviour", "what we rely on", "basis", "relied on by", "embedded cloud"]
+_INTRODUCTION = """\
+# The design's assumptions about AWS
+
+Each row is a behaviour of AWS that the code relies on and that the embedded cloud imitates. *Documented*
+names AWS' page. *Assumed* means that AWS does not document it. *Measured* means that `make verify-aws` has
+seen it in an account; tests/local/gaps/test_verify.py then expects the same answer from the embedded cloud.
+How to ask your own account: [deploy](../how-to/deploy.md#ask-your-account). `python -m verify.report`
+writes the first table from verify/questions/; the second is written by hand.
+"""
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.write_text(text(load(), PAGE.read_text()))
+
+
+def text(known: Measured, page: str) -> str:
+    """The whole page, with the part of ``page`` that is written by hand."""
+    _, heading, by_hand = page.partition(BY_HAND)
+    return "\n".join((*_generated(known, len(rows(by_hand))), "", heading + by_hand))
+
+
+def rows(by_hand: str) -> list[list[str]]:
+    """The cells of each row of a page's table."""
+    lines = [line for line in by_hand.splitlines() if line.startswith("| `")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def _generated(known: Measured, not_asked: int) -> Iterator[str]:
+    yield _INTRODUCTION
+    count = sum(one.name in known.seen for one in ALL)
+    yield (
+        f"`make verify-aws` asks {len(ALL)} of {len(ALL) + not_asked} behaviours. {count} were "
+        f"measured{f' by {known.by} on {known.date} in {known.region}' if known.seen else ''}."
+    )
+    yield ""
+    yield "## Asked by `make verify-aws`"
+    yield ""
+    cells = [
+        [f"`{one.name}`", one.assumed, _basis(one, known), ", ".join(one.relied_on_by), _embedded(one)]
+        for one in ALL
+    ]
+    yield Table("", _HEAD, cells).as_markdown()
+
+
+def _basis(one: Question, known: Measured) -> str:
+    if one.name in known.seen:
+        same = compared(known.seen[one.name]) == one.expected
+        return f"measured ({'as assumed' if same else 'differs'})"
+    return f"documented: {one.source}" if one.source else "assumed"
+
+
+def _embedded(one: Question) -> str:
+    return f"not asked: {one.not_embedded}" if one.not_embedded else "asked in every test run"
+
+
+if __name__ == "__main__":
+    main()
+
+
+# A run takes about an hour (nobody has measured it); what is metered by the hour is counted for two.
+_HOURS = 2.0
+# More than all questions together send and invoke (tests/local/gaps/test_verify.py counts them).
+MESSAGES, INVOCATIONS, WRITES = 5_000, 2_000, 5_000
+_ALARMS, _METRICS, _DASHBOARDS = 40, 200, 3
+_GB_SECONDS = INVOCATIONS * 0.5 * 1.0
+# What single questions use beside that, by the meters of the price list.
+BESIDE: Mapping[str, Mapping[str, float]] = {
+    "analysis.no_robot": {"transition": 20, "compute_arm": 10},
+    "analysis.empty_plan": {"transition": 20, "compute_arm": 10},
+    "analysis.one_drive": {"transition": 30, "compute_arm": 60, "express_request": 1},
+    "analysis.failing_drive": {
+        "transition": 60,
+        "compute_arm": 120,
+        "express_request": 2,
+        "express_duration": 10,
+    },
+    "analysis.stopped": {"transition": 60, "compute_arm": 120, "express_request": 2, "express_duration": 10},
+    "archive.hour_twice": {"compute_arm": 60, "queue_request": 100},
+    "archive.late_batch": {"compute_arm": 60, "queue_request": 100},
+    "archive.read_back": {"compute_arm": 40, "queue_request": 100},
+    "archive.pyarrow_arm64": {"compute_arm": 40, "queue_request": 100},
+    "schedules.archive": {"schedule": 1, "compute_arm": 10},
+    # A night of the robots that the questions before have registered.
+    "schedules.analysis": {"schedule": 1, "transition": 200, "compute_arm": 300},
+    "stream.put_off": {"compute_arm": 200, "queue_request": 1_000},
+    "functions.ten_at_once": {"compute_arm": 60, "invocation": 100},
+}
+
+
+def estimate() -> dict[str, float]:
+    """Dollars by meter."""
+    month = _HOURS / MONTH_HOURS
+    each = {name: price.each for name, price in PRICES.items()}
+    return {
+        "messages, rules and actions": MESSAGES * (each["message"] + each["rule"] + 2 * each["action"]),
+        "Lambda": INVOCATIONS * each["invocation"] + _GB_SECONDS * each["compute_arm"],
+        "DynamoDB": WRITES * (each["write"] + each["read"]),
+        "alarms and metrics of an hour": month * (_ALARMS * each["alarm"] + _METRICS * each["metric"]),
+        "dashboards of an hour": month * _DASHBOARDS * each["dashboard"],
+        "single questions": sum(
+            units * each[meter] for used in BESIDE.values() for meter, units in used.items()
+        ),
+        "a key of one's own": month * each["key"] + 1_000 * each["key_request"],
+    }
+
+
+def told(dollars: dict[str, float]) -> str:
+    """The estimate in one line, rounded up to a cent."""
+    parts = ", ".join(f"{name} {usd:.3f}" for name, usd in dollars.items())
+    return f"about ${ceil(sum(dollars.values()) * 100) / 100:.2f} ({parts})"

@@ -34,12 +34,12 @@ from testkit import machine
 from testkit.command import confirm, wound_up
 from testkit.target import AWS, EMBEDDED, Target, open_target
 from testkit.waiting import InstrumentError
-from verify import price, report
+from verify import report
 from verify.deployment import CHANGES, Deployment
-from verify.preflight import command as preflight
+from verify.preflight import __main__ as preflight
 from verify.question import CHANGED, ENDED, FIRST, Answer, Question, Verdict, ask
 from verify.questions import ALL
-from verify.questions.messages.live import keys_lent
+from verify.questions.live import keys_lent
 
 OUT = ROOT / "build" / "verify"
 _STYLES = {
@@ -129,7 +129,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
     if options.keep:
         shutil.copyfile(options.out / "report.json", report.KEPT)
         console.print(
-            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.page` writes "
+            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.report` writes "
             "docs/explanation/assumptions.md"
         )
     verdicts = {answer.verdict for answer in answers}
@@ -168,7 +168,7 @@ def _looked(cloud: Cloud, console: Console) -> list[str]:
 
 def _announced(cloud: Cloud) -> str:
     return (
-        f"This takes about an hour and costs {price.told(price.estimate())} at the list prices of "
+        f"This takes about an hour and costs {report.told(report.estimate())} at the list prices of "
         f"{AS_OF}. It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with "
         "all their data. A key of the account's own is scheduled for deletion, which AWS does not charge for."
     )

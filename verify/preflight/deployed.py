@@ -3,15 +3,17 @@ cannot change in one step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from botocore.exceptions import ClientError
+from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import IOT, PUBNUB, claim_name, fleet_name, pubnub_parameter
-from iort_contract.topics import rule_name
-from stacks.settings import PROD, Settings
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import check_namespace, rule_name
+from iort_station.errors import StationError
+from stacks.settings import NEW_ACCOUNT, PROD, Settings
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
@@ -267,3 +269,45 @@ def _used_by(importers: list[str]) -> str:
 
 
 ITEMS = (stacks, names, kept, live_messages, changes)
+
+
+def account_concurrency(clients: Clients, _namespace: str) -> str:
+    """What the account's functions may have at once, by Lambda's GetAccountSettings."""
+    total = clients.client("lambda").get_account_settings()["AccountLimit"]["ConcurrentExecutions"]
+    # Fewer than ever a new account had are planned as such a one's.
+    return str(max(NEW_ACCOUNT, int(total)))
+
+
+def live_transport(clients: Clients, namespace: str) -> str:
+    """PubNub if its keys are stored. If nobody may look for them, a deployment keeps the way that it has."""
+    try:
+        return PUBNUB if has_pubnub_keys(clients, namespace) else IOT
+    except (BotoCoreError, ClientError):
+        if transport(clients, namespace) == PUBNUB:
+            return PUBNUB
+        raise
+
+
+# By the context's key. Each is asked with the deployment's namespace; what it raises leaves the default.
+DERIVED: Mapping[str, Callable[[Clients, str], str]] = {
+    "account_concurrency": account_concurrency,
+    "live_transport": live_transport,
+}
+
+
+def namespace_of(given: Mapping[str, Any]) -> str:
+    """The deployment's namespace; raises `ContractError` for an invalid one."""
+    return check_namespace(given.get("namespace", DEFAULT_NAMESPACE))
+
+
+def derive(clients: Clients, given: Mapping[str, Any]) -> dict[str, str]:
+    """The context that the account gives, by key, without what is ``given``."""
+    namespace, answers = namespace_of(given), dict[str, str]()
+    for key, ask in DERIVED.items():
+        if key not in given:
+            try:
+                answers[key] = ask(clients, namespace)
+            except (BotoCoreError, ClientError, StationError):
+                # The preflight's item about the same tells why.
+                continue
+    return answers

@@ -1,16 +1,26 @@
-"""The questions: a room a subject, a decorated function a question. They may use every package."""
+"""The questions: a module a subject, a decorated function a question. They may use every package below."""
 
 from __future__ import annotations
 
 from verify.question import Question
-from verify.questions.identity import certificates, people, policies, provisioning
-from verify.questions.messages import broker, live, payloads, rule_errors, rules
-from verify.questions.operations import alarms, analysis, functions, logs, schedules
-from verify.questions.storage import archive, dynamodb, files, quarantine, stream
+from verify.questions import (
+    alarms,
+    analysis,
+    archive,
+    broker,
+    files,
+    functions,
+    identity,
+    live,
+    people,
+    provisioning,
+    rules,
+    stream,
+)
 
-# In the order in which they are asked.
+# In the order in which they are asked: the first one wants a deployment that has no robot yet.
 _FILES = (
-    *(analysis, archive, schedules, rules, payloads, rule_errors, broker, provisioning, certificates),
-    *(people, stream, quarantine, dynamodb, functions, logs, files, live, alarms, policies),
+    *(analysis, archive, rules, broker, provisioning, identity, people, stream, functions, files, live),
+    alarms,
 )
 ALL = tuple(one for file in _FILES for one in vars(file).values() if isinstance(one, Question))

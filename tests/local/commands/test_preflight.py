@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stacks.settings import Settings
-from verify.preflight import command as preflight
+from verify.preflight import __main__ as preflight
 from verify.preflight.finding import Verdict
 
 

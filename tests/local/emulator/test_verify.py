@@ -21,11 +21,10 @@ from iort_station.fleet import robots
 from iort_station.page.page import load_keys
 from testkit.target import AWS, EMBEDDED, Target
 from testkit.waiting import InstrumentError
-from verify import price, report, run
+from verify import report, run
 from verify.deployment import CHANGES
 from verify.question import CHANGED, ENDED, Question, Verdict, ask
-from verify.questions import ALL
-from verify.questions.messages import live
+from verify.questions import ALL, live
 
 RULES = tuple(one for one in ALL if one.subject == "rules")
 
@@ -180,4 +179,4 @@ def test_partial_answers_do_not_replace_complete_answers(monkeypatch, capsys):
 
 
 def test_the_price_is_shown_before_the_run(capsys):
-    assert price.told(price.estimate()).startswith("about $0.")
+    assert report.told(report.estimate()).startswith("about $0.")

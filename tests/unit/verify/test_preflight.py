@@ -12,9 +12,9 @@ from iort_station.cli.console import Console
 from iort_station.errors import StationError
 from stacks.settings import Settings, SettingsError
 from tests.unit.verify.account import NEW, Account, Refused, denied, limits, settings, stack_answers
+from verify.preflight import __main__ as preflight
 from verify.preflight import account
-from verify.preflight import command as preflight
-from verify.preflight.derived import derive
+from verify.preflight.deployed import derive
 from verify.preflight.finding import Verdict
 
 WARNING, STOPS = Verdict.WARNING, Verdict.STOPS

@@ -12,7 +12,7 @@ from iort_station.cost.prices import PRICES
 from local.deployment import ROOT
 from testkit.target import AWS, EMBEDDED, Target
 from testkit.waiting import InstrumentError
-from verify import page, price, report
+from verify import report
 from verify.question import CannotAskError, Question, Verdict, ask
 from verify.questions import ALL
 
@@ -110,7 +110,7 @@ def test_a_report_contains_no_secret(tmp_path, secret):
 
 
 def test_names_are_unique_and_every_named_file_exists():
-    rows = page.rows(page.PAGE.read_text())
+    rows = report.rows(report.PAGE.read_text())
     names = [name for name, *_ in rows]
     assert len(names) == len(set(names)) > len(ALL)
     for name, _, basis, relied_on_by, _ in rows:
@@ -120,13 +120,13 @@ def test_names_are_unique_and_every_named_file_exists():
 
 
 def test_the_price_names_questions_and_meters():
-    assert price.BESIDE.keys() <= {one.name for one in ALL}
-    assert {meter for used in price.BESIDE.values() for meter in used} <= PRICES.keys()
-    assert price.estimate()["single questions"] > 0
+    assert report.BESIDE.keys() <= {one.name for one in ALL}
+    assert {meter for used in report.BESIDE.values() for meter in used} <= PRICES.keys()
+    assert report.estimate()["single questions"] > 0
 
 
 def test_every_gap_of_the_emulator_is_an_assumption():
-    rows = page.rows(page.PAGE.read_text())
+    rows = report.rows(report.PAGE.read_text())
     relied = {path for _, _, _, relied_on_by, _ in rows for path in relied_on_by.split(", ")}
     folder = ROOT / "local" / "gaps"
     files = {path for path in folder.glob("*/*.py") if "\nAWS: does not apply;" not in path.read_text()}
@@ -135,14 +135,14 @@ def test_every_gap_of_the_emulator_is_an_assumption():
 
 
 def test_the_page_lists_the_current_assumptions():
-    written = page.PAGE.read_text()
-    assert written == page.text(report.load(), written), "run `python -m verify.page`"
+    written = report.PAGE.read_text()
+    assert written == report.text(report.load(), written), "run `python -m verify.report`"
 
 
 def test_the_page_names_the_person_who_measured():
     known = report.Measured(
         by="B", date="2026-02-02", region="eu-west-1", seen={ALL[0].name: ALL[0].expected}
     )
-    text = page.text(known, page.PAGE.read_text())
+    text = report.text(known, report.PAGE.read_text())
     assert "measured by B on 2026-02-02" in text
     assert "measured (as assumed)" in text

@@ -13,8 +13,7 @@ from iort_contract.topics import LAMBDA, PING, build_topic
 from testkit.target import Target, temporary_function
 from testkit.waiting import InstrumentError, until
 from verify.question import CannotAskError, Seen, question
-from verify.tools.logs import lines
-from verify.tools.telemetry import only_entry
+from verify.tools import lines, only_entry
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256

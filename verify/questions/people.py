@@ -26,7 +26,7 @@ from testkit.mqtt import STALE, WAIT_S, Person
 from testkit.target import Target
 from testkit.waiting import InstrumentError
 from verify.question import CHANGED, Seen, question
-from verify.tools.uploading import trust
+from verify.tools import trust
 
 _IOT = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _COGNITO = "https://docs.aws.amazon.com/cognito/latest/developerguide"

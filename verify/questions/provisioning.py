@@ -26,7 +26,7 @@ from testkit.mqtt import refusal
 from testkit.target import Target
 from testkit.waiting import InstrumentError
 from verify.question import Seen, question
-from verify.tools.robots import removed_after
+from verify.tools import removed_after
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _HOOK = f"{_GUIDE}/pre-provisioning-hook.html"

@@ -30,7 +30,7 @@ from testkit.mqtt import Robot
 from testkit.target import Target
 from testkit.waiting import until
 from verify.question import CannotAskError, Seen, question
-from verify.tools.telemetry import RUN
+from verify.tools import RUN
 
 _STALE = 0
 # Two clocks of AWS differ by less than the first, the operator's and AWS' by less than the second.

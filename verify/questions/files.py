@@ -11,7 +11,7 @@ from iort_contract.messages.files import FILES_PREFIX, PART_BYTES, File, part_ra
 from testkit.target import Target, temporary_function
 from testkit.waiting import until
 from verify.question import Seen, question
-from verify.tools.uploading import asking, sent, trust
+from verify.tools import asking, sent, trust
 
 _GUIDE = "https://docs.aws.amazon.com/AmazonS3/latest/userguide"
 _API = "https://docs.aws.amazon.com/AmazonS3/latest/API"

@@ -1,1 +1,0 @@
-"""Questions about certificates, and how a robot gets its first one."""

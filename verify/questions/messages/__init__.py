@@ -1,1 +1,0 @@
-"""Questions about messages: topic rules, what they forward, the broker, and the live lane."""

@@ -1,1 +1,0 @@
-"""Questions about what runs and is watched: functions, logs, alarms."""

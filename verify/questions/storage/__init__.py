@@ -1,1 +1,0 @@
-"""Questions about what is kept: tables and their streams, files, the quarantine."""
