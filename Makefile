@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest mutants check setup prove-mixed wheels bench bench-guard bench-agent bench-page bench-look bench-drive bench-stop screenshots bench-fleet bench-analysis bench-analysis-cloud bench-cold bench-kept verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-fast test-oldest mutants check setup prove-mixed wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -62,48 +62,16 @@ wheels: setup ## build the wheels of contract, agent and station into dist/
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
 	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
 
-bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
-	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \
-		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
+# The options of the bench's sections: `python -m bench.run --help` tells whose.
+BENCH_OPTIONS := CARS DURATION HOURS KILLS LIMIT MINUTES NEW OLD PART PICTURES PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
 
-bench-guard: setup ## hold the ratios of the last `make bench` against the report in docs/bench
-	@$(BIN)/python -m bench.guard
-
-bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=600 REPORT=figures.json
-	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \
-		$(if $(REPORT),--json "$(REPORT)")
-
-bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 RATE=50 LIMIT=1 REPORT=figures.json
-	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
-		$(if $(RATE),--rate $(RATE)) $(if $(LIMIT),--limit) $(if $(REPORT),--json "$(REPORT)")
-
-bench-drive: setup ## measure driving by hand from the page, with ROS 1: TRIES=50 ONLY="tab hidden" REPORT=figures.json
-	@$(BIN)/python -m bench.browser.driving $(if $(TRIES),--tries $(TRIES)) $(if $(ONLY),--only "$(ONLY)") $(if $(REPORT),--json "$(REPORT)")
-
-bench-stop: setup ## measure the emergency stop under full overload: TRIES=20 REPORT=figures.json
-	@$(BIN)/python -m bench.browser.stopping $(if $(TRIES),--tries $(TRIES)) $(if $(REPORT),--json "$(REPORT)")
-
-bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: CARS=500 RATE=2 SOAK=300 REPORT=figures.json
-	@$(BIN)/python -m bench.browser.page $(if $(CARS),--cars $(CARS)) $(if $(RATE),--rate $(RATE)) $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
-
-bench-analysis: setup ## prove the analysis on simulated cars with known faults, in 15 minutes: QUICK=1 ONLY=coverage OUT=docs/bench
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysis $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY)) $(if $(OUT),--out $(OUT))
-
-bench-analysis-cloud: setup ## analyse 50 robot-hours on an embedded cloud, with progress: HOURS=50 REPORT=figures.json
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.analysed_fleet $(if $(HOURS),--hours $(HOURS)) $(if $(REPORT),--json "$(REPORT)")
-
-bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
-	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
-
-bench-kept: setup ## kill the cloud of make up at random, and soak it for a week of its clock: KILLS=50 SOAK=168 MINUTES=4 OUT=docs/bench
-	@$(BIN)/python -m bench.kept $(if $(KILLS),--kills $(KILLS)) $(if $(SOAK),--soak $(SOAK)) $(if $(MINUTES),--minutes $(MINUTES)) \
-		$(if $(OUT),--out $(OUT)) $(if $(REPORT),--json "$(REPORT)")
-
-bench-look: setup ## look at cars in Chromium, and count at the broker what it costs: CARS=20 PICTURES=folder REPORT=figures.json
-	@$(BIN)/python -m bench.browser.looking $(if $(CARS),--cars $(CARS)) $(if $(PICTURES),--pictures "$(PICTURES)") $(if $(REPORT),--json "$(REPORT)")
+bench: setup ## measure every table of the thesis, or others: ONLY=query,outage or agent, drive, fleet ..., TARGET=aws OUT=docs/bench REPORT=figures.json
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) \
+		$(foreach name,$(BENCH_OPTIONS),$(if $($(name)),--set "$(name)=$($(name))")) $(if $(TARGET),--target $(TARGET)) \
+		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE)) $(if $(REPORT),--report "$(REPORT)")
 
 screenshots: setup ## take the pictures of docs/images anew
-	@$(BIN)/python -m bench.browser.screenshots
+	@$(BIN)/python -m bench.screenshots
 
 verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,files YES=1 KEEP=1 BY=name
 	@$(BIN)/python -m verify.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

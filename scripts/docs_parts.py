@@ -21,8 +21,8 @@ from typer.cli import get_docs_for_click
 
 import iort_agent.errors
 import iort_station.errors
-from bench.report.fleet_costs import fleets
-from bench.report.result import Ratio
+from bench.report import Ratio
+from bench.sections.cost import fleets
 from iort_agent.sources.sim import faults as sim_faults
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.catalog.derived import DERIVED

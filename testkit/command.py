@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import rich.table
 from rich.console import Console
@@ -25,34 +21,8 @@ from rich.progress import (
 )
 from rich.prompt import Confirm
 
-from testkit import machine
-
 Row = Sequence[str]
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-def parser(documentation: str | None) -> argparse.ArgumentParser:
-    """Return a parser with the option --json."""
-    made = argparse.ArgumentParser(description=(documentation or "").splitlines()[0])
-    made.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
-    return made
-
-
-def made() -> dict[str, Any]:
-    """Return the date, the machine and the versions behind figures."""
-    return {"machine": machine.describe()}
-
-
-def write(path: Path | None, figures: Any) -> None:
-    """Write the figures, if there is a file for them."""
-    if path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(figures, indent=2) + "\n")
-
-
-def steps(console: Console) -> Callable[[str], None]:
-    """Tells each step of the work in a dim line."""
-    return lambda step: console.print(f"  {step}", style="dim", highlight=False)
 
 
 def progress(console: Console) -> Progress:

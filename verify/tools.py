@@ -20,7 +20,7 @@ from iort_agent.files.upload import trusting
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.requests.files import (
+from iort_contract.messages.files import (
     Address,
     File,
     FileAnswer,

@@ -1,12 +1,13 @@
 """Publishes many simulated cars to PubNub's stand-in, as Lambda 1 does, to measure the page.
 
-python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20
-"""
+python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20"""
 
 from __future__ import annotations
 
 import argparse
+import base64
 import http
+import io
 import math
 import secrets
 import sys
@@ -17,7 +18,6 @@ from typing import Any
 
 import urllib3
 
-from bench.load import camera
 from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -25,6 +25,43 @@ from iort_contract.cloud import channel
 from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
 from iort_contract.tables import ROBOT
+
+_WIDTH, _HEIGHT, _HORIZON = 96, 54, 20
+
+
+def attachment(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, Value]:
+    """A sample of a camera topic with ``large: upload``; the key has the form of the agent's keys."""
+    content = _jpeg(driven_m, yaw_rate_rad_s)
+    return {
+        "format": "jpeg",
+        "data.key": f"robots/{robot}/2026/05/04/100000-0123456789abcdef/camera/{driven_m * 1e3:.0f}-data.jpg",
+        "data.sha256": "0" * 64,
+        "data.size": 60 * len(content),
+        "data.content_type": "image/jpeg",
+        "data.thumbnail": base64.b64encode(content).decode(),
+    }
+
+
+def _jpeg(driven_m: float, yaw_rate_rad_s: float) -> bytes:
+    from PIL import Image, ImageDraw  # noqa: PLC0415 - only the pictures need it
+
+    image = Image.new("RGB", (_WIDTH, _HEIGHT), (176, 196, 212))
+    draw = ImageDraw.Draw(image)
+    draw.rectangle((0, _HORIZON, _WIDTH, _HEIGHT), fill=(96, 104, 88))
+    for y in range(_HORIZON, _HEIGHT):
+        near = (y - _HORIZON) / (_HEIGHT - _HORIZON)
+        middle = _WIDTH / 2 + 26 * yaw_rate_rad_s * (1 - near) ** 2
+        half = 3 + 40 * near
+        draw.line((middle - half, y, middle + half, y), fill=(70, 72, 76))
+        # Dashes come nearer as the car drives.
+        if math.fmod(driven_m + 2 / (near + 0.08), 2) < 1:
+            draw.line((middle - half / 14, y, middle + half / 14, y), fill=(232, 226, 190))
+        for side in (-1, 1):
+            draw.line((middle + side * half, y, middle + side * half * 1.08, y), fill=(214, 92, 60))
+    out = io.BytesIO()
+    image.save(out, "JPEG", quality=80)
+    return out.getvalue()
+
 
 RATE_HZ = 10.0
 # Length of a simulation step; with larger ones the driver swerves.
@@ -79,7 +116,7 @@ class SimulatedCar:
             "linear_acceleration.y": round(speed_mps * yaw_rate, 3),
             "angular_velocity.z": round(yaw_rate, 3),
         }
-        picture = camera.attachment(self.name, self._driven_m, yaw_rate)
+        picture = attachment(self.name, self._driven_m, yaw_rate)
         return [
             self._update("odom", pose),
             self._update("imu", acceleration),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.report.result import Section
+from bench.report import Section
 from iort_agent.sources.recording.player import Message
 from iort_agent.sources.recording.rosbag import Recording, Unread
 from iort_agent.sources.recording.tool_csv import VescLog

@@ -9,11 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from bench.probes import dynamodb, functions, iot_core, watching
-from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture
-from bench.report import thesis
-from bench.report.result import Section
-from bench.report.thesis import UNSAID, said
+from bench import probes as dynamodb
+from bench import probes as functions
+from bench import probes as iot_core
+from bench import probes as watching
+from bench import thesis
+from bench.probes import AbilityMissingError, ProbeFixture
+from bench.report import Section
+from bench.sections import Declared
+from bench.thesis import UNSAID, said
 from testkit.command import Table
 from testkit.target import Say, Target
 
@@ -106,3 +110,6 @@ def _answer(probe: Probe, fixture: ProbeFixture) -> tuple[str, str]:
         return "no", str(missing)
     except Exception as error:  # noqa: BLE001 - any other behaviour of the service is an answer
         return "no", f"{type(error).__name__}: {error}"[:160]
+
+
+SECTION = Declared("the abilities of each service, tried", run)

@@ -17,8 +17,8 @@ from statistics import median
 from typing import NamedTuple
 
 from bench.load import stored_drive
-from bench.report.result import Section
-from bench.report.spread import ratio
+from bench.report import Section, ratio
+from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
 from testkit.car import RATE_HZ
@@ -113,3 +113,6 @@ def _timed(command: list[str], environment: Mapping[str, str]) -> Times:
 def _children_s() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
+
+
+SECTION = Declared("how long a person waits for `iort`", run)

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from bench.report import plots
-from bench.report.result import Section
-from bench.report.spread import spread, text
+from bench import plots
+from bench.report import Section, spread, text
+from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.operations import audit, trace
@@ -159,3 +159,6 @@ def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
             "robot => window.iort?.robots[robot]?.streams?.vesc", arg=robot, timeout=60_000
         )
         yield page
+
+
+SECTION = Declared("from the car to a subscriber and to a painted frame", run)

@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Iterable
 
 from bench.floors.raw_mqtt import RawClient
-from bench.report.result import NOT_MEASURED, Section
-from bench.report.spread import spread
+from bench.report import NOT_MEASURED, Section, spread
+from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND
@@ -190,3 +190,6 @@ def _add(
             late, count = (f"{name.format(kind)} / alone" for name in names)
             section.ratio(late, round(one.p95 / alone.p95, 2), _MOST, tolerance=tolerance)
             section.ratio(count, round(one.n / alone.n, 2), 0.9, at_least=True)
+
+
+SECTION = Declared("one robot at the limit beside another", run)

@@ -21,11 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.floors.mosquitto import Mosquitto, found
-from bench.meters.watcher import subscribed
-from bench.report import plots
-from bench.report.result import NOT_MEASURED, Section
+from bench import plots
+from bench.floors.mosquitto import Mosquitto, found, subscribed
+from bench.report import NOT_MEASURED, Section
 from bench.ros.mixed_robot import MIXED, topics
+from bench.sections import Declared
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_contract.messages.batch import decode_batch
@@ -76,7 +76,7 @@ class Found:
         return sum(max(0, sent - got.get(topic, 0)) for topic, sent in self.published.items())
 
 
-def run(_target: Target, say: Say) -> Section:
+def run(_target: Target | None, say: Say) -> Section:
     """Drive the mixed robot once; the target is not used."""
     section = Section("mixed", "A mixed robot beside rosbag record")
     program = found()
@@ -256,3 +256,6 @@ def report(section: Section, result: Found) -> None:
     # `dataclasses.asdict`, by which the report is written, makes no sense of a Counter.
     plain = {name: dict(one) if isinstance(one, Counter) else one for name, one in vars(result).items()}
     section.raw = {**plain, "lost": lost}
+
+
+SECTION = Declared("a robot of many topics, beside rosbag record", run, cloud=False)

@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
 
-from bench.report import plots
-from bench.report.result import NOT_MEASURED, Section
-from bench.report.spread import spread
+from bench import plots
+from bench.report import NOT_MEASURED, Section, spread
+from bench.sections import Declared
 from iort_agent.config import load_config
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -180,3 +180,6 @@ def _way(target: Target, bundle: Bundle) -> Iterator[tuple[Callable[[], None], C
         iot.update_certificate(certificateId=number, newStatus="INACTIVE")
 
     yield cut, mend
+
+
+SECTION = Declared("a minute without a broker", run)

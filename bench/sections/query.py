@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
 
+from bench import plots, thesis
 from bench.load import stored_drive
-from bench.meters.message_sizes import item_bytes
-from bench.report import plots, thesis
-from bench.report.result import NOT_MEASURED, Section
-from bench.report.spread import ratio
+from bench.load.message_sizes import item_bytes
+from bench.report import NOT_MEASURED, Section, ratio
+from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
@@ -246,3 +246,6 @@ def _thesis_table(target: Target, items: list[dict[str, Any]]) -> Iterator[Any]:
         yield table
     finally:
         table.delete()
+
+
+SECTION = Declared("query and scan, beside the thesis' layout", run)

@@ -4,37 +4,174 @@ Durations come from Lambda's REPORT lines. The embedded cloud gives every functi
 memory size. So there the operating system also measures processor time, which is projected to each memory
 size. On AWS each size is set and measured.
 
-Beside the functions run their floors (`bench.floors.functions`), with the same events in turns.
-"""
+Beside the functions run their floors (`bench.floors.functions`), with the same events in turns."""
 
 from __future__ import annotations
 
+import base64
 import inspect
 import json
+import re
 import subprocess
 import sys
-from contextlib import ExitStack
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
 from itertools import count
 from statistics import median
 from typing import Any
 
-from bench.floors.functions import live as live_floor
-from bench.floors.functions import summarize as summarize_floor
+from bench import plots, thesis
+from bench.floors import live as live_floor
+from bench.floors import summarize as summarize_floor
 from bench.load import stored_drive
-from bench.load.events import live_event, stream_event
-from bench.meters.invocations import Event, Measured, invoke, measure, reporting
-from bench.report import plots, thesis
-from bench.report.result import NOT_MEASURED, Section
-from bench.report.spread import ratio, spread
+from bench.report import NOT_MEASURED, Section, ratio, spread
+from bench.sections import Declared
+from iort_agent.sources.sim import Sensors
+from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.codec import DICTIONARY
+from iort_contract.messages.envelope import rule_event
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import LIVE, RECORD, build_topic
-from testkit import ROOT
+from testkit import ROOT, machine
 from testkit.car import RATE_HZ
 from testkit.target import Say, Target, configure, temporary_function
-from testkit.waiting import InstrumentError
+from testkit.waiting import InstrumentError, reached
+
+_LOGS_S = 60.0
+_REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
+_INIT = re.compile(r"Init Duration: ([\d.]+) ms")
+
+# Makes the event of an invocation, by its number in the round.
+Event = Callable[[int], dict[str, Any]]
+
+
+@dataclass
+class Measured:
+    """The figures of one function in ms.
+
+    ``duration_ms`` has a list for each round. ``cpu_ms`` has the processor time an invocation for each round,
+    on the embedded cloud. ``init_ms`` has the start times of new environments.
+    """
+
+    duration_ms: list[list[float]] = field(default_factory=list)
+    cpu_ms: list[float] = field(default_factory=list)
+    init_ms: list[float] = field(default_factory=list)
+
+
+def measure(target: Target, function: str, event: Event, calls: int, found: Measured) -> None:
+    """Invoke the function ``calls`` times, one after the other, and add the round to ``found``.
+
+    Raises `InstrumentError` where an invocation fails, or no REPORT line comes.
+    """
+    began_ms = int(time.time() * 1000)
+    before = _cpu(target)
+    told = [invoke(target, function, event(i)) for i in range(calls)]
+    if target.embedded is not None:
+        found.cpu_ms.append(machine.spent_ms(before, _cpu(target)) / calls)
+    # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
+    reports = [line for line in told if line is not None]
+    if len(reports) < calls:
+        reports = _logged(target, function, began_ms, calls)
+    found.duration_ms.append([float(match[1]) for line in reports if (match := _REPORT.match(line))])
+    found.init_ms += [float(match[1]) for line in reports if (match := _INIT.search(line))]
+
+
+def _cpu(target: Target) -> dict[int, int]:
+    return (
+        {}
+        if target.embedded is None
+        else machine.threads_ns(machine.descendants(target.embedded.emulator.pid))
+    )
+
+
+def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
+    """Run the function once; return its REPORT line, if the answer has it. Raises `InstrumentError`."""
+    answer = target.cloud.client("lambda").invoke(
+        FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
+    )
+    if "FunctionError" in answer:
+        raise InstrumentError(f"{function}: {answer['Payload'].read()[:400]!r}")
+    return report_line(base64.b64decode(answer.get("LogResult", "")).decode(errors="replace"))
+
+
+def report_line(tail: str) -> str | None:
+    """Return the REPORT line of an invocation's log, if there is one."""
+    match = _REPORT.search(tail)
+    return None if match is None else match[0]
+
+
+def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[str]:
+    """Wait for the REPORT lines since ``began_ms`` in the function's log, and return them."""
+    configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=function)
+    group = configuration.get("LoggingConfig", {}).get("LogGroup", f"/aws/lambda/{function}")
+    logs = target.cloud.client("logs").get_paginator("filter_log_events")
+    reports: list[str] = []
+
+    def all_there() -> bool:
+        pages = logs.paginate(logGroupName=group, startTime=began_ms, filterPattern="REPORT")
+        lines = (event["message"] for page in pages for event in page["events"])
+        reports[:] = [line for line in lines if _REPORT.match(line)]
+        return len(reports) >= calls
+
+    if not reached(all_there, within_s=_LOGS_S, poll_s=0.5) and not reports:
+        raise InstrumentError(
+            f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
+        )
+    return reports
+
+
+@contextmanager
+def reporting(target: Target, function: str) -> Iterator[None]:
+    """Have Lambda write REPORT lines; the stacks leave them out (`function_logs`)."""
+    client = target.cloud.client("lambda")
+    was = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
+    if was.get("LogFormat") != "JSON":
+        yield
+        return
+    try:
+        configure(client, function, LoggingConfig={"LogFormat": "Text", "LogGroup": was["LogGroup"]})
+        yield
+    finally:
+        configure(client, function, LoggingConfig=was)
+
+
+# Time enough that a robot's share of Lambda 2 is whole again.
+_ARRIVES_EVERY_S = 10
+
+
+def stream_event(items: Sequence[dict[str, Any]], number: int = 0) -> dict[str, Any]:
+    """Stored batches as the telemetry table's stream brings them. The events of a drive arrive one after the
+    other, by their ``number``, so that no robot is over its share."""
+    records = [
+        {
+            "eventID": f"bench-{i}",
+            "eventName": "INSERT",
+            "eventSource": "aws:dynamodb",
+            "dynamodb": {
+                "ApproximateCreationDateTime": int(time.time()) + number * _ARRIVES_EVERY_S,
+                "Keys": {name: item[name] for name in (TOPIC, BATCH)},
+                "NewImage": item,
+                "SequenceNumber": f"{i + 1:021}",
+                "StreamViewType": "NEW_IMAGE",
+            },
+        }
+        for i, item in enumerate(items)
+    ]
+    return {"Records": records}
+
+
+def live_event(topic: str, number: int) -> dict[str, Any]:
+    """A live message of a VESC, as the live rule sends it to Lambda 1."""
+    now_us = time.time_ns() // 1000
+    sample = Sensors(Vehicle(VehicleConfig(), seed=1), seed=1).vesc()
+    message = encode_live(LiveSample("0badcafe", number, now_us - 1000, now_us, sample))
+    return rule_event(message, topic, now_us // 1000)
+
 
 SIZES_MB = (128, 256, 512, 1024, 1769)
 # "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".
@@ -249,13 +386,16 @@ def _floors(target: Target, stack: ExitStack) -> dict[str, str]:
 
 def _cycle() -> dict[str, float]:
     done = subprocess.run(
-        [sys.executable, "-m", "bench.meters.cycle", "5000"],
+        [sys.executable, "-m", "bench.ros.cycle", "5000"],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode:
-        raise InstrumentError(f"bench.meters.cycle failed: {done.stderr[-800:]}")
+        raise InstrumentError(f"bench.ros.cycle failed: {done.stderr[-800:]}")
     found: dict[str, float] = json.loads(done.stdout)
     return found
+
+
+SECTION = Declared("functions and node, beside their floors", run)

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 
-from bench.report.result import Section
-from bench.report.spread import Spread, spread, text
+from bench.report import Section, Spread, spread, text
+from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import IOT, PUBNUB
 from iort_contract.limits import LIVE_BROKER_EVERY_S, LIVE_MAX_RATE_HZ
@@ -206,3 +206,6 @@ def report(
 def _numbers(values: list[float]) -> dict[str, float] | None:
     found: Spread | None = spread([values])
     return asdict(found) if found else None
+
+
+SECTION = Declared("the live lane while nobody looks, and awake", run)

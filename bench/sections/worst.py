@@ -6,7 +6,8 @@ import time
 import tracemalloc
 from typing import NamedTuple
 
-from bench.report.result import Section
+from bench.report import Report, Section
+from bench.sections import Declared
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import decode_batch
 from iort_contract.statistics import summarize_second
@@ -14,6 +15,7 @@ from testkit.target import Say, Target
 from testkit.worst_case import cases
 
 _TIMES = 5
+WORST = Report("worst", "The most expensive batches", "make bench ONLY=worst")
 
 
 class Cost(NamedTuple):
@@ -49,7 +51,7 @@ def _held_mb(message: bytes) -> float:
     return held / 1e6
 
 
-def run(_target: Target, say: Say) -> Section:
+def run(_target: Target | None, say: Say) -> Section:
     """Decode and summarise each batch on one core."""
     section = Section("worst", "The most expensive batches")
     rows = []
@@ -63,3 +65,11 @@ def run(_target: Target, say: Say) -> Section:
         "Decoded and summarised", ["batch", "on the wire", "processor time", "held", "refused"], rows
     )
     return section
+
+
+SECTION = Declared(
+    "the most expensive batches",
+    run,
+    report=WORST,
+    cloud=False,
+)

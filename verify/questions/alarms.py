@@ -277,7 +277,7 @@ def metric(target: Target) -> Seen:
     relied_on_by=(
         "stacks/monitoring.py",
         "functions/shared/metrics.py",
-        "station/iort_station/operations/monitoring/log_records.py",
+        "station/iort_station/operations/cloudwatch.py",
         "local/patches/log_records.patch",
     ),
 )

@@ -10,8 +10,8 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from iort_contract.archive import DUE, TASK
-from iort_contract.catalog.analysis.kinds import ANALYSIS_FAILED
-from iort_contract.messages.analysis.run import AnalysisRequest
+from iort_contract.catalog.analysis import ANALYSIS_FAILED
+from iort_contract.messages.analysis import AnalysisRequest
 from iort_station.data import findings
 from iort_station.errors import StationError
 from iort_station.fleet import registry

@@ -15,8 +15,8 @@ from iort_contract.tables import BATCH
 from iort_contract.topics import rule_name
 from iort_station.data.recorded import summary_table
 from iort_station.fleet import control
-from iort_station.operations.delivery import counts
-from iort_station.operations.replay import replay
+from iort_station.operations import audit
+from iort_station.operations.quarantine import replay
 from testkit.target import Target, temporary_function
 from testkit.waiting import until
 from testkit.worst_case import worst_batches
@@ -205,7 +205,7 @@ def reported(target: Target) -> Seen:
 
 
 def _summarized(target: Target, robot: str) -> int:
-    return counts.samples_summarized(target.cloud, robot, VESC_STREAM)
+    return audit.samples_summarized(target.cloud, robot, VESC_STREAM)
 
 
 @question(
@@ -239,7 +239,7 @@ def refused_batch(target: Target) -> Seen:
     "quarantine.replayed",
     expected={"before": 0, "fate": "replayed", "summarized": 1, "left": 0},
     source="https://docs.aws.amazon.com/iot/latest/developerguide/iot-basic-ingest.html",
-    relied_on_by=("station/iort_station/operations/replay.py", "functions/quarantine.py"),
+    relied_on_by=("station/iort_station/operations/quarantine.py", "functions/quarantine.py"),
 )
 def replayed(target: Target) -> Seen:
     """A batch in quarantine is published again to its rule alone, by Basic Ingest; it is then in the

@@ -24,7 +24,7 @@ METER, WRITE, READ, PUBNUB_UNIT = 5 * 1024, 1024, 4 * 1024, 2048
 _ITEM_OVERHEAD = 100
 _HOUR_S, _YEAR_DAYS = 3600.0, 365
 
-# --- sizes, as `python -m bench.meters.message_sizes` measures them -------------------------------------
+# --- sizes, as `python -m bench.load.message_sizes` measures them -------------------------------------
 
 # The telemetry item of one sample of the agent's metrics.
 OWN_ITEM_BYTES = 236
@@ -146,7 +146,7 @@ _SOUGHT_SHARE, _SOUGHT_DAYS = 0.2, 14
 # run at once, each an express workflow. A drive takes seconds, units and objects for reading and writing.
 ANALYSIS_MB, DRIVES_AT_ONCE, DRIVE_OBJECTS = 1769, 40, 5
 _WORKFLOW_MB, _DRIVE_S, _DRIVE_WRITES = 64, 1.0, 4
-# A robot-hour with 180,000 samples took 1.6 s of this project's test machine, as `make bench-analysis`
+# A robot-hour with 180,000 samples took 1.6 s of this project's test machine, as `make bench ONLY=analysis`
 # measures it; its results were 0.5 MB, which are kept, here counted for a year.
 _ANALYSED_SAMPLE_S, _RESULT_BYTES, _RESULT_MONTHS = 1.6 / 180_000, 5e5 / 180_000, 12
 # States of a run, besides one for each robot and one for each drive; three of them call a function. Both days

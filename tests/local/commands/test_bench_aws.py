@@ -9,10 +9,9 @@ import json
 import pytest
 from botocore.exceptions import ClientError
 
-from bench import run
-from bench.load.events import live_event
-from bench.report import spending
+from bench import run, spending
 from bench.sections import SECTIONS, utilisation
+from bench.sections.utilisation import live_event
 from iort_station.fleet import identity, robots
 from testkit.target import AWS, open_target
 
@@ -23,7 +22,9 @@ def memory_mb(cloud) -> int:
 
 
 def options(tmp_path, *only: str, yes: bool):
-    return argparse.Namespace(only=list(only), target=AWS, namespace="iort", yes=yes, out=tmp_path)
+    return argparse.Namespace(
+        only=list(only), values=[], target=AWS, namespace="iort", yes=yes, out=tmp_path, report=None
+    )
 
 
 def test_each_run_has_its_own_robots_and_removes_them(embedded):

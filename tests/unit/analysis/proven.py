@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import NamedTuple
 
-from bench.proof.cars import drive_of, fault_of
-from bench.proof.drives import simulated
+from bench.proof.fleet import drive_of, fault_of, simulated
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
 

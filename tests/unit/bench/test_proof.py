@@ -7,12 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.proof import speed
-from bench.proof.analysing import Analysed
-from bench.proof.cars import drive_of, fault_of
-from bench.proof.drives import Simulated, simulated
-from bench.proof.judging import RIGHT, Car, coverage, detection, judge
-from bench.proof.truths import TRUTHS
+from bench.proof import report
+from bench.proof.fleet import Simulated, drive_of, fault_of, simulated
+from bench.proof.judging import RIGHT, TRUTHS, Analysed, Car, coverage, detection, judge
 from iort_agent.sources.sim.faults import KINDS as FAULTS
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
@@ -108,7 +105,7 @@ def test_every_truth_is_of_a_parameter_and_in_its_unit():
 
 
 def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
-    once, twice, slow = (speed.bill(*these, 600.0) for these in ((100, 2.0), (200, 2.0), (100, 20.0)))
+    once, twice, slow = (report.bill(*these, 600.0) for these in ((100, 2.0), (200, 2.0), (100, 20.0)))
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
     assert slow.dollars["Lambda, computing"] > once.dollars["Lambda, computing"]

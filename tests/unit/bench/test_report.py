@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import pytest
 
-from bench import guard
-from bench.report import plots, writer
-from bench.report.result import Plot, Ratio, Section
-from bench.report.spread import ratio, spread
+from bench import plots, run
+from bench import report as writer
+from bench.report import Plot, Ratio, Report, Section, ratio, spread
+from bench.sections import ALL, SECTIONS, Declared, Option, guard, load, numbers, values
 from scripts.docs_parts import REPORT
 from testkit.command import Table
+from testkit.waiting import InstrumentError
 
 MACHINE = {
     "date": "2026-01-02T03:04:05+00:00",
@@ -137,21 +140,80 @@ def test_the_guard_names_missing_figures_and_sections_that_were_not_run():
 
 
 @pytest.mark.parametrize(
-    ("change", "status", "said"),
+    ("change", "said"),
     [
-        ({}, 0, "1 figures compared, 0 worse"),
-        ({"target": "aws"}, 2, "a report of aws says nothing about one of embedded"),
-        ({"sections": []}, 2, "has no figure of"),
+        ({}, ""),
+        ({"target": "aws"}, "a report of aws says nothing about one of embedded"),
+        ({"sections": []}, "has no figure of"),
     ],
 )
-def test_the_guard_reports_its_comparison(tmp_path, capsys, change, status, said):
+def test_the_guard_compares_reports_of_one_target(tmp_path, change, said):
     report = _report(Ratio("r", 1, 2))
     for name, content in (("old", report), ("new", {**report, **change})):
         (tmp_path / name).write_text(json.dumps(content))
+    files = {"new": tmp_path / "new", "old": tmp_path / "old"}
+    if said:
+        with pytest.raises(InstrumentError, match=said):
+            guard.run(None, print, **files)
+    else:
+        (worse,) = guard.run(None, print, **files).ratios
+        assert (worse.value, worse.reached) == (0, True)
+
+
+def test_a_merged_report_keeps_what_was_not_measured_again(tmp_path):
+    kind = Report("kept", "Kept", "make bench", merged=True)
+    then, now = ({**MACHINE, "commit": commit} for commit in ("then", "now"))
+    first, second = replace(_section(), key="first"), replace(_section(), key="second")
+    writer.write(tmp_path, [first, second], then, "embedded", kind)
+    writer.write(tmp_path, [replace(second, title="again", notes=[])], now, "embedded", kind)
+    sections, machine = writer.read(tmp_path, kind)
+    assert [section.title for section in sections] == [first.title, "again"]
+    assert (machine["commit"], sections[1].notes) == (
+        "then",
+        [f"Measured on {now['date'][:10]}, commit now."],
+    )
+    writer.write(tmp_path, [first, second], now, "embedded", kind)
+    assert writer.read(tmp_path, kind) == ([first, second], now)
+
+
+def _declared(*options, section=None):
+    return Declared("", lambda *_, **__: section or _section(), options, cloud=False)
+
+
+def test_options_are_read_by_the_section_that_has_them():
+    both = {"a": _declared(Option("CARS", int, 20, "")), "b": _declared(Option("ROBOTS", numbers, [1], ""))}
+    assert values(both, ["CARS=3"]) == {"a": {"cars": 3}, "b": {"robots": [1]}}
+    assert values(both, ["ROBOTS=10 200"])["b"] == {"robots": [10, 200]}
+    with pytest.raises(ValueError, match="KILLS: a, b has CARS, ROBOTS"):
+        values(both, ["KILLS=1"])
+    with pytest.raises(ValueError, match="CARS=many"):
+        values(both, ["CARS=many"])
+
+
+def test_every_section_declares_itself():
+    for key in ALL:
+        declared = load(key)
+        assert declared.what
+        assert declared.report.name == "report" if key in SECTIONS else declared.report.name != "report"
+
+
+@pytest.mark.parametrize(
+    ("value", "status"), [(1, 0), (3, 1), (None, 2)], ids=["reached", "missed", "not measured"]
+)
+def test_a_missed_target_is_an_exit_status(tmp_path, monkeypatch, value, status):
+    def measure(_target, _say):
+        if value is None:
+            raise InstrumentError("it failed")
+        return _section(Ratio("r", value, 2))
+
+    monkeypatch.setattr(run.sections, "load", lambda _: Declared("", measure, cloud=False))
+    options = argparse.Namespace(
+        only=["cost"], values=[], target="embedded", namespace="iort", yes=False, out=tmp_path, report=None
+    )
     with pytest.raises(SystemExit) as ended:
-        guard.main(["--new", str(tmp_path / "new"), "--old", str(tmp_path / "old")])
+        run.run(options)
     assert ended.value.code == status
-    assert said in "".join(capsys.readouterr())
+    assert (tmp_path / "report.md").exists() is (value is not None)
 
 
 def test_the_guard_reads_the_kept_report():

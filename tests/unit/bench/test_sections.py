@@ -6,12 +6,9 @@ import json
 
 import pytest
 
-from bench.meters import invocations
-from bench.meters.invocations import Measured
-from bench.meters.round_trips import RAW
-from bench.probes.probe_fixture import AbilityMissingError
-from bench.report import thesis
-from bench.report.result import Section
+from bench import thesis
+from bench.probes import AbilityMissingError
+from bench.report import Section
 from bench.ros import mixed_robot
 from bench.sections import (
     SECTIONS,
@@ -21,11 +18,12 @@ from bench.sections import (
     mixed,
     outage,
     query,
-    thesis_ping,
+    round_trips,
     utilisation,
     viewing,
 )
-from bench.sections.utilisation import BATCHES
+from bench.sections.round_trips import RAW
+from bench.sections.utilisation import BATCHES, Measured
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.ros1.definition import parse
 from iort_contract.topics import BROKER, LAMBDA, RULE, live_topic, record_topic
@@ -35,13 +33,13 @@ def test_lambdas_report_lines_are_read():
     line = "REPORT RequestId: 8f50\tDuration: 12.34 ms\tBilled Duration: 13 ms\tMemory Size: 256 MB\t"
     cold = line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t"
     tail = f"START RequestId: 8f50 Version: $LATEST\nREPORTED\nEND RequestId: 8f50\n{cold}\n"
-    assert invocations.report_line(tail) == cold
-    assert invocations.report_line("START RequestId: 8f50\n") is None
-    duration, init = invocations._REPORT.match(cold), invocations._INIT.search(cold)
+    assert utilisation.report_line(tail) == cold
+    assert utilisation.report_line("START RequestId: 8f50\n") is None
+    duration, init = utilisation._REPORT.match(cold), utilisation._INIT.search(cold)
     assert duration is not None
     assert init is not None
     assert (float(duration[1]), float(init[1])) == (12.34, 250.5)
-    assert invocations._INIT.search(line) is None
+    assert utilisation._INIT.search(line) is None
 
 
 def test_the_projection_scales_with_the_cpu_share_of_the_memory_size():
@@ -152,12 +150,12 @@ def test_the_thesis_tables_are_in_the_report_with_their_source():
 def test_round_trips_with_the_thesis_ping_are_shown_beside_its_figures():
     took_ms = {BROKER: 52.0, RULE: 53.0, LAMBDA: 58.0, RAW: 51.0}
     found = {
-        f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in thesis_ping.RATES_HZ
+        f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in round_trips.RATES_HZ
     }
     section = Section("round_trips", "")
-    thesis_ping.report(
+    round_trips.report(
         section,
-        {**found, thesis_ping.DASHBOARD: [[60.0] * 3], thesis_ping.ECHO: [[50.5] * 3]},
+        {**found, round_trips.DASHBOARD: [[60.0] * 3], round_trips.ECHO: [[50.5] * 3]},
     )
     rows = {row[0]: row[1:] for row in section.tables[0].rows}
     ten_hz = {name: (row[1], row[-1]) for name, row in rows.items()}

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.proof.cars import drive_of
-from bench.proof.drives import simulated
+from bench.proof.fleet import drive_of, simulated
 from iort_agent.sources.sim.faults import FaultConfig
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive

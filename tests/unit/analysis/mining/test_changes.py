@@ -97,8 +97,7 @@ def test_a_stretch_like_no_other_is_found() -> None:
 
 
 def test_friction_that_begins_on_the_way_is_found_at_its_time() -> None:
-    from bench.proof.cars import drive_of
-    from bench.proof.drives import simulated
+    from bench.proof.fleet import drive_of, simulated
     from iort_agent.sources.sim.faults import FaultConfig
 
     spec = drive_of(300, 1, [FaultConfig("added_friction", "strong", 180.0)], seconds=300.0)

@@ -1,13 +1,12 @@
-"""The intervals of a car's parameters, on drives of a few cars of any lab: `make bench-analysis` has more."""
+"""The intervals of a car's parameters, on a few cars of any lab: `make bench ONLY=analysis` has more."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
 
-from bench.proof.cars import ANY_CARS, drive_of
-from bench.proof.drives import simulated
-from bench.proof.truths import INDICATORS, SPANNING, TRUTHS
+from bench.proof.fleet import ANY_CARS, drive_of, simulated
+from bench.proof.judging import INDICATORS, SPANNING, TRUTHS
 from iort_agent.sources.sim import ALL
 from iort_analysis.process import MINERS, analyse
 from iort_contract.catalog.derived import F1TENTH

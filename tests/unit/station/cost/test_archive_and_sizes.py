@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bench.meters import message_sizes
+from bench.load import message_sizes
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.cloud import PUBNUB
 from iort_station.cli.main import app
@@ -173,7 +173,7 @@ def test_each_item_of_a_second_fits_in_one_write_unit():
 def test_the_table_of_sizes_matches_measured_sizes(row):
     # Versions of zlib differ a little in size.
     fresh = message_sizes.batch_sizes(row.samples, 1.0)
-    assert row == pytest.approx(fresh, rel=0.03), "put in what `python -m bench.meters.message_sizes` prints"
+    assert row == pytest.approx(fresh, rel=0.03), "put in what `python -m bench.load.message_sizes` prints"
 
 
 def test_the_other_sizes_match_measured_sizes():

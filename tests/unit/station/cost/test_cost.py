@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bench.meters import message_sizes
+from bench.load import message_sizes
 from functions.shared.metrics import Gathered, emit
 from functions.shared.summary import measure
 from iort_agent.agent import Agent

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.meters.message_sizes import stored_bytes
+from bench.load.message_sizes import stored_bytes
 from iort_analysis.samples.batches import RefusedItems, blocks, decode_each, decode_together, part
 from iort_analysis.samples.blocks import join
 from iort_contract.checks import wire_column

@@ -1,1 +1,0 @@
-"""Commands that look at the page in Chromium, or drive from it."""

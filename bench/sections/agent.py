@@ -1,0 +1,217 @@
+"""The cost of the agent on a real ROS 1 graph, beside a bare rospy subscriber, at 50 Hz and at 1000 Hz.
+
+- the processor time a sample, of the agent (both lanes, the spool, TLS to the embedded cloud's broker) and of
+  a bare subscriber of the same topic in the same run;
+- the memory at the start and at the end, and the samples lost;
+- the delay from ROS publish to an MQTT subscriber over the live lane, beside a bare MQTT client's. This needs
+  mosquitto: the embedded cloud's broker hands Basic Ingest messages to the rule and to no subscriber, as AWS
+  IoT does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from bench import thesis
+from bench.floors import mosquitto
+from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
+from bench.report import Report, Section
+from bench.ros.mixed_robot import CORE
+from bench.sections import Declared, Option
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.limits import LIVE_MAX_RATE_HZ
+from iort_contract.messages.live import decode_live
+from iort_contract.topics import LIVE, build_topic, live_topic
+from iort_station.cloud import Cloud
+from iort_station.fleet import robots
+from iort_station.operations import audit
+from local.figures import Spread
+from testkit import machine
+from testkit.ros import PYTHONPATH, RosError, RosGraph, python_with_rospy
+from testkit.target import Say, Target
+from testkit.waiting import reached
+
+TOPIC = "/sensors/core"
+_FLOOR = "bench/floor"
+# A live message goes one way or the other; unlike AWS IoT, mosquitto delivers both.
+_AGENT = (build_topic(LIVE, ROBOT, VESC_STREAM), live_topic(ROBOT, VESC_STREAM))
+_WARM_UP_S = 3
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The delays at one rate, of the agent and of the floor."""
+
+    rate_hz: int
+    agent_ms: Spread
+    floor_ms: Spread
+
+
+def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
+    """Run both side by side. Raises `RosError` if one of the processes stops."""
+    agent_ms: list[float] = []
+    floor_ms: list[float] = []
+
+    def take(topic: str, payload: bytes) -> None:
+        now_us = time.time_ns() // 1000
+        if topic == _FLOOR:
+            floor_ms.append((now_us - _stamp_us(payload)) / 1000)
+        else:
+            agent_ms.append((now_us - decode_live(payload).t_us) / 1000)
+
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Mosquitto(program, Path(name)) as broker,
+        RosGraph(python, Path(name)) as graph,
+        subscribed(broker, (*_AGENT, _FLOOR), take),
+    ):
+        car = broker.car({TOPIC: {"stream": VESC_STREAM, "time": "header"}})
+        graph.start("iort_agent.cli", "run", "--config", car)
+        every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
+        floor = (TOPIC, every, broker.port, *broker.identity("floor"), broker.ca, _FLOOR)
+        graph.start("bench.floors.mqtt_floor", *floor)
+        publisher = graph.publisher(CORE, seconds + _WARM_UP_S, rate_hz=rate_hz)
+        publisher.ready()
+        publisher.go()
+        publisher.publish_for(_WARM_UP_S)
+        warm = len(agent_ms), len(floor_ms)
+        publisher.finish()
+    return Lane(rate_hz, Spread.of(agent_ms[warm[0] :]), Spread.of(floor_ms[warm[1] :]))
+
+
+def _stamp_us(message: bytes) -> int:
+    _, sec, nanosec = struct.unpack_from("<III", message)
+    return int(sec * 1_000_000 + nanosec // 1000)
+
+
+RATES_HZ = (50, 1000)
+# The most: processor time and live delay as a multiple of the floor's in the same run, memory, and the node's
+# cycle as a share of the thesis'.
+CPU_TIMES = {50: 3.5, 1000: 2.0}
+LIVE_TIMES, RSS_MB, CYCLE_SHARE = 2.0, 80.0, 0.05
+_CATCH_UP_S = 30.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """The figures at one rate: processor time a sample in us, memory, and lost samples."""
+
+    rate_hz: int
+    samples: int
+    lost: int
+    agent_cpu_us: float
+    floor_cpu_us: float
+    rss_mb_first: float
+    rss_mb_last: float
+
+
+def run(target: Target, say: Say, *, duration: int, soak: int) -> Section:
+    """Measure each rate on the embedded cloud, then the live lane through mosquitto."""
+    section, python, lanes = Section("agent", "The agent on a real ROS 1 graph"), python_with_rospy(), []
+    cycle, runs = _cycle(python), []
+    for rate_hz in (1000,) if soak else RATES_HZ:
+        say(f"{rate_hz} Hz for {soak or duration} s")
+        runs.append(_measure(target.cloud, python, rate_hz, soak or duration))
+    program = mosquitto.found()
+    if program is None:
+        section.notes.append("mosquitto is not installed (apt install mosquitto): the live lane is left out.")
+    for rate_hz in RATES_HZ if program is not None and not soak else ():
+        say(f"mosquitto, {rate_hz} Hz for {duration} s")
+        lanes.append(measure(str(program), python, rate_hz, duration))
+    report(section, runs, cycle, lanes)
+    return section
+
+
+def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
+    robot, count = f"bench-{rate_hz}", rate_hz * (seconds + _WARM_UP_S)
+    with tempfile.TemporaryDirectory() as name, RosGraph(python, Path(name)) as graph:
+        topics = {TOPIC: {"stream": VESC_STREAM, "time": "header"}}
+        settings = {
+            "sources": [{"type": "ros1", "topics": topics}],
+            "queue": {"path": "spool.db"},
+            "live": {"when": "always"},
+        }
+        bundle = robots.add(cloud, robot, out=Path(name), settings=settings)
+        agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
+        floor = graph.start("bench.floors.ros_floor", TOPIC)
+        publisher = graph.publisher(CORE, seconds + _WARM_UP_S, rate_hz=rate_hz)
+        publisher.ready()
+        publisher.go()
+        publisher.publish_for(_WARM_UP_S)
+        before, began = (machine.usage_of(agent.pid), machine.usage_of(floor.pid)), time.monotonic()
+        publisher.publish_for(seconds - 1)
+        measured = (time.monotonic() - began) * rate_hz
+        after = machine.usage_of(agent.pid), machine.usage_of(floor.pid)
+        publisher.finish()
+
+        def stored() -> int:
+            return sum(len(batch.times_us) for batch in audit.batches(cloud, robot, VESC_STREAM))
+
+        reached(lambda: stored() >= count, within_s=_CATCH_UP_S, poll_s=0.5)
+        lost = count - stored()
+        agent.terminate()
+        agent.wait()
+    agent_us, floor_us = (
+        round((then.cpu_s - first.cpu_s) / measured * 1e6, 1)
+        for first, then in zip(before, after, strict=True)
+    )
+    rss_mb = round(before[0].rss_mb, 1), round(after[0].rss_mb, 1)
+    return Run(rate_hz, count, lost, agent_us, floor_us, *rss_mb)
+
+
+def _cycle(python: str) -> dict[str, float]:
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
+    command = [python, "-m", "bench.ros.cycle", "20000"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RosError(f"{' '.join(command)} failed:\n{done.stderr[-1000:]}")
+    found: dict[str, float] = json.loads(done.stdout)
+    return found
+
+
+def report(section: Section, runs: list[Run], cycle: dict[str, float], lanes: list[Lane]) -> None:
+    """Add the table and the figures with their targets."""
+    rows = []
+    for run in runs:
+        rate, ours, floor = f"at {run.rate_hz} Hz", run.agent_cpu_us, run.floor_cpu_us
+        rss = f"{run.rss_mb_first:.1f} to {run.rss_mb_last:.1f} MB"
+        rows.append([f"processor a sample {rate}", f"{ours:.0f} us", f"{floor:.0f} us"])
+        rows.append([f"memory {rate}, first to last", rss, ""])
+        times = round(ours / floor, 2)
+        section.ratio(f"agent's processor a sample {rate} / floor", times, CPU_TIMES[run.rate_hz])
+        section.ratio(f"agent's memory {rate}", run.rss_mb_last, RSS_MB, unit="MB")
+        section.ratio(f"samples lost {rate}", run.lost, 0, unit=f"of {run.samples:,}")
+    for lane in lanes:
+        name = f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto"
+        # To a hundredth of a ms: the two differ by no more.
+        rows.append([name, lane.agent_ms.text(2), lane.floor_ms.text(2)])
+        if lane.agent_ms.p50 and lane.floor_ms.p50:
+            section.ratio(f"{name} / floor", round(lane.agent_ms.p50 / lane.floor_ms.p50, 2), LIVE_TIMES)
+    p50 = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
+    rows.append(["node's cycle, callback to spool", p50, f"thesis: {thesis.NODE_CYCLE_MS} ms"])
+    share = round(cycle["p50"] / thesis.NODE_CYCLE_MS, 4)
+    section.ratio("node's cycle / thesis'", share, CYCLE_SHARE, by_machine=True)
+    section.table("The agent", ["figure", "measured", "floor, same run"], rows)
+    section.raw = {
+        "cycle_ms": cycle,
+        "runs": [asdict(run) for run in runs],
+        "mosquitto": [asdict(lane) for lane in lanes],
+    }
+
+
+SECTION = Declared(
+    "the agent on a real ROS 1 graph, beside a bare rospy subscriber",
+    run,
+    (
+        Option("DURATION", int, 30, "seconds of each rate"),
+        Option("SOAK", int, 0, "1000 Hz alone, for so many seconds"),
+    ),
+    Report("agent", "The agent", "make bench ONLY=agent"),
+)

@@ -1,0 +1,60 @@
+"""The verdicts about a kept cloud that is killed, and soaked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from bench.sections import kept, soak
+from bench.sections.kept import OPEN_MOST_S, Counted, Kills
+from bench.sections.soak import Look, Soak
+from local.figures import Spread
+
+CAR = Counted(
+    samples=100, batches=2, duplicated=0, lost=0, incomplete=(), killed_runs=1, summarized=100, expected=100
+)
+DRIVE = Kills(
+    killed={"killed agent": 1},
+    seed=1,
+    seconds=10.0,
+    restart_s=Spread.of([]),
+    cars={"car1": CAR},
+    agent_kills={"car1": 1},
+    open_s={"car1": [0.9]},
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "good"),
+    [
+        ({}, True),
+        ({"open_s": {"car1": [None]}}, True),
+        ({"open_s": {"car1": [OPEN_MOST_S + 0.1]}}, False),
+        # An agent ended badly, and nobody had killed it.
+        ({"agent_kills": {}}, False),
+        ({"cars": {"car1": replace(CAR, lost=50, incomplete=("vesc",))}}, False),
+        ({"cars": {"car1": replace(CAR, summarized=99)}}, False),
+    ],
+)
+def test_a_killed_agent_may_lose_its_open_batch_and_nothing_else(change, good):
+    (ratio,) = kept.report(replace(DRIVE, **change)).ratios
+    assert ratio.reached is good
+
+
+def test_the_table_names_what_was_open():
+    (table,) = kept.report(replace(DRIVE, open_s={"car1": [0.9, None]})).tables
+    assert "| 0.90, all |" in table.as_markdown()
+
+
+@pytest.mark.parametrize(
+    ("last", "sent", "reached"),
+    [(101.0, 15_000, [True, True]), (111.0, 15_000, [True, False]), (101.0, 15_050, [False, True])],
+)
+def test_memory_may_not_grow_after_the_first_quarter_and_nothing_is_lost(last, sent, reached):
+    memory = (80.0, 100.0, 100.0, last)
+    looks = [Look(hour + 1, 300, 10.0 * hour, mb, 700.0, 5.0, 1.0) for hour, mb in enumerate(memory)]
+    car = Counted(15_000, 300, 0, 0, (), 0, 15_000, 15_000)
+    section = soak.report(Soak(4, 1, looks, {"car1": sent}, {"car1": car}))
+    assert [ratio.reached for ratio in section.ratios] == reached
+    assert len(section.plots) == 1
