@@ -66,9 +66,9 @@ class State(NamedTuple):
         """What the robot rejects of the desired settings; not its rejection of an earlier value."""
         desired = self.desired.settings
         return {
-            name: one
-            for name, one in self.reported.rejected.items()
-            if name in desired and _same(one.value, desired[name])
+            name: rejection
+            for name, rejection in self.reported.rejected.items()
+            if name in desired and _same(rejection.value, desired[name])
         }
 
     @property
@@ -171,8 +171,8 @@ def settled(wanted: Mapping[str, Any], state: State) -> bool | None:
 
 def outcome(state: State, name: str, session: str, seq: int) -> str | None:
     """The robot's report on a command; None until it reports."""
-    found = state.reported.commands.get(name)
-    return found.outcome if found is not None and found[:2] == (session, seq) else None
+    report = state.reported.commands.get(name)
+    return report.outcome if report is not None and report[:2] == (session, seq) else None
 
 
 def _same(quoted: Any, value: Any) -> bool:
@@ -250,7 +250,7 @@ def change_settings(cloud: Cloud, robot: str, wanted: Mapping[str, Any], seconds
             check_name(name)
     in_time = _change_and_wait(shadow, before, wanted, seconds if online else min(seconds, _OFFLINE_S))
     state = shadow.read()
-    rejected = {name: one for name, one in state.rejected().items() if name in wanted}
+    rejected = {name: rejection for name, rejection in state.rejected().items() if name in wanted}
     _withdraw(shadow, before, state, {name: wanted[name] for name in rejected})
     return Changed(state, rejected, online, in_time)
 
@@ -367,10 +367,10 @@ def sending(
     if offline := _offline(cloud, robot):
         on_offline(offline)
         seconds = min(seconds, _OFFLINE_S)
-    said = yield from shadow.waiting(
+    answer = yield from shadow.waiting(
         lambda state: outcome(state, name, command.session, command.seq), seconds
     )
-    return Sent(command, said, offline if said is None else "")
+    return Sent(command, answer, offline if answer is None else "")
 
 
 def _offline(cloud: Cloud, robot: str) -> str:

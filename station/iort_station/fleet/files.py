@@ -56,16 +56,16 @@ def listed(
     after = prefix if start_us is None else prefix + _day(start_us)
     pages = cloud.client("s3").get_paginator("list_objects_v2")
     for page in pages.paginate(Bucket=_bucket(cloud), Prefix=prefix, StartAfter=after):
-        for one in page.get("Contents", ()):
+        for entry in page.get("Contents", ()):
             try:
-                key = parse_file_key(one["Key"])
+                key = parse_file_key(entry["Key"])
             except ContractError:
                 continue  # not a file of a robot
             if end_us is not None and key.second * 1_000_000 >= end_us:
                 return
             if start_us is None or (key.second + 1) * 1_000_000 > start_us:
-                stored_s = one["LastModified"].timestamp()
-                yield StoredFile(one["Key"], key.robot, key.name, one["Size"], key.second, stored_s)
+                stored_s = entry["LastModified"].timestamp()
+                yield StoredFile(entry["Key"], key.robot, key.name, entry["Size"], key.second, stored_s)
 
 
 def download(
@@ -82,16 +82,16 @@ def download(
     """
     client, bucket = cloud.client("s3"), _bucket(cloud)
     head = client.head_object(Bucket=bucket, Key=file.key)
-    said = head["Metadata"].get("sha256", "")
+    expected = head["Metadata"].get("sha256", "")
     path = out / file.name
     if path.exists():
-        if _sha256(path).hexdigest() == said:
+        if _sha256(path).hexdigest() == expected:
             progress(file.size)
             return path
         if not force:
             raise StationError(f"{path} is another file: give another --out, or overwrite it with --force")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{said[:12]}.part")
+    part = path.with_name(f"{path.name}.{expected[:12]}.part")
     digest = _sha256(part) if part.exists() else hashlib.sha256()
     there = part.stat().st_size if part.exists() else 0
     progress(there)
@@ -106,9 +106,9 @@ def download(
                 digest.update(chunk)
                 written.write(chunk)
                 progress(len(chunk))
-    if digest.hexdigest() != said:
+    if digest.hexdigest() != expected:
         part.unlink()
-        raise StationError(f"{file.key}: SHA-256 must be {said}, got {digest.hexdigest()}")
+        raise StationError(f"{file.key}: SHA-256 must be {expected}, got {digest.hexdigest()}")
     part.replace(path)
     return path
 
@@ -123,9 +123,11 @@ def damage(cloud: Cloud, file: StoredFile, progress: CountProgress = lambda _byt
     for chunk in _chunks(answer["Body"], file.key):
         digest.update(chunk)
         progress(len(chunk))
-    said = answer["Metadata"].get("sha256")
+    expected = answer["Metadata"].get("sha256")
     return (
-        f"SHA-256 must be {said}, got {digest.hexdigest()}" if said not in {None, digest.hexdigest()} else ""
+        f"SHA-256 must be {expected}, got {digest.hexdigest()}"
+        if expected not in {None, digest.hexdigest()}
+        else ""
     )
 
 
@@ -143,15 +145,15 @@ def empty(cloud: Cloud, progress: CountProgress = lambda _count: None) -> None:
     deleted."""
     client, bucket = cloud.client("s3"), _bucket(cloud)
     uploads = client.get_paginator("list_multipart_uploads").paginate(Bucket=bucket)
-    for begun in [one for page in uploads for one in page.get("Uploads", ())]:
+    for begun in [upload for page in uploads for upload in page.get("Uploads", ())]:
         client.abort_multipart_upload(Bucket=bucket, Key=begun["Key"], UploadId=begun["UploadId"])
         progress(1)
     # An object of a bucket without versions is its version "null": "ListObjectVersions".
     pages = client.get_paginator("list_object_versions").paginate(Bucket=bucket)
     versions: list[ObjectIdentifierTypeDef] = [
-        {"Key": one["Key"], "VersionId": one["VersionId"]}
+        {"Key": entry["Key"], "VersionId": entry["VersionId"]}
         for page in pages
-        for one in (*page.get("Versions", ()), *page.get("DeleteMarkers", ()))
+        for entry in (*page.get("Versions", ()), *page.get("DeleteMarkers", ()))
     ]
     every = iter(versions)
     while chunk := list(islice(every, _DELETE_SIZE)):

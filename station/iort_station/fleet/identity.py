@@ -91,9 +91,9 @@ def certificates(cloud: Cloud, robot: str) -> list[Certificate]:
 
 def _described(iot: IoTClient, arn: str) -> Certificate:
     number = arn.rsplit("/", 1)[-1]
-    said = iot.describe_certificate(certificateId=number)["certificateDescription"]
-    expires = said.get("validity", {}).get("notAfter")
-    return Certificate(number, arn, said["status"], said["creationDate"], expires)
+    description = iot.describe_certificate(certificateId=number)["certificateDescription"]
+    expires = description.get("validity", {}).get("notAfter")
+    return Certificate(number, arn, description["status"], description["creationDate"], expires)
 
 
 def revoke_certificate(cloud: Cloud, certificate: Certificate) -> None:
@@ -222,9 +222,9 @@ def claim(
         settings.update(_serial_of(iot, robot))
     try:
         if lasting:
-            made = make_certificate(iot, claim_name(cloud.namespace))
-            iot.attach_policy(policyName=claim_name(cloud.namespace), target=made.arn)
-            number, certificate, key = made.id, made.pem, made.private_key_pem
+            new = make_certificate(iot, claim_name(cloud.namespace))
+            iot.attach_policy(policyName=claim_name(cloud.namespace), target=new.arn)
+            number, certificate, key = new.id, new.pem, new.private_key_pem
         else:
             created = iot.create_provisioning_claim(templateName=fleet_name(cloud.namespace))
             number, certificate = created["certificateId"], created["certificatePem"]

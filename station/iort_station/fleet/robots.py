@@ -83,14 +83,14 @@ def equip(cloud: Cloud, bundle: Bundle, settings: Mapping[str, Any] | None = Non
     iot, robot = cloud.client("iot"), bundle.robot
     try:
         make_thing(cloud, robot, attributes(cloud, robot) or {"vehicle": "vesc"})
-        made = identity.make_certificate(iot, robot)
-        iot.attach_policy(policyName=fleet_name(cloud.namespace), target=made.arn)
-        iot.attach_thing_principal(thingName=robot, principal=made.arn)
+        new = identity.make_certificate(iot, robot)
+        iot.attach_policy(policyName=fleet_name(cloud.namespace), target=new.arn)
+        iot.attach_thing_principal(thingName=robot, principal=new.arn)
     except ClientError as error:
         raise StationError(
             f"robot {robot} is only partly registered; remove it and try again: {error}"
         ) from error
-    write_bundle(cloud, bundle, made.pem, made.private_key_pem, settings or {})
+    write_bundle(cloud, bundle, new.pem, new.private_key_pem, settings or {})
 
 
 def attributes(cloud: Cloud, robot: str) -> dict[str, str] | None:
