@@ -13,9 +13,8 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_analysis.errors import AnalysisError
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_station.cli.cloud_options import CloudOptions
-from iort_station.cli.lazy import Verbs
-from iort_station.cli.words import say
+from iort_station.cli.options import CloudOptions, say
+from iort_station.cli.verbs import Verbs
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError, UsageError
 

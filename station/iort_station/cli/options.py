@@ -3,38 +3,199 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import inspect
+import json
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
+from botocore.exceptions import BotoCoreError
 
 from iort_contract.catalog.derived import DERIVED
 from iort_station import kept
-from iort_station.cli import completion
-from iort_station.cli.words import say
-from iort_station.errors import UsageError
-from iort_station.times import duration_us, has_zone, is_clock, time_us
+from iort_station.cloud import AWS_NAMED, Cloud, embedded_here, find_embedded
+from iort_station.errors import StationError, UsageError
+from iort_station.output import cache, one_line, whole
+from iort_station.times import duration_us, has_zone, is_clock, iso_s, time_us
 from iort_station.upkeep.snapshot import VERSION
 
-Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=completion.robots)]
-Stream = Annotated[
-    str, typer.Argument(help="The stream, for example vesc.", autocompletion=completion.streams)
-]
-OneRobot = Annotated[
-    str | None, typer.Option("--robot", help="Only this robot.", autocompletion=completion.robots)
-]
+# What TAB offers: the names of robots, streams, fields and files.
+#
+# The shell waits for TAB, and a cloud takes a second to answer. So names are kept in a file, in the user's
+# cache. A process in the background asks the cloud, and writes the file for the next TAB. Only the first TAB
+# waits for it. TAB prints no error: an unreachable cloud offers nothing.
+
+if TYPE_CHECKING:
+    from iort_station.cloud import Cloud
+
+# How long names are offered before the cloud is asked again, and how long the first TAB waits.
+_FRESH_S, _PATIENCE_S = 30.0, 3.0
+_NEWEST_FILES = 200
+# Set in the process in the background.
+_ASKS = "IORT_COMPLETION_ASKS"
+Ask = Callable[["Cloud"], list[str]]
+
+
+def robots(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The registered robots."""
+
+    def ask(cloud: Cloud) -> list[str]:
+        from iort_station.fleet import registry  # noqa: PLC0415 - only the background asks
+
+        return sorted(str(row["robot"]) for row in registry.listed(cloud))
+
+    return _matching(_names(ctx, ask, "robots"), incomplete)
+
+
+def streams(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The streams of the robot that is named before."""
+    robot = _robot(ctx)
+
+    def ask(cloud: Cloud) -> list[str]:
+        from iort_station.data import inventory  # noqa: PLC0415 - as above
+
+        return inventory.streams_of(cloud, robot)
+
+    return _matching(_names(ctx, ask, "streams", robot), incomplete)
+
+
+def fields(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The fields of the stream that is named before, and the derived ones; after a comma another one."""
+    robot, stream = _robot(ctx), str(ctx.params.get("stream"))
+
+    def ask(cloud: Cloud) -> list[str]:
+        from iort_station.data import inventory  # noqa: PLC0415 - as above
+
+        return sorted({*inventory.newest_block(cloud, robot, stream).columns, *DERIVED})
+
+    before, comma, begun = incomplete.rpartition(",")
+    known = set(_names(ctx, ask, "fields", robot, stream)) - set(before.split(","))
+    return [f"{before}{comma}{name}" for name in _matching(sorted(known), begun)]
+
+
+def files(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The newest files of the robot that is named before."""
+    robot = _robot(ctx)
+
+    def ask(cloud: Cloud) -> list[str]:
+        from iort_station.fleet import files as stored  # noqa: PLC0415 - as above
+
+        found = dict.fromkeys(one.name for one in stored.listed(cloud, robot))
+        return list(found)[-_NEWEST_FILES:]
+
+    return _matching(_names(ctx, ask, "files", robot), incomplete)
+
+
+def _robot(ctx: typer.Context) -> str:
+    return str(ctx.params.get("robot") or ctx.params.get("name"))
+
+
+def _matching(names: list[str], begun: str) -> list[str]:
+    return [name for name in names if name.startswith(begun)]
+
+
+def _names(ctx: typer.Context, ask: Ask, *key: str) -> list[str]:
+    """The names that are kept under ``key``; older ones are asked for in the background."""
+    with suppress(Exception):
+        given = ctx.find_root().params
+        options = CloudOptions(
+            *(given[name] for name in ("namespace", "profile", "region", "local", "embedded"))
+        )
+        path = _kept_at(options, *key)
+        if _ASKS in os.environ:
+            _keep(path, ask(options.cloud()))
+            return []
+        found = _kept(path)
+        if not path.exists() or not 0 <= time.time() - path.stat().st_mtime < _FRESH_S:
+            # Also a cloud that does not answer is asked only so often.
+            _keep(path, found)
+            asking = _ask_in_background()
+            if not found:
+                asking.wait(_PATIENCE_S)
+                return _kept(path)
+        return found
+    return []
+
+
+def _kept(path: Path) -> list[str]:
+    return list(json.loads(path.read_text())) if path.exists() else []
+
+
+def _keep(path: Path, names: list[str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path, force=True) as part:
+        part.write_text(json.dumps(names))
+
+
+def _ask_in_background() -> subprocess.Popen[Any]:
+    """Run this very completion in a process of its own, which outlives this one."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "iort_station.cli.main"],
+        env={**os.environ, _ASKS: "1"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _kept_at(options: CloudOptions, *key: str) -> Path:
+    """The file of the names; another cloud has other ones."""
+    embedded = options.file()
+    chosen = [os.environ.get(name) for name in ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION")]
+    began = embedded.stat().st_mtime if embedded and embedded.exists() else None
+    text = repr((options, embedded, began, chosen, key))
+    return cache(os.environ) / "names" / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
+
+
+# Words to the operator: on standard error, where they do not get into a pipe, and in the help.
+
+if TYPE_CHECKING:
+    from iort_contract.messages.page import Archived
+
+
+def say(*lines: str) -> None:
+    """Print a text, or several lines. What a robot has said begins no line of its own."""
+    print("iort: " + "\n".join(map(one_line, lines)), file=sys.stderr, flush=True)
+
+
+def examples(*commands: str) -> str:
+    """The end of a verb's help: commands that work as they are. Tests run them."""
+    # The first line keeps click from joining the others.
+    return "\n".join(["\b", "Examples:", *(f"  iort {command}" for command in commands)])
+
+
+def say_refused(count: int, reason: str) -> None:
+    """Say what is stored and cannot be read, if there is something; ``reason`` names the first."""
+    if count:
+        say(f"{count:,} stored items cannot be read and are left out; the first: {reason}")
+
+
+def say_archived(archived: Archived | None) -> None:
+    """Say what came from the archive, if something did."""
+    if archived is not None:
+        hours = "an hour" if archived["hours"] == 1 else f"{archived['hours']:,} hours"
+        say(f"{hours} from the archive, {iso_s(archived['from_us'])} to {iso_s(archived['to_us'])}")
+
+
+Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=robots)]
+Stream = Annotated[str, typer.Argument(help="The stream, for example vesc.", autocompletion=streams)]
+OneRobot = Annotated[str | None, typer.Option("--robot", help="Only this robot.", autocompletion=robots)]
 Fields = Annotated[
     str | None,
     typer.Option(
         "--fields",
         help=f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived.",
-        autocompletion=completion.fields,
+        autocompletion=fields,
     ),
 ]
 Where = Annotated[
@@ -190,3 +351,47 @@ def ranged(verb: Callable[..., None]) -> Callable[..., None]:
     called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # read by inspect
     called.__annotations__ = {one.name: one.annotation for one in parameters}
     return called
+
+
+# The cloud of an `iort` command, from the options before its name.
+
+
+@dataclass
+class CloudOptions:
+    """The options that select a cloud; commands read it from ``context.obj``."""
+
+    namespace: str
+    profile: str | None
+    region: str | None
+    local: bool
+    embedded: Path | None
+
+    def cloud(self) -> Cloud:
+        """The selected cloud, which is said on standard error: see `Cloud.find`."""
+        return Cloud.find(**asdict(self), say=say)
+
+    def file(self) -> Path | None:
+        """The file of the embedded cloud that is named, or that runs here; None if there is none."""
+        return self.embedded or embedded_here()
+
+    def means_kept(self, folder: Path) -> bool:
+        """Whether the cloud of `make up` in this folder is meant: it is up, or was killed."""
+        if self.embedded is not None:
+            return self.embedded.absolute().parent == folder
+        said = self.profile or self.region or any(os.environ.get(name) for name in AWS_NAMED)
+        there = (folder / kept.UP).exists()
+        return there and (self.local or not said) and find_embedded(Path.cwd()) is None
+
+    def account(self, *, region: str) -> Cloud:
+        """An AWS account, never an embedded cloud; ``region`` is the default.
+
+        Raises `StationError` if the options select the embedded cloud, or if credentials are missing.
+        """
+        if self.local:
+            raise StationError("only AWS has this, and --local selects the embedded cloud")
+        cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        try:
+            named = cloud.region_name
+        except BotoCoreError as error:
+            raise StationError(f"AWS: {error}") from error
+        return replace(cloud, region=named or region).check()

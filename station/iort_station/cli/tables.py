@@ -12,7 +12,7 @@ from iort_analysis.samples.positions import in_degrees
 from iort_station.cli.console import Lines
 from iort_station.data import Result
 from iort_station.data.tabular import texts_of_time
-from iort_station.texts import one_line
+from iort_station.output import one_line
 
 # A terminal shows the beginning and the end of a long result: this many rows each.
 _ENDS = 20

@@ -12,7 +12,7 @@ import numpy as np
 from iort_analysis.samples.blocks import Column, values
 from iort_contract.codec import EXACT
 from iort_station.data import Result
-from iort_station.texts import visible
+from iort_station.output import visible
 
 _CHUNK = 10_000
 # Characters that begin a formula in a spreadsheet, also in full width: OWASP, "CSV Injection".

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_station import kept
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
+from iort_station.cli.options import CloudOptions
 from iort_station.cloud import EMBEDDED, Cloud, find_embedded
 from iort_station.errors import StationError
 from iort_station.page.page import typed_keys

@@ -10,10 +10,9 @@ import sys
 import pytest
 import typer
 
-from iort_station.cli import lazy, options
-from iort_station.cli.lazy import Verb
+from iort_station.cli import options, verbs
 from iort_station.cli.main import app, main
-from iort_station.cli.verbs import VERBS
+from iort_station.cli.verbs import VERBS, Verb
 from iort_station.errors import UsageError
 
 # Each takes longer to import than `iort --help` may take.
@@ -50,7 +49,7 @@ def loaded(*arguments):
 def test_help_imports_no_verb_and_nothing_heavy():
     found = loaded("--help")
     assert not found & HEAVY
-    assert not [name for name in found if name.startswith(f"{lazy.verbs.__name__}.")]
+    assert not [name for name in found if name.startswith(f"{verbs.__name__}.")]
 
 
 def test_a_verb_loads_no_client_before_it_calls_the_cloud():
@@ -61,11 +60,9 @@ def test_no_verb_that_reads_samples_loads_numpy_for_tab():
     """TAB after a verb imports the verb, for its options."""
     program = """
 import sys
-from iort_station.cli.lazy import Verb
-from iort_station.cli.verbs import VERBS
-for file in VERBS:
-    if file.rpartition(".")[2] in {"audit", "export", "laps", "plot", "query", "runs", "streams"}:
-        Verb(file, "").load()
+from iort_station.cli.verbs import VERBS, Verb
+for name in ("audit", "export", "laps", "plot", "query", "runs", "streams"):
+    Verb(name).load()
 print(*sorted(sys.modules))
 """
     done = subprocess.run(
@@ -74,11 +71,10 @@ print(*sorted(sys.modules))
     assert not set(done.stdout.split()) & {"boto3", "botocore.session", "numpy", "pyarrow"}
 
 
-@pytest.mark.parametrize("file", VERBS)
-def test_each_verb_of_the_list_is_in_its_file_and_has_a_line_of_help(file):
-    summary = VERBS[file]
-    verb = Verb(file, summary)
-    assert verb.load().name == verb.name
+@pytest.mark.parametrize("name", VERBS)
+def test_each_verb_of_the_list_is_in_its_module_and_has_a_line_of_help(name):
+    _, summary = VERBS[name]
+    assert Verb(name).load().name == name
     assert len(f"  replay-errors  {summary}") <= 80
     assert summary.endswith(".")
 

@@ -18,12 +18,11 @@ from typer.testing import CliRunner
 
 import iort_station
 from iort_contract.messages.batch import Batch
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import Console, Lines
 from iort_station.cli.main import app
-from iort_station.cli.words import say
+from iort_station.cli.options import CloudOptions, say
 from iort_station.errors import StationError
-from iort_station.texts import visible
+from iort_station.output import visible
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 
 # Write the clipboard; the same with C1; move the cursor and ring the bell; reverse a line.
@@ -195,8 +194,8 @@ def test_every_command_prints_by_the_console():
                 printing.add((name, ast.unparse(node.args[0])))
     assert printing == {
         ("cli/main.py", "f\"iort {version('iort-station')}\""),
-        ("cli/words.py", "'iort: ' + '\\n'.join(map(one_line, lines))"),
+        ("cli/options.py", "'iort: ' + '\\n'.join(map(one_line, lines))"),
         # Made visible a cell at a time.
         ("cli/tables.py", "stamp.ljust(len(_TIME_WIDE))"),
-        ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': live.sample})"),
+        ("cli/verbs/live.py", "json.dumps({**line, 'sample': live.sample})"),
     }

@@ -15,9 +15,9 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate, Finding
 from iort_contract.page import history_link
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.cli.verbs.operations import analyse
+from iort_station.cli.options import CloudOptions
+from iort_station.cli.verbs import analysis as analyse
 from iort_station.cloud import Cloud
 from iort_station.data import findings, inventory
 from iort_station.data import findings as stored

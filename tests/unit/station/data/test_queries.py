@@ -23,7 +23,7 @@ from iort_contract.messages.batch import Batch
 from iort_contract.ros1.message import MessageType
 from iort_contract.topics import build_topic
 from iort_station import data
-from iort_station.cli.verbs.data import query
+from iort_station.cli.verbs import samples
 from iort_station.data import select
 from iort_station.data import selection as conditions
 from iort_station.data.inventory import unit
@@ -332,9 +332,9 @@ class Options:
     [("b.csv", b"time,speed"), ("b.jsonl", b'{"time'), ("b.parquet", b"PAR1"), ("b.txt", b"time (UTC)")],
 )
 def test_a_file_has_the_format_of_its_ending_and_every_row(tmp_path, name, begins):
-    arguments = ["car", "vesc", "--last", "all"]
+    arguments = ["query", "car", "vesc", "--last", "all"]
     done = CliRunner().invoke(
-        query.commands,
+        samples.commands,
         [*arguments, "--out", str(tmp_path / name)],
         obj=Options(cloud_of(*ride())),
     )
@@ -345,7 +345,7 @@ def test_a_file_has_the_format_of_its_ending_and_every_row(tmp_path, name, begin
         assert pq.read_table(tmp_path / name).num_rows == 100
     else:
         assert [value for value in range(100) if not re.search(rb"\b%d\b" % value, content)] == []
-    piped = CliRunner().invoke(query.commands, arguments, obj=Options(cloud_of(*ride())))
+    piped = CliRunner().invoke(samples.commands, arguments, obj=Options(cloud_of(*ride())))
     assert len(piped.stdout.splitlines()) == 102, "the head, the units and every row"
 
 
@@ -354,7 +354,7 @@ def test_a_file_has_the_format_of_its_ending_and_every_row(tmp_path, name, begin
     [("b.xlsx", "must end in .csv, .jsonl"), ("b", "must end in"), ("b.mcap", "iort export writes .mcap")],
 )
 def test_a_file_of_an_unknown_ending_is_refused_before_the_query(tmp_path, name, said):
-    done = CliRunner().invoke(query.commands, ["car", "vesc", "--out", str(tmp_path / name)])
+    done = CliRunner().invoke(samples.commands, ["query", "car", "vesc", "--out", str(tmp_path / name)])
     assert said in str(done.exception)
     assert not (tmp_path / name).exists()
 

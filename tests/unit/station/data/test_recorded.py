@@ -26,8 +26,8 @@ from iort_contract.ros1.message import Messages, MessageType, RosType
 from iort_contract.tables import RECOMPUTE_FROM_S
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
+from iort_station.cli.options import CloudOptions
 from iort_station.data import tabular
 from iort_station.data.runs import overview, runs
 from iort_station.errors import StationError

@@ -15,8 +15,8 @@ from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
+from iort_station.cli.options import CloudOptions
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.page.answers import answers

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from iort_contract.messages.commands import DRIVEN_BY_ANOTHER, NO_LEASE, Command, decode_command
 from iort_contract.messages.shadow import OverShare, Reported, decode_desired, decode_reported
-from iort_station.cli.verbs.fleet.send import commands
+from iort_station.cli.verbs.control import commands
 from iort_station.errors import StationError
 from iort_station.fleet.control import State, _check_clock, outcome, over_share, settled, slept
 from iort_station.page import answers
@@ -57,7 +57,7 @@ class Cloud:
 
 def send(cloud: Cloud, *options: str) -> Any:
     asked = SimpleNamespace(cloud=lambda: cloud)
-    return CliRunner().invoke(commands, ["car7", "drive", "{}", *options], obj=asked)
+    return CliRunner().invoke(commands, ["send", "car7", "drive", "{}", *options], obj=asked)
 
 
 @pytest.mark.parametrize(("options", "takeover"), [((), False), (("--takeover",), True)])

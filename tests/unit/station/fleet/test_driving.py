@@ -13,8 +13,7 @@ import pytest
 
 from iort_contract.messages.commands import Command, DriveLimits, decode_command, encode_command
 from iort_contract.messages.live import LiveSample
-from iort_station.cli.keys import FIRST_US, NEXT_US, Keys, keys_of
-from iort_station.cli.verbs.fleet.drive import _Seat
+from iort_station.cli.verbs.drive import FIRST_US, NEXT_US, Keys, _Seat, keys_of
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
 from iort_station.fleet.driving import Driver, Phase, Stick

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_contract.messages.files import File, file_key
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
+from iort_station.cli.options import CloudOptions
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files

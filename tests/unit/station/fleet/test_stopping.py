@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.commands import NO_MOTION, DriveLimits, encode_limits
-from iort_station.cli.verbs.fleet.robots import commands as robots
-from iort_station.cli.verbs.fleet.stop import commands
+from iort_station.cli.verbs.control import commands
+from iort_station.cli.verbs.robots import commands as robots
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
 from iort_station.operations.alarms import user
@@ -267,7 +267,7 @@ def iort_stop(cloud: Shadows, *arguments: str) -> Any:
             raise StationError("the embedded cloud does not answer")
         return cloud
 
-    return CliRunner().invoke(commands, list(arguments), obj=SimpleNamespace(cloud=found))
+    return CliRunner().invoke(commands, ["stop", *arguments], obj=SimpleNamespace(cloud=found))
 
 
 class Robots(Shadows):

@@ -8,7 +8,7 @@ import pytest
 
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.live import LiveSample, live_update
-from iort_station.cli.verbs.operations.trace import bar
+from iort_station.cli.verbs.live import bar
 from iort_station.operations.trace import (
     BROKER,
     CAR,

@@ -11,12 +11,9 @@ from rich.filesize import decimal
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_contract.tables import NO_ROBOT
-from iort_station.cli import completion
-from iort_station.cli.cloud_options import CloudOptions
-from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, DryRun
-from iort_station.cli.progress import bar
-from iort_station.cli.words import examples, say
+from iort_station.cli import options
+from iort_station.cli.console import bar, errors, out, print_json
+from iort_station.cli.options import AsJson, CloudOptions, DryRun, examples, say
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -39,7 +36,7 @@ def move_(
     ],
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="ROBOT", help="Default: every robot.", autocompletion=completion.robots),
+        typer.Argument(metavar="ROBOT", help="Default: every robot.", autocompletion=options.robots),
     ] = None,
     to_profile: Annotated[str | None, typer.Option(help="The AWS profile of --to aws.")] = None,
     to_region: Annotated[str | None, typer.Option(help="The AWS region of --to aws.")] = None,

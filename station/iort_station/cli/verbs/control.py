@@ -1,36 +1,114 @@
-"""`iort stop`: the emergency stop of one robot or all, and its release.
-
-A stop waits for nothing that reads: it has clients of its own, which give up within seconds, and robots that
-are named are stopped before anything is looked up.
-"""
+"""`iort send`, `stop`, `config` and `ask`: commands, the emergency stop, settings, and questions."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import Annotated, NoReturn
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
 
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.messages.commands import DRIVE_LEASE_MS, MAX_LEASE_MS
+from iort_contract.catalog.questions import QUESTIONS
+from iort_contract.checks import json_object
+from iort_contract.limits import ContractError
+from iort_contract.messages.commands import DRIVE_LEASE_MS, MAX_LEASE_MS, MAX_VALID_MS
 from iort_contract.messages.page import RobotPresence
+from iort_contract.messages.shadow import Rejection
 from iort_contract.tables import ONLINE
-from iort_station.cli import completion
-from iort_station.cli.cloud_options import CloudOptions
-from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson
-from iort_station.cli.words import examples, say
+from iort_contract.topics import ACCEPTED
+from iort_station.cli import options
+from iort_station.cli.console import Lines, errors, out, print_json, tell
+from iort_station.cli.options import AsJson, CloudOptions, Robot, examples, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry, stopping
+from iort_station.fleet import control, registry, stopping
+from iort_station.fleet import control as fleet_commands
+from iort_station.fleet.control import Shadow, State
 from iort_station.fleet.stopping import Motion
 from iort_station.operations import alarms
+from iort_station.output import one_line
 from iort_station.times import iso_s
 
 commands = typer.Typer()
+
+
+@commands.command("send", epilog=examples("""send car7 drive '{"drive": {"speed": 1.0}}' --lease-ms 500"""))
+def send(
+    context: typer.Context,
+    robot: Robot,
+    name: Annotated[str, typer.Argument(help="The command: a key of downlink.cmd in the robot's car.yaml.")],
+    message: Annotated[str, typer.Argument(help="The ROS message as JSON, with the fields of its type.")],
+    lease_ms: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=MAX_LEASE_MS, help="How long the robot may move, from now; needed if it moves."
+        ),
+    ] = None,
+    valid_ms: Annotated[
+        int, typer.Option(min=1, max=MAX_VALID_MS, help="The robot rejects it if it arrives later than this.")
+    ] = fleet_commands.VALID_MS,
+    seconds: Annotated[
+        float, typer.Option(min=0, help="How long to wait for the robot's answer.")
+    ] = fleet_commands.ANSWER_S,
+    takeover: Annotated[
+        bool, typer.Option("--takeover", help="Take the wheel from whoever drives; refused otherwise.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Send a command and print the robot's answer.
+
+    Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own:
+    while another one drives, also an earlier call of yours, a motion is refused unless it has --takeover.
+    """
+    asked = _message(message)
+    cloud = context.obj.cloud()
+    with errors.status(f"waiting for {robot}"):
+        command, said, offline = fleet_commands.send(
+            cloud,
+            robot,
+            name,
+            asked,
+            lease_ms=lease_ms,
+            valid_ms=valid_ms,
+            seconds=seconds,
+            takeover=takeover,
+            on_offline=say,
+        )
+    if as_json:
+        sent = {"robot": robot, "command": name, "session": command.session, "seq": command.seq}
+        print_json({**sent, "outcome": said})
+    elif said == ACCEPTED:
+        out.print(f"{robot} has accepted {name}")
+    if offline:
+        raise StationError(f"{offline}, and has not answered")
+    if said is None:
+        raise StationError(
+            f"{robot} has not answered within {seconds:g} s: is its agent running, and has its car.yaml "
+            f"downlink.cmd.{name}?"
+        )
+    if said != ACCEPTED:
+        advice = fleet_commands.advice(said)
+        raise StationError(f"{robot} has rejected {name}: {one_line(said)}{advice and f': {advice}'}")
+
+
+def _message(text: str) -> dict[str, Any]:
+    try:
+        message = json.loads(text)
+    except ValueError as error:
+        raise UsageError(f"MESSAGE must be JSON, got {text}: {error}") from error
+    if not isinstance(message, dict):
+        raise UsageError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
+    return message
+
+
+# A stop waits for nothing that reads: it has clients of its own, which give up within seconds, and robots
+# that are named are stopped before anything is looked up.
+
 _POLL_S, _AGAIN_S = 0.1, 2.0
 # A robot that is connected answers sooner.
 _SOON_S = 1.0
@@ -45,7 +123,7 @@ _ELSEWHERE = (
 def stop(
     context: typer.Context,
     robots: Annotated[
-        list[str] | None, typer.Argument(help="The robots' names.", autocompletion=completion.robots)
+        list[str] | None, typer.Argument(help="The robots' names.", autocompletion=options.robots)
     ] = None,
     everyone: Annotated[bool, typer.Option("--all", help="Every robot of the registry.")] = False,
     release: Annotated[bool, typer.Option("--release", help="Let them move again.")] = False,
@@ -216,3 +294,117 @@ def _words(one: Motion | None, *, stopped: bool, stays: bool, online: bool) -> s
         return "not confirmed: it is released when it is connected"
     where = "it has not answered" if online else "it is not connected"
     return f"NOT CONFIRMED: {where}, and stops when it hears it, before it takes a command"
+
+
+# `iort config`: read and change the settings of a running agent.
+
+
+@commands.command(
+    "config", epilog=examples("config car7", "config car7 live.rate_hz=5 fields.vesc=speed,fault_code")
+)
+def config(
+    context: typer.Context,
+    robot: Robot,
+    changes: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=VALUE]...", help="live.rate_hz=5, fields.vesc=speed,fault_code, log_level=debug"
+        ),
+    ] = None,
+    unset: Annotated[
+        list[str] | None, typer.Option(help="A setting to withdraw; car.yaml's value applies again.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for the robot's answer.")] = 30.0,
+    as_json: AsJson = False,
+) -> None:
+    """Show a robot's settings, or change them and wait for its answer.
+
+    A value that no agent accepts is not sent. A change that the robot rejects is withdrawn: the last accepted
+    value stays in force, and the exit status is 1. A change for an offline robot is pending until it is back.
+    """
+    wanted = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
+    cloud = context.obj.cloud()
+    if not wanted:
+        state = Shadow(cloud, robot).read()
+        rejected = state.rejected()
+        _print(robot, state, rejected, {}, as_json=as_json)
+        if rejected and not as_json:
+            options = " ".join(f"--unset {name}" for name in rejected)
+            errors.print(f"`iort config {robot} {options}` withdraws what is rejected", soft_wrap=True)
+        return
+    with errors.status(f"waiting for {robot}"):
+        state, rejected, online, answer = control.change_settings(cloud, robot, wanted, seconds)
+    _print(robot, state, rejected, wanted, as_json=as_json)
+    pending = state.pending().keys() & wanted.keys()
+    if not answer and online:
+        raise StationError(
+            f"{robot} is online and has not answered within {seconds:g} s: is its agent running? "
+            "The change is pending; --unset withdraws it"
+        )
+    if pending and not as_json:
+        errors.print(f"pending: {robot} is offline, and applies it when it is back", soft_wrap=True)
+    if rejected:
+        raise typer.Exit(1)
+
+
+def _change(text: str) -> tuple[str, Any]:
+    name, equals, written = text.partition("=")
+    if not name or not equals:
+        raise UsageError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
+    return name, control.parse_setting(name, written)
+
+
+def _print(
+    robot: str,
+    state: State,
+    rejected: Mapping[str, Rejection],
+    wanted: Mapping[str, Any],
+    *,
+    as_json: bool,
+) -> None:
+    in_force, pending = state.reported.settings, state.pending()
+    if as_json:
+        reasons = {name: one._asdict() for name, one in rejected.items()}
+        print_json({"robot": robot, "settings": in_force, "rejected": reasons, "pending": pending})
+        return
+    if not in_force:
+        out.print(f"{robot} has reported no settings yet")
+    said = {name: "  (withdrawn)" if value is None else "  (changed)" for name, value in wanted.items()}
+    said |= dict.fromkeys(rejected, "  (unchanged: the change is rejected)")
+    said |= {name: f"  (pending: {control.setting_text(value)})" for name, value in pending.items()}
+    for name, value in {**dict.fromkeys(pending, "?"), **in_force}.items():
+        out.print(f"{name}={control.setting_text(value)}{said.get(name, '')}")
+    for one in rejected.values():
+        errors.print(f"rejected: {one.reason}", style="red")
+
+
+# `iort ask`: a robot's question to the cloud, asked by the operator.
+
+
+@commands.command("ask", epilog=examples("ask car7 calibration", "ask car7 raceline --body track.json"))
+def ask(
+    context: typer.Context,
+    robot: Robot,
+    question: Annotated[str, typer.Argument(help=f"One of {', '.join(QUESTIONS)}.")],
+    body: Annotated[
+        Path | None,
+        typer.Option(help="A JSON file with the body of the question."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Ask the cloud what a robot may ask, and print the answer: indented, or as one line of JSON.
+
+    It takes nothing from the robot's quota. Exit status 1 if the cloud refuses, with the reason.
+    """
+    asked = {} if body is None else _read(body)
+    cloud = context.obj.cloud()
+    with errors.status(f"waiting for {question} of {robot}"):
+        answer = control.ask(cloud, robot, question, asked)
+    tell(answer, Lines(json.dumps(answer, indent=2)), as_json=as_json)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return json_object(file.read_bytes(), str(file))
+    except (ContractError, OSError) as error:
+        raise UsageError(str(error)) from error

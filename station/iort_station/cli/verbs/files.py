@@ -13,10 +13,9 @@ import typer
 from botocore.exceptions import ClientError
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
-from iort_station.cli import completion, console
-from iort_station.cli.options import AsJson, Force, Range, Robot, When, Yes, agreed, ranged, to_file
-from iort_station.cli.progress import bar
-from iort_station.cli.words import examples
+from iort_station.cli import console, options
+from iort_station.cli.console import bar
+from iort_station.cli.options import AsJson, Force, Range, Robot, When, Yes, agreed, examples, ranged, to_file
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import files, registry
@@ -64,7 +63,7 @@ def get(
         list[str] | None,
         typer.Argument(
             help="Names or keys; a name means its newest file. Default: all.",
-            autocompletion=completion.files,
+            autocompletion=options.files,
         ),
     ] = None,
     name: _Name = "*",

@@ -11,10 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
-from iort_station.cli.options import AsJson
-from iort_station.cli.words import examples
+from iort_station.cli.options import AsJson, CloudOptions, examples
 from iort_station.cost import model, report
 from iort_station.cost.model import deployment_dollars_per_month
 from iort_station.cost.prices import API_REGION, AS_OF, PRICES, REGION, Listed, keep, kept_at, load, read

@@ -14,10 +14,9 @@ from rich.text import Text
 from iort_contract.limits import ContractError
 from iort_contract.tables import ROBOT
 from iort_contract.topics import check_robot, check_stream
-from iort_station.cli import completion
+from iort_station.cli import options
 from iort_station.cli.console import Lines, errors, out, print_json
-from iort_station.cli.options import AsJson, Range, When, ranged
-from iort_station.cli.words import examples, say_archived
+from iort_station.cli.options import AsJson, Range, When, examples, ranged, say_archived
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
@@ -37,7 +36,7 @@ def audit_(
     context: typer.Context,
     when: When,
     robot: Annotated[
-        str | None, typer.Argument(help="The robot's name.", autocompletion=completion.robots)
+        str | None, typer.Argument(help="The robot's name.", autocompletion=options.robots)
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Every registered robot.")] = False,
     streams: Annotated[
@@ -45,7 +44,7 @@ def audit_(
         typer.Option(
             "--stream",
             help="Only this stream; may be repeated. Default: all known.",
-            autocompletion=completion.streams,
+            autocompletion=options.streams,
         ),
     ] = None,
     late: Annotated[
@@ -102,12 +101,12 @@ class _Audited(NamedTuple):
 
     def hashed(self, cloud: Cloud, robot: str, within: Range) -> _Audited:
         """With the hashes of each stream's runs."""
-        from iort_station.operations import audit as contents  # noqa: PLC0415 - numpy, as below
+        from iort_station.operations import audit  # noqa: PLC0415 - numpy, as below
 
         with errors.status("reading contents"):
             return self._replace(
                 contents={
-                    one.stream: contents.hashes(cloud, robot, one.stream, within.start_us, within.end_us)
+                    one.stream: audit.hashes(cloud, robot, one.stream, within.start_us, within.end_us)
                     for one in self.found
                 }
             )

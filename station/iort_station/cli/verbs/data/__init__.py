@@ -1,1 +1,0 @@
-"""Commands that read recorded samples. They use `iort_station.data`."""

@@ -1,0 +1,340 @@
+"""`iort query`, `export` and `plot`: what a robot has recorded, as text, as files, as pictures."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
+
+import typer
+
+from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
+from iort_contract.catalog.vesc import NO_SENSOR_DEGC
+from iort_station.cli.console import Console, reading, tell
+from iort_station.cli.options import (
+    SHORT,
+    AsJson,
+    Every,
+    Fields,
+    Force,
+    Range,
+    Robot,
+    Stream,
+    When,
+    Where,
+    examples,
+    names,
+    ranged,
+    say,
+    say_archived,
+    say_refused,
+    to_file,
+)
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError, UsageError
+from iort_station.fleet import registry
+from iort_station.output import check_free, whole
+from iort_station.times import between_hours
+
+if TYPE_CHECKING:
+    from iort_station.data import Result
+
+commands = typer.Typer()
+
+
+Format = Literal["table", "csv", "jsonl", "parquet"]
+# A file's format, unless --format says another.
+_ENDINGS: dict[str, Format] = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".txt": "table",
+}
+
+
+@commands.command(
+    "query",
+    epilog=examples(
+        "query car7 vesc --last 10m --fields speed_mps,voltage_input",
+        "query car7 vesc --last 1h --where 'speed_mps > 1.2' --every 1s",
+        "query car7 vesc --last 7d --out car7.parquet",
+    ),
+)
+@ranged
+def query(
+    context: typer.Context,
+    robot: Robot,
+    stream: Stream,
+    when: When,
+    fields: Fields = None,
+    where: Where = None,
+    every: Every = None,
+    summary: Annotated[
+        bool, typer.Option("--summary", help="The summary of each second instead of samples.")
+    ] = False,
+    form: Annotated[
+        Format | None,
+        typer.Option("--format", help="The output format. Default: the ending of --out, or else a table."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
+    ] = False,
+    out: Annotated[Path | None, to_file("The file to write. Default: standard output.")] = None,
+    force: Force = False,
+    on: Annotated[
+        Literal["client", "lambda"],
+        typer.Option(help="Select samples on this machine, or in the cloud's query function."),
+    ] = "client",
+    source: Annotated[
+        Literal["auto", "table", "archive"],
+        typer.Option(help="Read the table and, of what expires, the archive; or only one of them."),
+    ] = "auto",
+    scan: Annotated[
+        bool,
+        typer.Option("--scan", help="Scan the whole table, which is slow; for comparison."),
+    ] = False,
+) -> None:
+    """Print recorded samples, combined samples, or the summary of each second.
+
+    The default range is the last five minutes. A range includes its start and excludes its end.
+    """
+    # numpy takes longer to load than most commands to run.
+    from iort_station import data  # noqa: PLC0415 - see above
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
+
+    form = "jsonl" if as_json else form or _form_of(out)
+    if form == "parquet" and out is None and sys.stdout.isatty():
+        raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
+    if out is not None:
+        check_free(out, force=force)
+    within = when.range(SHORT)
+    cloud = context.obj.cloud()
+    began = time.monotonic()
+    with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
+        result = data.query(
+            cloud,
+            robot,
+            stream,
+            within.start_us,
+            within.end_us,
+            fields=names(fields),
+            where=where,
+            every=every,
+            summary=summary,
+            on=on,
+            source=source,
+            scan=scan,
+            progress=progress,
+        )
+    took_s = time.monotonic() - began
+    if out is None:
+        _write(result, form, sys.stdout, raw=raw)
+    else:
+        with whole(out, force=force) as part, part.open("w", encoding="utf-8", newline="") as file:
+            _write(result, form, file, raw=raw)
+    say_refused(result.refused, result.reason)
+    if result.absent:
+        counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
+        say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")
+    say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
+    say_archived(result.origin.told())
+    if not len(result) and (extent := inventory.extent(cloud, robot, stream)):
+        say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
+
+
+def _form_of(out: Path | None) -> Format:
+    """The format that a file's ending names; a device, a pipe and the standard output get a table."""
+    if out is None or (out.exists() and not out.is_file()):
+        return "table"
+    if out.suffix in {".mcap", ".bag"}:
+        raise UsageError(f"iort export writes {out.suffix}, iort query {', '.join(_ENDINGS)}; got {out}")
+    if out.suffix not in _ENDINGS:
+        raise UsageError(
+            f"the file must end in {', '.join(_ENDINGS)}, or --format must say what it is; got {out}"
+        )
+    return _ENDINGS[out.suffix]
+
+
+def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
+    from iort_station.cli import tables  # noqa: PLC0415 - as above
+    from iort_station.data import tabular  # noqa: PLC0415 - as above
+
+    if form == "parquet":
+        tabular.to_parquet(result, file.buffer)
+    elif form == "csv":
+        tabular.to_csv(result, file, raw=raw)
+    elif form == "jsonl":
+        tabular.to_json_lines(result, file)
+    elif file.isatty():
+        console = Console(file=file)
+        shown = tables.terminal(result, console.width)
+        console.print(shown.table)
+        if shown.rows < len(result):
+            say(f"{shown.rows} of {len(result):,} shown; a pipe or --out FILE.csv gets every one")
+        if shown.left_out:
+            say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --out FILE.csv")
+    else:
+        tables.plain(result, file)
+
+
+# `iort export`: the data as files that other tools open.
+
+
+# Streams for the station alone, not for people.
+_BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
+
+
+@commands.command(
+    "export",
+    epilog=examples("export car7 vesc --last 10m --out car7.mcap", "export car7 --last 10m --out all.mcap"),
+)
+@ranged
+def export(
+    context: typer.Context,
+    robot: Robot,
+    when: When,
+    out: Annotated[Path, to_file("The file to write: .mcap or .bag.")],
+    streams: Annotated[
+        list[str] | None, typer.Argument(help="The streams, for example vesc. Default: all.")
+    ] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
+
+    ROS messages of every type are written byte for byte as they were published. Other samples (of a simulated
+    car, a serial line, a selection of fields) become messages of the type that their source gave, or of their
+    fields. For CSV and Parquet, use iort query.
+    """
+    # numpy takes longer to load than most commands to run.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
+    from iort_station.data import bags  # noqa: PLC0415 - as above
+    from iort_station.data.export import write  # noqa: PLC0415 - as above
+    from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
+    from iort_station.data.selection import select  # noqa: PLC0415 - as above
+
+    kind = bags.KINDS.get(out.suffix)
+    if kind is None:
+        raise UsageError(f"the file must end in {' or '.join(bags.KINDS)}, got {out}")
+    check_free(out, force=force)
+    within = when.range(SHORT)
+    cloud = context.obj.cloud()
+    if not streams:
+        streams = [name for name in check_recorded(cloud, robot) if name not in _BOOKKEEPING]
+    written, origin = 0, Origin()
+    with kind(out, force=force) as file:
+        for stream in dict.fromkeys(streams):
+            selection = select(robot, stream, within.start_us, within.end_us)
+            with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
+                written += write(cloud, selection, file, origin=origin, say=say, progress=progress)
+        if not written:
+            for stream in streams:
+                check_there(cloud, robot, stream)
+            raise StationError(f"there are no samples to export; {out} is not written")
+    archived = origin.within(within.start_us, within.end_us).told()
+    told = {"file": str(out), "messages": written, "archive": archived and between_hours(archived)}
+    tell(told, f"{out}: {written:,} messages", as_json=as_json)
+    say_archived(archived)
+
+
+# `iort plot`: pictures of recorded samples.
+
+
+@commands.command(
+    "plot",
+    epilog=examples(
+        "plot car7 vesc --last 10m --fields speed_mps --out speed.png",
+        "plot car7 pose --kind trajectory --last 10m --out track.png",
+    ),
+)
+@ranged
+def plot(
+    context: typer.Context,
+    robot: Robot,
+    stream: Stream,
+    when: When,
+    out: Annotated[Path, to_file("The picture: .png, .svg or .pdf.")],
+    kind: Annotated[
+        Literal["time", "trajectory", "distribution"],
+        typer.Option(help="Fields over time, the way from above, or the distribution of values."),
+    ] = "time",
+    fields: Fields = None,
+    also: Annotated[list[str] | None, typer.Option("--with", help="Another robot; may be repeated.")] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Option("--run", help="A run's range, FROM/TO, instead of --from and --to; may be repeated."),
+    ] = None,
+    align: Annotated[
+        Literal["time", "start"], typer.Option(help="Draw several runs by the clock, or from their start.")
+    ] = "time",
+    where: Where = None,
+    every: Every = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Draw fields over time, the trajectory or the distribution, of one robot or several.
+
+    A trajectory needs a stream with a position: it is not computed from speeds. Latitudes and longitudes are
+    drawn as metres to the east and north of the first known place.
+    """
+    # Together they take longer to load than most commands to run.
+    from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
+    from iort_station.cli import plots  # noqa: PLC0415 - see above
+
+    plots.check_ending(out)
+    check_free(out, force=force)
+    if runs and when != When():
+        raise UsageError("give either --run or --from, --to and --last")
+    ranges = [_run(run) for run in runs] if runs else [when.range(SHORT)]
+    cloud = context.obj.cloud()
+    wanted = names(fields)
+    drawn: list[plots.Run] = []
+    for name in dict.fromkeys([robot, *(also or ())]):
+        for within in ranges:
+            result = _read(cloud, name, stream, within, fields=wanted, where=where, every=every)
+            say_refused(result.refused, result.reason)
+            if not len(result):
+                say(f"{name} {stream}: no samples in this range")
+                continue
+            label = f"{name}, {plots.when(int(result.times_us[0]))} UTC" if runs else name
+            drawn.append(plots.Run(label, result))
+    if not drawn:
+        raise StationError("there are no samples to draw")
+    if kind == "trajectory":
+        figure = plots.trajectory(drawn)
+    elif kind == "time":
+        shown = wanted or plots.usual(drawn[0].result)
+        figure = plots.over_time(drawn, shown, from_start=align == "start")
+    else:
+        figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
+    plots.save(figure, out, force=force)
+    count = sum(len(run.result) for run in drawn)
+    archived = Origin([hour for run in drawn for hour in run.result.origin.hours]).told()
+    told = {"file": str(out), "samples": count, "archive": archived and between_hours(archived)}
+    tell(told, f"{out}: {count:,} samples", as_json=as_json)
+    say_archived(archived)
+
+
+def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
+    from iort_station import data  # noqa: PLC0415 - as above
+    from iort_station.data.selection import derive  # noqa: PLC0415 - as above
+
+    with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
+        result = data.query(cloud, robot, stream, within.start_us, within.end_us, progress=progress, **asked)
+    columns = dict(result.columns)
+    if asked["fields"] is None and "speed" in columns:
+        columns |= derive(columns, registry.vehicle_of(cloud, robot))
+    return replace(result, columns=columns)
+
+
+def _run(text: str) -> Range:
+    first, separator, last = text.partition("/")
+    if not separator:
+        raise UsageError(
+            f"--run must be FROM/TO, for example 2026-05-04T10:00Z/2026-05-04T10:05Z, got {text!r}"
+        )
+    return When(first, last).range()
