@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-fast test-oldest mutants check setup prove-mixed wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-all test-fast test-oldest mutants check setup prove-mixed wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -35,8 +35,13 @@ up-service: setup ## let systemd run `make up`, also after a reboot; options as 
 up-password: setup ## set the password of the page that PAGE= opens: STATE=folder
 	@$(BIN)/python -m local.up.commands password $(STATE_OPTION)
 
-test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
-	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder
+PYTEST = $(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder --durations 20
+
+test: setup ## run every test but the heaviest: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
+	@$(PYTEST) -m "not heavy"
+
+test-all: setup ## run every test, also those of minutes, which CI runs: options as for test
+	@$(PYTEST)
 
 test-fast: setup ## run the unit tests that need no emulator, browser or ROS: while you work, WORKERS=2
 	@$(BIN)/python -m pytest tests/unit --numprocesses $(or $(WORKERS),2) --dist loadscope --no-loadscope-reorder \

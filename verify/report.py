@@ -158,7 +158,8 @@ _INTRODUCTION = """\
 
 Each row is a behaviour of AWS that the code relies on and that the embedded cloud imitates. *Documented*
 names AWS' page. *Assumed* means that AWS does not document it. *Measured* means that `make verify-aws` has
-seen it in an account; tests/local/gaps/test_verify.py then expects the same answer from the embedded cloud.
+seen it in an account; tests/local/emulator/test_verify.py then expects the same answer from the embedded
+cloud.
 How to ask your own account: [deploy](../how-to/deploy.md#ask-your-account). `python -m verify.report`
 writes the first table from verify/questions/; the second is written by hand.
 """
@@ -215,7 +216,7 @@ if __name__ == "__main__":
 
 # A run takes about an hour (nobody has measured it); what is metered by the hour is counted for two.
 _HOURS = 2.0
-# More than all questions together send and invoke (tests/local/gaps/test_verify.py counts them).
+# More than all questions together send and invoke (tests/local/emulator/test_verify.py counts them).
 MESSAGES, INVOCATIONS, WRITES = 5_000, 2_000, 5_000
 _ALARMS, _METRICS, _DASHBOARDS = 40, 200, 3
 _GB_SECONDS = INVOCATIONS * 0.5 * 1.0

@@ -245,7 +245,7 @@ def _counted(target: Target, since: datetime) -> float:
         "functions/shared/metrics.py",
         "stacks/parts.py",
         "stacks/monitoring.py",
-        "local/gaps/metrics/embedded_metrics.py",
+        "local/emulator/fixes/metrics.py",
     ),
 )
 def metric(target: Target) -> Seen:

@@ -106,6 +106,7 @@ def test_a_night_without_drives_passes_the_map_by(embedded, bundle, iort) -> Non
     assert "Drives" not in entered
 
 
+@pytest.mark.heavy
 def test_two_drives_of_the_agent_are_analysed(embedded, bundle, iort) -> None:
     """The agent's car drives twice; between the runs it is off."""
     car = bundle(sources=[{"type": "sim", "duration_s": 20, "rate_hz": 50}])
@@ -182,6 +183,7 @@ def _analysing(embedded: EmbeddedCloud) -> dict[int, float]:
     return found
 
 
+@pytest.mark.heavy
 def test_a_killed_function_is_tried_again_and_three_times_are_a_finding(embedded, bundle, iort) -> None:
     good, bad = bundle("good").robot, bundle("bad").robot
     stored(embedded, good, ago(4000, long()))

@@ -81,6 +81,7 @@ def test_the_figures_match_the_recording(tmp_path):
     until(lambda: not processes_of(tmp_path))
 
 
+@pytest.mark.heavy
 def test_the_demo_runs_until_ctrl_c_and_leaves_no_process(tmp_path):
     folder = tmp_path / "local"
     terminal = Terminal(lambda theirs: demo(folder, "--duration", "1", terminal=theirs))
@@ -165,6 +166,7 @@ def test_an_error_lists_the_topics_of_a_recording_without_vesc(tmp_path):
     assert "/servo" in output
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
 def test_no_process_remains_after_a_hangup_or_a_kill(tmp_path, number):
     folder = tmp_path / "local"

@@ -109,6 +109,7 @@ def drives(embedded: EmbeddedCloud, tmp_path_factory):
     return finished
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_network_fault_loses_no_sample(embedded, drives, name):
     robot, agent, report = drives[name]
@@ -167,6 +168,7 @@ def test_a_killed_agent_resumes_its_queue(embedded, bundle, proxy, tmp_path, bro
     assert found[restart:] == list(range(10 * RATE_HZ))
 
 
+@pytest.mark.heavy
 def test_a_claimed_robot_that_is_killed_in_an_outage_loses_only_its_open_batch(embedded, proxy, tmp_path):
     """The recommended way to a robot sets no queue, and it is on the disk."""
     claim = identity.claim(embedded.cloud, "claimed-killed", out=tmp_path / "claim")

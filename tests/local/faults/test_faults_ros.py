@@ -6,6 +6,8 @@ import functools
 import json
 from collections.abc import Callable
 
+import pytest
+
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
@@ -14,6 +16,8 @@ from local.cloud import EmbeddedCloud
 from testkit.waiting import until
 from tests.ros.conftest import Graph, graph, ros_python  # noqa: F401 - fixtures
 from tests.ros.test_source import WHEEL
+
+pytestmark = pytest.mark.heavy
 
 LATER, COUNT = 1000, 100
 

@@ -23,6 +23,8 @@ from tests.local.network.booted import booted
 from tests.local.network.laboratory import BIN, Laboratory, waiting
 from tests.local.network.namespaces import two_machines
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:

@@ -21,6 +21,8 @@ from testkit.mqtt import Robot
 from testkit.waiting import until
 from testkit.worst_case import worst_batches
 
+pytestmark = pytest.mark.heavy
+
 S = 1_000_000
 GOOD = 8
 

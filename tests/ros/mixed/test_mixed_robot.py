@@ -37,6 +37,8 @@ from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read
 from tests.ros.mixed.robot import NODES, TOPICS
 from tests.ros.mixed.rosbridge import GraphServer
 
+pytestmark = pytest.mark.heavy
+
 RECORD = Path("/usr/lib/rosbag/record")
 DURATION_S = float(os.environ.get("IORT_MIXED_S") or 20)
 OUTAGE_S = max(5.0, DURATION_S / 5)

@@ -51,8 +51,8 @@ def module_exists(name: str) -> bool:
 def test_every_path_and_module_that_a_page_names_exists(page: Path) -> None:
     # What a page shows as a new file (how-to-extend.md) is in a fenced block.
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    assert missing_paths(text, page.parent) == set()
     if page.name != "CHANGELOG.md":  # It names what was removed, too.
+        assert missing_paths(text, page.parent) == set()
         assert missing_modules(text) == set()
 
 
