@@ -1,4 +1,4 @@
-"""The telemetry table, its stream and Lambda 2 in memory, and batches to store."""
+"""The telemetry table, its stream and `summarize` in memory, and batches to store."""
 
 from __future__ import annotations
 

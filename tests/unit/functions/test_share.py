@@ -1,4 +1,4 @@
-"""A robot's share of Lambda 2: batches over it wait, and the robot is notified."""
+"""A robot's share of the processor: batches over it wait, and the robot is notified."""
 
 from __future__ import annotations
 

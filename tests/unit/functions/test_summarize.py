@@ -1,4 +1,4 @@
-"""Lambda 2: the content of a second's summary, one property a test."""
+"""Summarize: the content of a second's summary, one property a test."""
 
 from __future__ import annotations
 
