@@ -1,4 +1,4 @@
-"""Lambda 1's publisher: PubNub's own SDK against the stand-in, over a real connection."""
+"""The live function's publisher: PubNub's own SDK against the stand-in, over a real connection."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def standin():
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """On a slow machine the stand-in does not always answer within Lambda 1's second."""
-    monkeypatch.setattr(pubnub_client, "_TIMEOUT_S", GUARD_S)
+    monkeypatch.setattr(pubnub_client, "_TIMEOUT_S", int(GUARD_S))
 
 
 @pytest.fixture
