@@ -1,5 +1,5 @@
 """Measures what the README promises, each figure beside its floor in the same run.
 
-A module at this level is a command, or all commands share it. The bench may import every other package of the
-repository; only verify/, scripts/ and tests/ import the bench.
+`python -m bench.run` measures sections, which `bench.sections` declares, and writes their report. Only
+scripts/ and tests/ import the bench.
 """

@@ -157,7 +157,8 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="make bench",
         description=(__doc__ or "").splitlines()[0],
-        epilog=sections.manual(),
+        # It loads every section, and with one of them the CDK.
+        epilog=sections.manual() if {"-h", "--help"} & set(sys.argv) else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--only", type=_sections, default=list(SECTIONS), help=f"some of {', '.join(ALL)}")

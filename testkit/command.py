@@ -1,4 +1,4 @@
-"""What all commands share: options, figures as a file, progress, confirmation, and an orderly end."""
+"""What commands share: progress, confirmation, an orderly end, and tables."""
 
 from __future__ import annotations
 

@@ -39,12 +39,16 @@ class Client:
     """A client of the broker, by its name for errors.
 
     ``build`` makes the library's client from the options that all have. `reason` is the name of the reason
-    code with which the broker refused or ended the connection; "" if it gave none.
+    code with which the broker refused or ended the connection; "" if it gave none. ``take`` gets each message
+    in the client's thread; without it they wait for `next_message`.
     """
 
-    def __init__(self, name: str, build: Callable[..., mqtt5.Client]) -> None:
+    def __init__(
+        self, name: str, build: Callable[..., mqtt5.Client], take: Callable[[str, bytes], None] | None = None
+    ) -> None:
         self.name = name
         self.messages: queue.Queue[tuple[str, bytes]] = queue.Queue()
+        put = take or (lambda topic, payload: self.messages.put((topic, payload)))
         self.connected, self.refused, self.lost = threading.Event(), threading.Event(), threading.Event()
         self.reason = ""
         self._stopped = threading.Event()
@@ -52,9 +56,7 @@ class Client:
             ack_timeout_sec=60,
             min_reconnect_delay_ms=60_000,
             max_reconnect_delay_ms=60_000,
-            on_publish_received=lambda data: self.messages.put(
-                (data.publish_packet.topic, data.publish_packet.payload)
-            ),
+            on_publish_received=lambda data: put(data.publish_packet.topic, data.publish_packet.payload),
             on_lifecycle_connection_success=lambda _data: self.connected.set(),
             on_lifecycle_connection_failure=lambda data: self._ended(data.connack_packet, self.refused),
             on_lifecycle_disconnection=lambda data: self._ended(data.disconnect_packet, self.lost),
@@ -96,9 +98,9 @@ class Client:
             return str(sent.result().puback.reason_code.name)
         return "DISCONNECTED" if self.lost.is_set() else "NOT_SENT"
 
-    def subscribe(self, topic_filter: str) -> str:
-        """Subscribe at QoS 1; return the broker's reason code. Raises `InstrumentError` if none comes."""
-        subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
+    def subscribe(self, topic_filter: str, qos: int = 1) -> str:
+        """Subscribe; return the broker's reason code. Raises `InstrumentError` if none comes."""
+        subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS(qos))
         packet = mqtt5.SubscribePacket(subscriptions=[subscription])
         answer = self._answer(self._client.subscribe(packet))
         return str(answer.reason_codes[0].name)
