@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import stat
 import threading
@@ -135,15 +134,6 @@ def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
     assert len((folder / STATE).read_text().splitlines()) <= 1000 + 2 * count
 
 
-def test_the_state_of_an_earlier_agent_is_taken_over(folder):
-    (folder / "a.jpg").write_bytes(b"1")
-    look = (folder / "a.jpg").stat()
-    done = {"look": [look.st_size, look.st_mtime_ns], "key": "key", "at_s": 1}
-    (folder / ".iort-uploads.json").write_text(json.dumps({"read": {}, "done": {"a.jpg": done}}))
-    assert watched(folder).next() is None
-    assert (folder / STATE).exists()
-
-
 def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
     name, stop = PurePath("drive/a.bag"), threading.Event()
     path = folder / name
@@ -235,9 +225,7 @@ def test_a_readable_queue_is_made_private(folder):
     assert modes(folder) == {0o600}
 
 
-@pytest.mark.parametrize(
-    "name", ["queue.db", "queue.db-wal", "queue.db-shm", "queue.db.lock", "queue.db.seq"]
-)
+@pytest.mark.parametrize("name", ["queue.db", "queue.db-wal", "queue.db-shm", "queue.db.lock"])
 def test_a_link_in_place_of_the_queue_is_reported_and_batches_are_sent(folder, secret, name):
     (folder / name).symlink_to(secret)
     clock = ManualClock()

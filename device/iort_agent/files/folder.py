@@ -27,8 +27,6 @@ from iort_agent.files.upload import Uploader
 _log = logging.getLogger(__name__)
 
 STATE = ".iort-uploads.jsonl"
-# The whole state in one object, as earlier agents wrote it.
-_OLD_STATE = ".iort-uploads.json"
 # While files wait, the folder is looked through this often: each look costs as much as it has files.
 _LOOK_S = 30.0
 # The lines that may be out of force, beside as many as are in force.
@@ -204,19 +202,11 @@ class Folder:
             self._write()
 
     def _saved(self) -> str:
-        """The lines of the state; an earlier agent's state becomes lines."""
+        """The complete lines of the state."""
         try:
             with open_below(self.path, PurePath(STATE)) as file:
                 text = file.read().decode()
         except FileNotFoundError:
-            try:
-                with open_below(self.path, PurePath(_OLD_STATE)) as file:
-                    saved = json.load(file)
-            except FileNotFoundError:
-                return ""
-            for name in {**saved["read"], **saved["done"]}:
-                self._take(name, saved["read"].get(name), saved["done"].get(name))
-            self._write()
             return ""
         # The agent may have been killed in the middle of the last line.
         lines, newline, rest = text.rpartition("\n")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import fcntl
-import json
 import os
 import sqlite3
 import zlib
@@ -15,15 +14,10 @@ from typing import Callable, Collection, Iterable, Mapping, NamedTuple
 from iort_agent.common.private_files import make_private
 from iort_agent.errors import AgentError
 from iort_agent.spool import FULL, Backlog, Dropped, Entry
-from iort_contract.messages.batch import MAX_PREVIOUS, RunEnd, batch_id
+from iort_contract.messages.batch import MAX_PREVIOUS, RunEnd
 
 _APPLICATION_ID = 0x696F7274  # "iort"
 _VERSION = 2
-_RUNS = """
-CREATE TABLE runs (
-    stream TEXT NOT NULL, boot TEXT NOT NULL, last_seq INTEGER NOT NULL, PRIMARY KEY (stream, boot)
-);
-"""
 # The index lets a start count the batches without reading the payloads.
 _SCHEMA = f"""
 BEGIN;
@@ -32,20 +26,12 @@ CREATE TABLE batches (
     bytes INTEGER NOT NULL, crc INTEGER NOT NULL, payload BLOB NOT NULL
 );
 CREATE INDEX sizes ON batches (id, bytes, samples);
-{_RUNS}
+CREATE TABLE runs (
+    stream TEXT NOT NULL, boot TEXT NOT NULL, last_seq INTEGER NOT NULL, PRIMARY KEY (stream, boot)
+);
 PRAGMA application_id = {_APPLICATION_ID};
 PRAGMA user_version = {_VERSION};
 COMMIT;
-"""
-# Version 1 numbered a stream's batches across runs.
-_FROM_VERSION_1 = f"""
-BEGIN;
-{_RUNS}
-DROP INDEX ledger;
-CREATE INDEX sizes ON batches (id, bytes, samples);
-DROP TABLE streams;
-DROP TABLE dropped;
-PRAGMA user_version = {_VERSION};
 """
 # The write-ahead log is cut to this after a checkpoint, which comes every 1,000 pages.
 _LOG_BYTES = 4 * 1024 * 1024
@@ -67,42 +53,32 @@ class QueueLock:
     """
 
     def __init__(self, path: Path) -> None:
-        # Agents before queue files of version 2 lock this file.
-        self._old = Path(f"{path}.seq")
-        names = [Path(f"{path}.lock"), *([self._old] if self._old.exists() else [])]
-        self._fds: list[int] = []
+        name = Path(f"{path}.lock")
+        self._fd = os.open(name, _LOCK_FLAGS, 0o600)
         try:
-            for name in names:
-                self._fds.append(os.open(name, _LOCK_FLAGS, 0o600))
-                self._lock(name, self._fds[-1])
-        except BaseException:
-            self.close()
-            raise
-        self.ours = any(os.fstat(fd).st_size > 0 for fd in self._fds)
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            content = os.pread(self._fd, 32, 0)
+            os.close(self._fd)
+            if not isinstance(error, BlockingIOError):
+                raise
+            process = int(content) if content.isdigit() else "unknown"
+            raise AgentError(
+                f"{name}: the queue is in use by another iort-agent (process {process}): "
+                "end that one, or give this robot a queue.path of its own"
+            ) from error
+        self.ours = os.fstat(self._fd).st_size > 0
 
     def note_owner(self) -> None:
         """Note this process as the queue's, once the queue's file is known to be one."""
         self.ours = True
         with contextlib.suppress(OSError):  # the lock holds without it, on a full disk too
-            os.ftruncate(self._fds[0], 0)
-            os.pwrite(self._fds[0], b"%d" % os.getpid(), 0)
-            self._old.unlink()
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, b"%d" % os.getpid(), 0)
 
     def close(self) -> None:
         """Give the queue to whoever comes next."""
-        while self._fds:
-            os.close(self._fds.pop())
-
-    def _lock(self, path: Path, fd: int) -> None:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            content = os.pread(fd, 32, 0)
-            process = int(content) if content.isdigit() else "unknown"
-            raise AgentError(
-                f"{path}: the queue is in use by another iort-agent (process {process}): "
-                "end that one, or give this robot a queue.path of its own"
-            ) from error
+        os.close(self._fd)
 
 
 class SpoolFile:
@@ -126,47 +102,34 @@ class SpoolFile:
 
     def _set_up(self, durability: str) -> None:
         run = self.connection.execute
-        # Takes effect in a new file only, and lets the file shrink again.
-        run("PRAGMA auto_vacuum = INCREMENTAL")
-        version = self._known_version()
+        # First, because a file that is refused must stay as it is.
+        is_new = self._is_new()
+        if is_new:
+            # Lets the file shrink again.
+            run("PRAGMA auto_vacuum = INCREMENTAL")
         run("PRAGMA journal_mode = WAL")
         # FULL syncs the log with every commit; NORMAL leaves that to the kernel, and the checkpoint.
         run(f"PRAGMA synchronous = {'FULL' if durability == FULL else 'NORMAL'}")
         run(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
-        if version == 0:
+        if is_new:
             self.connection.executescript(_SCHEMA)
-        elif version == 1:
-            self._upgrade()
         self._stat = self._path.stat()
 
-    def _known_version(self) -> int:
-        """The file's version, 0 for a new file. The file of another program must be neither written to nor
-        moved away."""
+    def _is_new(self) -> bool:
+        """Whether it has no tables yet. The file of another program, or of another version with what waits in
+        it, must be neither written to nor moved away."""
         owner, version = self._number("application_id"), self._number("user_version")
         empty = self.connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
         if empty and (owner, version) == (0, 0):
-            return 0
+            return True
         if owner != _APPLICATION_ID:
             raise sqlite3.DatabaseError("it is a database of another program")
-        if version not in (1, _VERSION):
+        if version != _VERSION:
             raise AgentError(
                 f"{self._path}: was written by another version of iort-agent (format {version}, this one "
-                f"knows 1 and {_VERSION}): let that version send what is in it, or move the file away"
+                f"knows {_VERSION}): let that version send what is in it, or move the file away"
             )
-        return version
-
-    def _upgrade(self) -> None:
-        """Make a file of version 1 one of this version. Its batches stay; the name of the run that wrote
-        them is in the batches."""
-        run = self.connection.execute
-        next_seqs = dict(run("SELECT stream, next_seq FROM streams"))
-        last = run("SELECT stream, payload, max(id) FROM batches GROUP BY stream").fetchall()
-        self.connection.executescript(_FROM_VERSION_1)
-        for stream, payload, _ in last:
-            with contextlib.suppress(ValueError, KeyError, TypeError):  # not a batch of today
-                boot = batch_id(json.loads(payload)["batch"]).boot
-                run("INSERT INTO runs VALUES (?, ?, ?)", (stream, boot, next_seqs[stream] - 1))
-        run("COMMIT")
+        return False
 
     def in_place(self) -> bool:
         """Whether the file is still the one at its path; SQLite would go on in a removed one."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import json
 import os
 import shutil
 import sqlite3
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -18,95 +15,29 @@ import pytest
 
 from iort_agent.errors import AgentError
 from iort_agent.spool.file import SpoolFile
-from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
-from iort_contract.messages.batch import Batch, encode_batch
 from testkit.agent import ManualClock
-from tests.unit.agent.spool.test_spool import BOOT, fill, following, kept
-from tests.unit.agent.spool.test_sqlite_spool import MB, ROOT, RUNS, all_kept, crash, running, spool_at
+from tests.unit.agent.test_spool import (
+    BOOT,
+    MB,
+    ROOT,
+    RUNS,
+    Failing,
+    all_kept,
+    crash,
+    fill,
+    following,
+    kept,
+    path,
+    retry,
+    running,
+    spool_at,
+    works,
+)
 
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "spool.db"
-
-
-def retry(spool: SqliteSpool) -> None:
-    """The next time that the spool's thread looks at the disk."""
-    spool._clock.wait(spool._kick, 0)
-    clock: Any = spool._clock
-    clock.advance(RETRY_S)
-    spool.work()
-
-
-class Failing(SpoolFile):
-    """A file whose commits fail, and whose reads too, while these say how."""
-
-    commits: Exception | None = None
-    reads: Exception | None = None
-
-    def commit(self, *arguments: Any, **more: Any) -> None:
-        if Failing.commits is not None:
-            raise Failing.commits
-        super().commit(*arguments, **more)
-
-    def read(self, after: int, to: int) -> Any:
-        if Failing.reads is not None:
-            raise Failing.reads
-        return super().read(after, to)
-
-
-@pytest.fixture(autouse=True)
-def _works() -> None:
-    Failing.commits = Failing.reads = None
+__all__ = ["path", "works"]
 
 
 # --- disks that do not work ------------------------------------------------------------------------
-
-
-class Small(SpoolFile):
-    """A file on a disk of 256 KB."""
-
-    def _set_up(self, durability: str) -> None:
-        super()._set_up(durability)
-        self.connection.execute("PRAGMA max_page_count = 64")
-
-
-def test_a_full_disk_leaves_it_running_in_memory_until_there_is_room(
-    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    spool = spool_at(path, open_file=Small, memory_bytes=100_000)
-    for first in range(0, 1000, 50):
-        fill(spool, 50, size=1000, first=first)
-        spool.work()
-    assert "database or disk is full" in (spool.alarm or "")
-    assert caplog.text.count("disk is full") == 1, "raised once"
-    assert not spool.durable
-    fill(spool, 200, size=1000, first=1000)
-    dropped = spool.dropped()
-    assert dropped.batches > 0, "what memory has no room for"
-    assert 90_000 < spool._memory.backlog().payload_bytes <= 100_000
-    seqs = kept(spool)
-    assert seqs == sorted(seqs)
-    assert seqs[-1] == 1199
-    assert len(seqs) == 1200 - dropped.batches == spool.backlog().batches
-    # A kill now: the file does not know all the numbers that were used.
-    again = spool_at(crash(spool, tmp_path), open_file=Small, memory_bytes=100_000)
-    ((boot, last),) = again.previous("vesc") or ()
-    assert (boot, last) == (BOOT, max(kept(again)))
-    fill(again, 50, size=1000, boot=RUNS[0])
-    again.work()
-    assert again.alarm is not None
-    entries = all_kept(again)
-    assert [entry.seq for entry in entries[-50:]] == list(range(50)), "published from memory, after the file"
-    for entry in entries:
-        again.ack(entry.id)
-    fill(again, 5, size=1000, first=50, boot=RUNS[0])
-    retry(again)
-    assert again.alarm is None, "with room, what is in memory is written"
-    again.close()
-    with running(again._path) as third:
-        assert kept(third) == [50, 51, 52, 53, 54]
-        assert third.previous("vesc") == ((RUNS[0], 54),)
 
 
 def test_the_oldest_in_a_full_file_are_dropped_and_counted_though_they_cannot_be_deleted(path: Path) -> None:
@@ -150,23 +81,6 @@ def test_a_disk_that_fails_at_the_start_is_taken_into_use_when_it_works(path: Pa
     with running(missing / "spool.db") as again:
         assert again.backlog().batches == 0
         assert again.previous("vesc") == ((BOOT, 4),)
-
-
-def test_what_was_acknowledged_while_the_disk_was_full_does_not_come_again(path: Path) -> None:
-    spool = spool_at(path, open_file=Failing)
-    fill(spool, 5)
-    spool.work()
-    Failing.commits = sqlite3.OperationalError("any text")
-    for entry in all_kept(spool)[:3]:
-        spool.ack(entry.id)
-    spool.work()
-    assert not spool.durable
-    Failing.commits = None
-    retry(spool)
-    assert spool.durable
-    spool.close()
-    with running(path) as again:
-        assert kept(again) == [3, 4]
 
 
 def test_a_batch_that_arrives_while_it_is_being_written_is_not_kept(path: Path) -> None:
@@ -266,23 +180,6 @@ def flip_pages(path: Path, pages: range) -> None:
             file.write(bytes(byte ^ 0x55 for byte in old))
 
 
-def test_garbage_is_set_aside(path: Path) -> None:
-    with running(path) as spool:
-        fill(spool, 10)
-    path.write_bytes(b"\0garbage" * 5000)
-    with running(path) as spool:
-        assert "damaged" in (spool.alarm or "")
-        assert spool.previous("vesc") == (), "nothing is known of the run before"
-        assert (spool.dropped(), spool.damaged) == ((0, 0), 1), "but that it was there"
-        fill(spool, 1)
-        assert kept(spool) == [0]
-    assert [file.read_bytes() for file in aside(path)] == [b"\0garbage" * 5000]
-    with running(path) as spool:
-        assert spool.alarm is None, "a good file at the next start is good"
-        assert spool.damaged == 0
-        assert kept(spool) == [0]
-
-
 @pytest.mark.parametrize("stopped", [True, False])
 def test_pages_flipped_in_the_middle_cost_only_what_was_in_them(path: Path, stopped: bool) -> None:
     spool = spool_at(path, max_bytes=10 * MB)
@@ -321,21 +218,6 @@ def test_pages_flipped_in_the_middle_cost_only_what_was_in_them(path: Path, stop
         assert kept(again) == [*seqs, 2000]
         assert again.previous("vesc") == ((BOOT, 2000),)
         assert again.previous("rtt") == ((BOOT, 0),)
-
-
-def test_a_payload_altered_on_the_disk_does_not_go_out(path: Path) -> None:
-    with running(path) as spool:
-        for i in range(10):
-            spool.put("vesc", BOOT, i, b"payload %d" % i * 10, samples=3)
-    content = path.read_bytes()
-    assert b"payload 4payload 4" in content
-    path.write_bytes(content.replace(b"payload 4payload 4", b"payload 4payload 5", 1))
-    with running(path) as spool:
-        assert kept(spool) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
-        assert spool.dropped() == (1, 3)
-        assert "is not as it was written" in (spool.alarm or "")
-        assert spool.previous("vesc") == ((BOOT, 9),)
-    assert len(aside(path)) == 1
 
 
 def test_batches_that_vanish_from_the_file_are_counted(path: Path) -> None:
@@ -439,24 +321,6 @@ def test_a_damaged_file_on_a_full_disk_waits_for_room(path: Path) -> None:
     spool.close()
 
 
-def test_a_file_removed_while_it_is_in_use_is_written_anew(path: Path, tmp_path: Path) -> None:
-    spool = spool_at(path)
-    fill(spool, 10)
-    spool.work()
-    for file in path.parent.glob("spool.db*"):
-        if not file.name.endswith(".lock"):
-            file.unlink()
-    fill(spool, 2, first=10)
-    spool.work()
-    spool.work()
-    assert "removed" in (spool.alarm or "")
-    assert spool.dropped() == (0, 0)
-    # A kill, because the new file's log must be where it belongs.
-    with running(crash(spool, tmp_path)) as again:
-        assert sorted(kept(again)) == list(range(12))
-        assert again.previous("vesc") == ((BOOT, 11),)
-
-
 def test_the_log_of_a_removed_file_is_not_written_into_the_new_one(path: Path) -> None:
     spool = spool_at(path, max_bytes=8 * MB)
     arrived = set()
@@ -501,27 +365,35 @@ def test_only_the_newest_damaged_files_are_kept(path: Path) -> None:
 # --- another's file -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["text", "database"])
-def test_a_file_that_is_none_of_ours_is_left_alone(path: Path, kind: str) -> None:
+NOT_OURS, OTHER = "give queue.path another name", "another version of iort-agent"
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("text", NOT_OURS),
+        ("database", NOT_OURS),
+        (1, OTHER),
+        (3, OTHER),
+    ],
+)
+def test_a_file_of_another_program_or_version_is_refused_and_left_alone(
+    path: Path, kind: Any, told: str
+) -> None:
     if kind == "text":
         path.write_text("notes\n" * 100)
     else:
+        if kind != "database":
+            with running(path) as spool:
+                fill(spool, 3)
         with contextlib.closing(sqlite3.connect(path)) as db:
-            db.execute("CREATE TABLE mine (x)")
+            db.execute("CREATE TABLE mine (x)" if kind == "database" else f"PRAGMA user_version = {kind}")
     before = path.read_bytes()
     for _ in range(2):
-        with pytest.raises(AgentError, match=r"spool\.db: .*give queue\.path another name"):
+        with pytest.raises(AgentError, match=rf"spool\.db: .*{told}"):
             spool_at(path)
     assert path.read_bytes() == before
     assert not aside(path)
-
-
-def test_a_newer_format_is_refused(path: Path) -> None:
-    spool_at(path).close()
-    with contextlib.closing(sqlite3.connect(path)) as db:
-        db.execute("PRAGMA user_version = 3")
-    with pytest.raises(AgentError, match="another version of iort-agent"):
-        spool_at(path)
 
 
 def test_a_second_agent_is_refused_and_told_what_to_do(path: Path) -> None:
@@ -540,71 +412,3 @@ def test_a_second_agent_is_refused_and_told_what_to_do(path: Path) -> None:
     )
     assert "end that one, or give this robot a queue.path of its own" in second.stderr
     spool_at(path).close()
-
-
-# --- files of version 1 ---------------------------------------------------------------------------------
-
-VERSION_1 = """
-PRAGMA journal_mode = WAL;
-BEGIN;
-CREATE TABLE batches (
-    id INTEGER PRIMARY KEY, stream TEXT NOT NULL, seq INTEGER NOT NULL, samples INTEGER NOT NULL,
-    bytes INTEGER NOT NULL, crc INTEGER NOT NULL, payload BLOB NOT NULL
-);
-CREATE INDEX ledger ON batches (id, bytes, samples);
-CREATE TABLE streams (stream TEXT PRIMARY KEY, next_seq INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE dropped (id INTEGER PRIMARY KEY, batches INTEGER NOT NULL, samples INTEGER NOT NULL);
-PRAGMA application_id = 0x696F7274;
-PRAGMA user_version = 1;
-INSERT INTO streams VALUES ('vesc', 45), ('rtt', 7);
-INSERT INTO dropped VALUES (0, 3, 150);
-COMMIT;
-"""
-
-
-def version_1(path: Path) -> list[bytes]:
-    """A queue file as the agent before this one left it: batches 41 to 43 wait, and 44 was dropped."""
-    payloads = [encode_batch(Batch(RUNS[0], seq, [seq], {"speed": [seq]})) for seq in (41, 42, 43)]
-    with contextlib.closing(sqlite3.connect(path)) as db:
-        db.executescript(VERSION_1)
-        for i, payload in enumerate(payloads):
-            crc = zlib.crc32(payload, zlib.crc32(f"vesc {41 + i} 1 ".encode()))
-            row = (7 + i, "vesc", 41 + i, 1, len(payload), crc, payload)
-            db.execute("INSERT INTO batches VALUES (?, ?, ?, ?, ?, ?, ?)", row)
-        db.commit()
-    slot = json.dumps({"reserved": {"vesc": 297}, "turn": 2, "clean": True}).ljust(32 * 1024)
-    Path(f"{path}.seq").write_text(slot)
-    return payloads
-
-
-def test_what_waits_in_a_file_of_version_1_is_sent_and_its_run_is_named(path: Path) -> None:
-    payloads = version_1(path)
-    with running(path) as spool:
-        assert spool.alarm is None
-        entries = all_kept(spool)
-        assert [(entry.seq, entry.payload) for entry in entries] == list(zip((41, 42, 43), payloads))
-        # Up to the number that was dropped.
-        assert spool.previous("vesc") == ((RUNS[0], 44),)
-        assert spool.previous("rtt") == (), "no batch says which run it was"
-        spool.ack(entries[0].id)
-    assert not path.with_name("spool.db.seq").exists()
-    with running(path) as spool:
-        assert kept(spool) == [42, 43]
-        assert spool.previous("vesc") == ((RUNS[0], 44),)
-
-
-def test_a_damaged_file_of_version_1_is_salvaged(path: Path) -> None:
-    payloads = version_1(path)
-    content = path.read_bytes()
-    path.write_bytes(content.replace(payloads[1], payloads[1][::-1]))
-    with running(path) as spool:
-        assert kept(spool) == [41, 43]
-        assert spool.dropped() == (1, 1)
-
-
-def test_an_agent_before_this_one_that_still_runs_keeps_the_queue(path: Path) -> None:
-    version_1(path)
-    with path.with_name("spool.db.seq").open("rb") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(AgentError, match=r"spool\.db\.seq: the queue is in use"):
-            spool_at(path)
