@@ -23,7 +23,7 @@ from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.proof.fleet import drive_of
 from bench.proof.judging import analysed
 from iort_agent.sources.sim.vehicle import VehicleConfig
-from iort_analysis.evaluation.evaluate import evaluate
+from iort_analysis.evaluation import evaluate
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH

@@ -15,8 +15,8 @@ from functions.shared import clients, recordings
 from functions.shared.analysis import Kept
 from functions.shared.clients import variables
 from functions.shared.recordings import Recordings
-from iort_analysis.archive.tables import write_table
-from iort_analysis.drives.recorded import recorded
+from iort_analysis.archive.columns import write_table
+from iort_analysis.drives.stretches import recorded
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, encode_result
 from iort_analysis.samples.batches import RefusedItems

@@ -13,8 +13,8 @@ from typing import Any
 from functions.shared import clients
 from functions.shared.analysis import Kept, failed_plans, failure, waits
 from functions.shared.clients import variables
-from iort_analysis.drives.finding import LONGEST_US
-from iort_analysis.evaluation.evaluate import evaluate
+from iort_analysis.drives.stretches import LONGEST_US
+from iort_analysis.evaluation import evaluate
 from iort_analysis.results import DriveResult, Measured, decode_result
 from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.catalog.environments import EvaluateEnvironment

@@ -22,8 +22,8 @@ from functions.shared import clients, recordings
 from functions.shared.analysis import NOT_COMPARED, Kept, failed_plans
 from functions.shared.clients import variables
 from functions.shared.recordings import Recordings
-from iort_analysis.drives.finding import STAND_US, Found, Heard, find
-from iort_analysis.drives.motion import Motion, motion_among
+from iort_analysis.drives.drive import Motion, motion_among
+from iort_analysis.drives.stretches import STAND_US, Found, Heard, find
 from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import plan_key, robots_key, waiting_key

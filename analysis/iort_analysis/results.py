@@ -11,6 +11,17 @@ from numpy.typing import NDArray
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import DriveKey, Estimate, decode_estimate, encode_estimate
 
+# The package's exceptions.
+
+
+class AnalysisError(Exception):
+    """The root of the package's exceptions."""
+
+
+class ArchiveError(AnalysisError):
+    """An object of the archive that is missing or damaged; the text says which."""
+
+
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
 Table: TypeAlias = Mapping[str, NDArray[Any]]
 

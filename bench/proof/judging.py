@@ -20,7 +20,7 @@ import iort_contract
 from bench.proof.fleet import DriveSpec, digest, simulated
 from iort_agent.sources.sim import ALL
 from iort_agent.sources.sim.vehicle import AIR_KG_PER_M3, G_MPS2, WIND_MPS, VehicleConfig
-from iort_analysis.evaluation.evaluate import evaluate
+from iort_analysis.evaluation import evaluate
 from iort_analysis.process import analyse
 from iort_analysis.results import DriveResult, Measured
 from iort_contract.catalog.derived import F1TENTH

@@ -20,7 +20,7 @@ from bench.proof.fleet import RATE_HZ, Plan, drive_of, stored
 from bench.proof.judging import INDICATORS, RIGHT, SPANNING, Case, Coverage, Detected, Judged
 from bench.report import Section
 from iort_agent.sources.sim.faults import KINDS, STRENGTHS
-from iort_analysis.drives.recorded import recorded
+from iort_analysis.drives.stretches import recorded
 from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH

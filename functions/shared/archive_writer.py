@@ -17,8 +17,8 @@ from typing import IO, Any, NamedTuple
 from functions.shared.archive import Archive
 from functions.shared.metrics import emit
 from iort_analysis.archive.hours import key_of, merged
-from iort_analysis.archive.items import items as archived_items
 from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.archive.reading import items as archived_items
 from iort_analysis.archive.writing import described, write_day, write_hour
 from iort_contract.archive import (
     ArchivedHour,

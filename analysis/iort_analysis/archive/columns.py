@@ -1,18 +1,20 @@
 """The columns of the archive's files: their names, and their values as arrays of Arrow and of numpy.
 
 A field is a column of its own name. What belongs to a batch or a message is in columns whose names begin with
-an underscore, which no field's does; they repeat for each row, which costs nearly nothing in Parquet.
-"""
+an underscore, which no field's does; they repeat for each row, which costs nearly nothing in Parquet."""
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
+from iort_analysis.results import Table
 from iort_analysis.samples.blocks import Column, column_of, objects
 from iort_contract.codec import EXACT
 from iort_contract.limits import Value
@@ -165,3 +167,29 @@ def runs(array: Any) -> tuple[list[Any], Any]:
     indices = np.asarray(array.indices if pa.types.is_dictionary(array.type) else array)
     starts = np.flatnonzero(np.append(True, indices[1:] != indices[:-1])) if len(indices) else indices[:0]
     return array.take(pa.array(starts)).to_pylist(), np.append(starts, len(indices))
+
+
+# The tables of a drive's result as Parquet: columns as they are, texts and lists as JSON.
+
+
+def write_table(table: Table) -> bytes:
+    """A table as a Parquet file."""
+    columns = {
+        name: pa.array(column if column.dtype.kind in "fiub" else _texts(column))
+        for name, column in table.items()
+    }
+    file = io.BytesIO()
+    pq.write_table(pa.table(columns), file, compression="zstd")
+    return file.getvalue()
+
+
+def read_table(content: bytes) -> dict[str, np.ndarray]:
+    """The columns of a file that `write_table` wrote."""
+    table = pq.read_table(io.BytesIO(content))
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def _texts(column: np.ndarray) -> list[str | None]:
+    return [
+        value if value is None or isinstance(value, str) else json.dumps(value) for value in column.tolist()
+    ]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from iort_analysis.errors import ArchiveError
+from iort_analysis.results import ArchiveError
 from iort_analysis.samples.batches import Item, Part, RefusedItems, Wanted
 from iort_analysis.samples.blocks import join
 from iort_analysis.samples.seconds import Batches, batches_of
@@ -189,7 +189,7 @@ class HourFile:
     def items(self) -> list[Item]:
         """Everything that was stored, in order; what is not a batch byte for byte."""
         # It takes longer to load than most commands to run.
-        from iort_analysis.archive.items import items  # noqa: PLC0415 - see above
+        from iort_analysis.archive.reading import items  # noqa: PLC0415 - see above
 
         batches = items(self._file, self._row.topic, self._hour) if self._row.batches else ()
         return sorted([*batches, *self._refused()], key=key_of)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import groupby
 from typing import IO, Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -21,15 +24,204 @@ from iort_analysis.archive.columns import (
     cast,
     column_name,
     joined_kind,
+    kind_of,
     named,
+    repeated,
+    to_arrow,
     to_values,
 )
-from iort_analysis.archive.pieces import pieces
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
+from iort_analysis.samples.batches import decode_together
+from iort_analysis.samples.blocks import Block, Column, column_of, join, objects
 from iort_contract.archive import Hour, content_hash, item_hash
 from iort_contract.catalog.streams import CATALOG
-from iort_contract.dynamodb import Item, whole
-from iort_contract.tables import BATCH, EXPIRES_S
+from iort_contract.checks import integer
+from iort_contract.codec import EXACT, packed_samples, unpacked
+from iort_contract.dynamodb import Item, plain, whole
+from iort_contract.limits import ContractError, Value
+from iort_contract.messages.batch import BatchId, Opened, open_batch
+from iort_contract.ros1.columns import view
+from iort_contract.ros1.message import Messages, unpack
+from iort_contract.tables import BATCH, EXPIRES_S, NONFINITE, PREVIOUS, RECEIVED_MS
+
+# Stored items in pieces: some thousand batches decoded to a table each, and what is refused.
+
+# A piece becomes a row group; it ends when one of these is reached.
+_ROWS, _VALUES, _BYTES = 262_144, 8_000_000, 32 * 1024 * 1024
+# Batches that are decoded together: their lists of Python numbers take ten times the memory of the arrays.
+_TOGETHER = 100
+# A batch with more text may not fit into a batch again once its text is escaped.
+_MUCH_TEXT = 400_000
+Refuse = Callable[[Item, str], None]
+
+
+class Piece(NamedTuple):
+    """Batches as a table with the columns `OWN` and a column a field, and each field's kind."""
+
+    table: Any
+    kinds: Mapping[str, str]
+    batches: int
+
+
+class _Entry(NamedTuple):
+    """A valid item: its batch; its ROS messages, if it has them as published, and the fields in them."""
+
+    item: Item
+    opened: Opened
+    messages: Messages | None
+    viewed: tuple[str, ...] = ()
+
+
+def pieces(items: Iterable[Item], refuse: Refuse) -> Iterator[Piece]:
+    """The items' batches in pieces, in the order of the items. Items that are no batches go to ``refuse``."""
+    parts: list[tuple[list[_Entry], Block]] = []
+    rows = values = size = 0
+    for entries in _opened(items, refuse):
+        part = _decoded(entries, refuse)
+        rows += len(part[1].times_us)
+        values += len(part[1].times_us) * len(part[1].columns)
+        size += sum(len(raw) for one in part[0] if one.messages for raw in one.messages.raw)
+        size += sum(map(_text, part[1].columns.values()))
+        parts.append(part)
+        if rows >= _ROWS or values >= _VALUES or size >= _BYTES:
+            yield _piece(parts)
+            parts, rows, values, size = [], 0, 0, 0
+    if any(entries for entries, _ in parts):
+        yield _piece(parts)
+
+
+def _text(column: Column) -> int:
+    return sum(len(value) for value in column if type(value) is str) if column.dtype.kind == "O" else 0
+
+
+def _opened(items: Iterable[Item], refuse: Refuse) -> Iterator[list[_Entry]]:
+    """Runs of valid items whose batches have the same fields."""
+
+    def each() -> Iterator[_Entry]:
+        for item in items:
+            try:
+                opened = open_batch(plain(item))
+                messages = None
+                if opened.serialized is not None:
+                    messages = unpack(opened.serialized, len(opened.times_us))
+                yield _Entry(item, opened._replace(serialized=None), messages)
+            except ContractError as error:  # noqa: PERF203 - each is refused by itself
+                refuse(item, str(error))
+
+    for _, same in groupby(each(), key=lambda one: (list(one.opened.written), one.messages is None)):
+        run: list[_Entry] = []
+        for one in same:
+            run.append(one)
+            if len(run) == _TOGETHER:
+                yield run
+                run = []
+        if run:
+            yield run
+
+
+def _decoded(run: list[_Entry], refuse: Refuse) -> tuple[list[_Entry], Block]:
+    """The valid ones of a run, without their written values, and all their samples."""
+    if run[0].messages is None:
+        try:
+            block = decode_together([one.opened for one in run], list(run[0].opened.written))
+            if not any(map(_is_much, run)):
+                return list(map(_without_values, run)), _exact(block, lambda name: _values(run, name))
+        except ContractError:
+            pass  # Each by itself tells which one is invalid.
+    valid, blocks = [], []
+    for one in run:
+        try:
+            decoded, block = _alone(one)
+        except ContractError as error:  # noqa: PERF203 - as above
+            refuse(one.item, str(error))
+        else:
+            valid.append(_without_values(decoded))
+            blocks.append(block)
+    return valid, join(blocks)
+
+
+def _without_values(one: _Entry) -> _Entry:
+    return one._replace(opened=one.opened._replace(written=dict.fromkeys(one.opened.written)))
+
+
+def _is_much(one: _Entry) -> bool:
+    texts = sum(len(v) for column in one.opened.written.values() for v in column if type(v) is str)
+    return texts + len(one.opened.about) > _MUCH_TEXT
+
+
+def _alone(one: _Entry) -> tuple[_Entry, Block]:
+    _, _, times, _, written, _, about, _ = one.opened
+    beside = {name: unpacked(name, column, len(times)) for name, column in written.items()}
+    if _is_much(one):
+        packed_samples([0] * len(times), beside, about.encode())
+    viewed = view(one.messages)[0] if one.messages is not None else {}
+    columns = {**viewed, **beside}
+    block = Block(np.array(times, dtype=np.int64), {name: column_of(v) for name, v in columns.items()})
+    return one._replace(viewed=tuple(viewed)), _exact(block, columns.__getitem__)
+
+
+def _exact(block: Block, values_of: Callable[[str], Sequence[Value]]) -> Block:
+    """The block with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
+    for name, column in block.columns.items():
+        if column.dtype.kind == "f" and bool((np.abs(column) >= EXACT).any()):
+            values = values_of(name)
+            if any(type(value) is int and abs(value) >= EXACT for value in values):
+                block.columns[name] = objects(values)
+    return block
+
+
+def _values(run: list[_Entry], name: str) -> list[Value]:
+    return [
+        value for one in run for value in unpacked(name, one.opened.written[name], len(one.opened.times_us))
+    ]
+
+
+def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
+    entries = [one for part, _ in parts for one in part]
+    block = join([part for _, part in parts])
+    counts = np.array([len(one.opened.times_us) for one in entries])
+    messages = [raw for one in entries for raw in _raws(one)]
+    own = {
+        names.TIME: pa.array(block.times_us, type=OWN[names.TIME]),
+        names.MESSAGE: pa.array(messages, type=OWN[names.MESSAGE]),
+        names.OTHER: pa.nulls(len(block.times_us), OWN[names.OTHER]),
+    }
+    of_batches: dict[str, list[Any]] = {
+        names.BATCH_ID: [_id(one) for one in entries],
+        names.RECEIVED: [_received_ms(one.item) for one in entries],
+        names.NOT_FINITE: [one.opened.nonfinite if NONFINITE in one.item else None for one in entries],
+        names.PREVIOUS_RUNS: [one.item[PREVIOUS]["S"] if PREVIOUS in one.item else None for one in entries],
+        names.HASH: [item_hash(one.item) for one in entries],
+        names.FIELDS: [_fields(one) for one in entries],
+        names.ABOUT: [one.opened.about or None for one in entries],
+        names.TYPE: [one.messages.type_id if one.messages else None for one in entries],
+        names.LAYOUT: [one.messages.layout if one.messages else None for one in entries],
+    }
+    own.update({name: repeated(values, counts, OWN[name]) for name, values in of_batches.items()})
+    kinds = {name: kind_of(column) for name, column in block.columns.items()}
+    own.update({named(name): to_arrow(column, kinds[name]) for name, column in block.columns.items()})
+    return Piece(pa.table(own), kinds, len(entries))
+
+
+def _raws(one: _Entry) -> Iterable[bytes | None]:
+    return [None] * len(one.opened.times_us) if one.messages is None else one.messages.raw
+
+
+def _id(one: _Entry) -> str:
+    return str(BatchId(one.opened.times_us[0], one.opened.boot, one.opened.seq))
+
+
+def _received_ms(item: Item) -> int | None:
+    """When the cloud received it; None for an item that somebody put into the table by hand."""
+    with suppress(ContractError):
+        return integer(plain({RECEIVED_MS: item.get(RECEIVED_MS, {"NULL": True})}), RECEIVED_MS)
+    return None
+
+
+def _fields(one: _Entry) -> str:
+    written = ",".join(one.opened.written)
+    return written if one.messages is None else f"{','.join(one.viewed)}|{written}"
+
 
 # Gives a field's unit and its meaning, each perhaps empty.
 Describe = Callable[[str], tuple[str, str]]

@@ -7,14 +7,98 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.drives.cleaning import clean, numeric
-from iort_analysis.drives.clock import on_one_clock
-from iort_analysis.drives.drive import Drive, Repair
-from iort_analysis.drives.motion import Motion, motion_among, pose_of, vesc_of, with_position
-from iort_analysis.drives.transform import with_derived
-from iort_analysis.samples.blocks import Block, ordered
-from iort_contract.catalog.derived import Vehicle
+from iort_analysis.drives.cleaning import ANGLES, clean, numeric, pause_us
+from iort_analysis.drives.drive import Drive, Motion, Repair, motion_among, pose_of, vesc_of, with_position
+from iort_analysis.samples.blocks import EMPTY, Block, Column, ordered
+from iort_contract.catalog.derived import Vehicle, calculable
 from iort_contract.messages.analysis import DriveKey
+
+# One clock for all streams: the samples of each at the times of one of them.
+
+
+def on_one_clock(streams: Mapping[str, Block], master: str | None) -> Block:
+    """All fields at the times of the stream ``master``, as ``<stream>.<field>``.
+
+    A value between two samples lies on the line between them; across a pause, and before the first and after
+    the last sample, nothing is known. Without a master it is the stream with the most samples.
+    """
+    if not streams:
+        return EMPTY
+    master = master or max(streams, key=lambda name: (len(streams[name].times_us), name))
+    times = streams[master].times_us
+    columns = {f"{master}.{name}": column for name, column in streams[master].columns.items()}
+    for stream, block in streams.items():
+        if stream != master:
+            pause = pause_us(block.times_us)
+            for name, column in block.columns.items():
+                columns[f"{stream}.{name}"] = at(times, block.times_us, column, pause, angle=name in ANGLES)
+    return Block(times, columns)
+
+
+def at(
+    wanted: NDArray[np.int64], times: NDArray[np.int64], column: Column, pause: int, *, angle: bool = False
+) -> Column:
+    """A field at other times; NaN within pauses."""
+    known = ~np.isnan(column)
+    times, column = times[known], column[known]
+    if not len(times) or not len(wanted):
+        return np.full(len(wanted), np.nan)
+    # Seconds since the start are exact in a float64; microseconds since the epoch are too, but only just.
+    first = times[0]
+    values = np.unwrap(column) if angle else column
+    made: Column = np.interp(wanted - first, times - first, values, left=np.nan, right=np.nan)
+    if len(times) > 1:
+        after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+        between = (times[after] != wanted) & (times[after - 1] != wanted)
+        made[between & (times[after] - times[after - 1] > pause)] = np.nan
+    if angle:
+        made = (made + np.pi) % (2 * np.pi) - np.pi
+    return made
+
+
+# Derived quantities of a drive, and its windows.
+
+# Acceleration is the slope of the speed over this time: a difference of two samples is mostly noise.
+_SLOPE_S = 0.2
+
+
+def with_derived(samples: Block, vesc: str, vehicle: Vehicle | None) -> Block:
+    """The samples with the catalogue's derived fields of the motor controller, and the car's
+    ``acceleration_mps2`` and ``distance_m``, which grows from 0, where its speed is known."""
+    prefix = f"{vesc}."
+    own = {name[len(prefix) :]: c for name, c in samples.columns.items() if name.startswith(prefix)}
+    made: dict[str, Column] = {}
+    for entry, parameters in calculable(own, vehicle):
+        arguments = [parameters[name] if name in parameters else own[name] for name in entry.arguments]
+        made[entry.name] = entry.formula(*arguments)
+    speed = made.get("speed_mps")
+    if speed is not None and len(speed) > 1:
+        made["acceleration_mps2"] = _slope(samples, speed)
+        made["distance_m"] = _sum(samples, np.abs(speed))
+    return Block(samples.times_us, {**samples.columns, **{prefix + name: c for name, c in made.items()}})
+
+
+def _slope(samples: Block, values: Column) -> Column:
+    """The change a second, by a line through the values around each."""
+    seconds = (samples.times_us - samples.times_us[0]) / 1e6
+    usual = max(float(np.median(np.diff(seconds))), 1e-6)
+    half = max(1, min(round(_SLOPE_S / 2 / usual), (len(values) - 1) // 2))
+    ahead = np.minimum(np.arange(len(values)) + half, len(values) - 1)
+    behind = np.maximum(np.arange(len(values)) - half, 0)
+    took = seconds[ahead] - seconds[behind]
+    made: Column = (values[ahead] - values[behind]) / np.maximum(took, 1e-9)
+    # Across a pause there is no slope.
+    made[took * 1e6 > pause_us(samples.times_us) + 2 * half * usual * 1e6] = np.nan
+    return made
+
+
+def _sum(samples: Block, rates: Column) -> Column:
+    """The integral over time, which counts nothing across a pause."""
+    steps = np.diff(samples.times_us)
+    steps = np.where(steps > pause_us(samples.times_us), 0, steps) / 1e6
+    known = np.nan_to_num(rates)
+    made: Column = np.append(0.0, np.cumsum((known[1:] + known[:-1]) / 2 * steps))
+    return made
 
 
 def build(

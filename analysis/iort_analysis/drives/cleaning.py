@@ -11,8 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT, Repair
-from iort_analysis.drives.motion import is_vesc
+from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT, Repair, is_vesc
 from iort_analysis.samples.blocks import Block, Column
 from iort_contract.catalog.vesc import ABSENT_FROM, MEASURED, VESC_FIELDS
 

@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.drives.building import with_derived
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
-from iort_analysis.drives.transform import with_derived
-from iort_analysis.mining.laps.path import path_of
+from iort_analysis.mining.paths import path_of
+from iort_analysis.statistics.distributions import sides
 from iort_analysis.statistics.fitting import Fit, fit
-from iort_analysis.statistics.intervals import sides
 from iort_contract.catalog.derived import Vehicle
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from iort_analysis.drives.drive import Drive
 from iort_analysis.results import Mined, Table
 from iort_analysis.samples.blocks import Column
 from iort_analysis.statistics.clusters import cluster, scaled
-from iort_analysis.statistics.intervals import share_of
+from iort_analysis.statistics.distributions import share_of
 from iort_contract.catalog.analysis import STYLE_TABLE, STYLES
 from iort_contract.messages.analysis import Estimate
 

@@ -15,10 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.statistics.intervals import sides
-from iort_analysis.statistics.normal import between
+from iort_analysis.statistics.distributions import between, quantile, sides
 from iort_analysis.statistics.signals import quantum
-from iort_analysis.statistics.student import quantile
 from iort_contract.messages.analysis import Estimate
 
 Array = NDArray[np.float64]

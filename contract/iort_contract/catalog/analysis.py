@@ -168,7 +168,7 @@ KINDS = {
             "the battery's voltage drops for moments under load",
             "stop driving with this battery; measure its cells at rest and under load; check the plug",
             severity="serious",
-            explains=("battery_worn", "pattern_unusual"),
+            explains=("battery_worn",),
             alternatives=("a loose battery plug",),
         ),
         Kind(
@@ -196,7 +196,7 @@ KINDS = {
             "the motor turns faster than the car moves, under torque",
             "tighten the pinion's screw, and look at the gears' teeth; look whether the tyres spin instead",
             severity="serious",
-            explains=("payload_added", "tyre_flat", "friction_added", "pattern_unusual", "brake_dragging"),
+            explains=("payload_added", "tyre_flat", "friction_added", "brake_dragging"),
             alternatives=("tyres that spin",),
         ),
         Kind(
@@ -224,7 +224,6 @@ KINDS = {
             "sensor_stuck",
             "a field kept exactly the same value while the car moved",
             "check the sensor and its wires; the analysis leaves out the samples in between",
-            explains=("pattern_unusual",),
         ),
         Kind(
             "sensor_drift",
@@ -237,14 +236,12 @@ KINDS = {
                 "motor_resistance_grown",
                 "battery_worn",
                 "cooling_lost",
-                "pattern_unusual",
             ),
         ),
         Kind(
             "can_intermittent",
             "samples of the motor controller are missing again and again",
             "check the cable and plugs between computer and controller, and the CAN bus' terminators",
-            explains=("pattern_unusual",),
             alternatives=("batches that were lost on their way to the cloud, which `iort audit` lists",),
         ),
         Kind(
@@ -252,12 +249,6 @@ KINDS = {
             "the motor controller reported a fault",
             "read what the fault's name means in VESC Tool's manual; look at the evidence in the history",
             severity="serious",
-        ),
-        Kind(
-            "pattern_unusual",
-            "a stretch of the drive is like no other one",
-            "look at the evidence in the history",
-            severity="info",
         ),
         Kind(
             "never_moved",

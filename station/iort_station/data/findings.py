@@ -131,7 +131,7 @@ def calibration(drives: Sequence[AnalysedDrive]) -> Calibration:
     """The car's parameters from drives, the newest first. A state, such as the battery's charge, is the
     newest drive's."""
     # numpy takes longer to load than most commands to run.
-    from iort_analysis.evaluation.combined import combined  # noqa: PLC0415 - see above
+    from iort_analysis.baselines import combined  # noqa: PLC0415 - see above
 
     found: dict[str, Calibrated] = {}
     missing: dict[str, str] = {}

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from iort_analysis.archive.stored import Origin, PageProgress
 from iort_analysis.drives.building import build
-from iort_analysis.drives.motion import motion_of
+from iort_analysis.drives.drive import motion_of
 from iort_analysis.mining import laps
 from iort_analysis.mining.gain import with_gain
 from iort_analysis.results import Mined

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.drives.recorded import recorded
+from iort_analysis.drives.stretches import recorded
 from iort_analysis.samples.batches import RefusedItems, blocks, part
 from iort_analysis.samples.seconds import batches_of
 from iort_contract.archive import ArchivedHour, Pending, archived_hour, parse_hour, parse_pending

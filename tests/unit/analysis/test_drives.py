@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from iort_analysis.drives.building import build
-from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT
-from iort_analysis.drives.motion import motion_among
+from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT, motion_among
 from iort_analysis.samples.blocks import Block, join
 from tests.unit.analysis.simulated import HZ, KEY, START_US, VEHICLE, changed, streams
 

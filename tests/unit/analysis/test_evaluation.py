@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.evaluation.baselines import baseline, fleet_baseline
-from iort_analysis.evaluation.combined import combined
-from iort_analysis.evaluation.evaluate import evaluate
-from iort_analysis.evaluation.trends import US_PER_DAY
+from iort_analysis.baselines import US_PER_DAY, baseline, combined, fleet_baseline
+from iort_analysis.evaluation import evaluate
 from iort_analysis.results import DriveResult, Event, Measured, Mined
 from iort_contract.messages.analysis import DriveKey, Estimate, Finding
 

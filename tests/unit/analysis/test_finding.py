@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.drives.finding import LONGEST_US, Found, Heard, find
+from iort_analysis.drives.stretches import LONGEST_US, Found, Heard, find
 from iort_contract.messages.batch import BatchId
 
 START_US, S = 1_700_000_000_000_000, 1_000_000

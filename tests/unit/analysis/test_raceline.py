@@ -13,10 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from iort_analysis.raceline import banded, quadratic
-from iort_analysis.raceline.line import least_curvature
-from iort_analysis.raceline.reference import Reference, TrackError, curvature, reference
-from iort_analysis.raceline.speed import Limits, profile
+from iort_analysis.raceline import (
+    Limits,
+    Reference,
+    TrackError,
+    curvature,
+    least_curvature,
+    profile,
+    reference,
+)
+from iort_analysis.statistics import quadratic
 from iort_contract.track import Track, parse_track
 
 CAR_M = 0.3
@@ -177,8 +183,10 @@ def system(seed: int, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 def test_the_banded_solver_agrees_with_numpys(seed: int, n: int) -> None:
     diagonals, full = system(seed, n)
     right = np.random.default_rng(seed).normal(size=n)
-    assert banded.product(diagonals, right) == pytest.approx(full @ right)
-    assert banded.solve(diagonals, right) == pytest.approx(np.linalg.solve(full, right), rel=1e-6, abs=1e-8)
+    assert quadratic.product(diagonals, right) == pytest.approx(full @ right)
+    assert quadratic.solve(diagonals, right) == pytest.approx(
+        np.linalg.solve(full, right), rel=1e-6, abs=1e-8
+    )
 
 
 @settings(max_examples=20, deadline=None)

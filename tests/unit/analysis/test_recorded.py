@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from iort_analysis.drives.recorded import Recorded, recorded
+from iort_analysis.drives.stretches import Recorded, recorded
 from iort_contract.messages.analysis import DriveKey
 from iort_contract.messages.batch import Batch
 from testkit.dynamodb import item_of

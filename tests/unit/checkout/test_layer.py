@@ -110,7 +110,7 @@ def test_a_layer_without_a_compiler_has_no_bytecode(requirements, tmp_path):
 MOST_BYTES = 250 * 1000**2
 WRITE = """
 import io, json
-from iort_analysis.archive.items import items
+from iort_analysis.archive.reading import items
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import write_hour
 from iort_contract.archive import hour_of

@@ -17,7 +17,7 @@ import pytest
 from functions import analyse, evaluate, plan, present
 from functions.shared import recordings
 from functions.shared.analysis import Kept
-from iort_analysis.archive.tables import read_table
+from iort_analysis.archive.columns import read_table
 from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
 from iort_analysis.samples.blocks import Block, values

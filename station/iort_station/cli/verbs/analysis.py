@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from iort_analysis.drives.finding import LONGEST_US
+from iort_analysis.drives.stretches import LONGEST_US
 from iort_contract.catalog.analysis import ANALYSIS_FAILED, KINDS
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import MAX_AHEAD_US, ContractError

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from iort_analysis.archive import columns, pieces
-from iort_analysis.archive.items import items as stored_again
+from iort_analysis.archive import columns, writing
 from iort_analysis.archive.reading import ArchiveFile
+from iort_analysis.archive.reading import items as stored_again
 from iort_analysis.archive.writing import Written, write_day, write_hour
 from iort_analysis.samples.batches import RefusedItems, blocks, in_order
 from iort_analysis.samples.blocks import join, values
@@ -82,7 +82,7 @@ def test_what_an_hour_holds_comes_back(plain_batches, of_messages, odd, most_col
     items = by_id(found)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(columns, "MAX_COLUMNS", most_columns)
-        patched.setattr(pieces, "_ROWS", rows)
+        patched.setattr(writing, "_ROWS", rows)
         file, told, refused = written(items)
 
     good = [item for item in items if not item[BATCH]["S"].endswith(f"-{BOOT}-100")]
@@ -165,7 +165,7 @@ def test_what_is_not_wanted_is_not_read():
 
 
 def test_much_text_does_not_stay_in_memory_for_an_hour(monkeypatch):
-    monkeypatch.setattr(pieces, "_BYTES", 100_000)
+    monkeypatch.setattr(writing, "_BYTES", 100_000)
     items = [item_of(batch_at(HOUR, i, {"log": ["x" * 4000] * 3}, seq=i)) for i in range(300)]
     file, told, _ = written(items)
     assert told.batches == 300

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.samples.batches import RefusedItems, part
-from iort_analysis.samples.steps import decoded, integers, written
+from iort_analysis.samples.batches import RefusedItems, decoded, integers, part, written
 from iort_contract.codec import DICTIONARY
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, read_envelope

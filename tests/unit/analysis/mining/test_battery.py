@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from iort_agent.sources.sim.vehicle import open_voltage
-from iort_analysis.drives.transform import with_derived
-from iort_analysis.mining.battery import mine
-from iort_analysis.mining.charge import Spent, charge
+from iort_analysis.drives.building import with_derived
+from iort_analysis.mining.battery import Spent, charge, mine
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.messages.analysis import Estimate
 from tests.unit.analysis.proven import proven

@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 
 from iort_analysis.drives.building import build
 from iort_analysis.mining import anomalies
-from iort_analysis.mining.anomalies.cusum import changed
-from iort_analysis.mining.anomalies.profile import matrix_profile
-from iort_analysis.samples.blocks import Block
-from tests.unit.analysis.simulated import KEY, START_US, streams
+from iort_analysis.mining.changes import changed
 
 
 def alike(rho: float, n: int, seed: int) -> np.ndarray:
@@ -58,42 +55,6 @@ def test_a_change_follows_the_scale(scale: float, shift: float) -> None:
 def test_what_is_constant_or_short_has_no_change() -> None:
     assert changed(np.ones(100), "V") is None
     assert changed(np.arange(10.0), "V") is None
-
-
-def test_flat_stretches_have_no_profile() -> None:
-    series = np.sin(np.arange(200) / 3)
-    series[80:120] = 0.5
-    profile = matrix_profile(series, 10)
-    assert np.isnan(profile[80:110]).all()
-    assert np.isfinite(profile[:80]).all()
-    assert np.isnan(matrix_profile(np.ones(100), 10)).all()
-    assert len(matrix_profile(np.ones(5), 10)) == 0
-
-
-def test_a_stretch_like_no_other_is_found() -> None:
-    # Laps of the same current, and a driver who once plays with the throttle.
-    made = dict(streams(120))
-    times, columns = made["vesc"]
-    n = 15_000
-    seconds = np.arange(n) / 50
-    times = START_US + np.arange(n) * 20_000
-    chance = np.random.default_rng(1)
-    lap = np.interp(seconds % 11, np.arange(12), [5, 20, 8, -6, 12, 25, 3, -8, 15, 6, 18, 5])
-    current = lap + chance.normal(0, 0.5, n)
-    speed = 15_000 + 300 * lap
-    quiet = {name: np.resize(column, n) for name, column in columns.items()}
-    usual = {"vesc": Block(times, {**quiet, "current_motor": current, "speed": speed})}
-    kinds = [event.kind for event in anomalies.mine(build(KEY, usual)).events]
-    assert "pattern_unusual" not in kinds
-
-    odd = (seconds > 151) & (seconds < 159)
-    current = np.where(odd, 12 + 12 * np.sign(np.sin(2 * np.pi * seconds / 1.7)), current)
-    strange = {"vesc": Block(times, {**quiet, "current_motor": current, "speed": speed})}
-    found = [event for event in anomalies.mine(build(KEY, strange)).events if event.kind == "pattern_unusual"]
-    assert len(found) == 1
-    assert found[0].start_us < START_US + 155_000_000 < found[0].end_us
-    assert found[0].p is not None
-    assert found[0].p < 1e-3
 
 
 def test_friction_that_begins_on_the_way_is_found_at_its_time() -> None:

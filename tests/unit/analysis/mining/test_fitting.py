@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from iort_analysis.statistics.distributions import mean_of
 from iort_analysis.statistics.fitting import Part, Prior, fit, propagated
-from iort_analysis.statistics.intervals import mean_of
 from iort_analysis.statistics.signals import lagged, quantum, resolution
 
 

@@ -7,7 +7,7 @@ import pytest
 import ruptures
 from statsmodels.stats.diagnostic import breaks_cusumolsresid
 
-from iort_analysis.mining.anomalies.cusum import changed
+from iort_analysis.mining.changes import changed
 
 
 @pytest.mark.parametrize("seed", range(10))

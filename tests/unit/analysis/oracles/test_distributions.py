@@ -11,10 +11,8 @@ from scipy.interpolate import BSpline
 from statsmodels.stats.proportion import proportion_confint
 from statsmodels.stats.weightstats import DescrStatsW
 
-from iort_analysis.statistics.intervals import mean_of, share_of
-from iort_analysis.statistics.normal import between
+from iort_analysis.statistics.distributions import between, mean_of, quantile, share_of, tail
 from iort_analysis.statistics.signals import lagged, smooth_basis
-from iort_analysis.statistics.student import quantile, tail
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 4.5, 30, 1e4, math.inf])

@@ -10,10 +10,9 @@ from scipy import stats
 from statsmodels.stats.meta_analysis import combine_effects
 from statsmodels.stats.multitest import multipletests
 
-from iort_analysis.evaluation.combined import combined
-from iort_analysis.evaluation.discovery import false_discovery_rates
-from iort_analysis.evaluation.trends import US_PER_DAY, trend
-from iort_analysis.statistics.intervals import sides
+from iort_analysis.baselines import US_PER_DAY, combined, trend
+from iort_analysis.evaluation import false_discovery_rates
+from iort_analysis.statistics.distributions import sides
 from iort_contract.messages.analysis import Estimate
 
 

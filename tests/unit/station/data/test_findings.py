@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from iort_analysis.evaluation.combined import combined
+from iort_analysis.baselines import combined
 from iort_contract.catalog.analysis import ANALYSIS_FAILED
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.findings_table import FindingsTable

@@ -1,19 +1,103 @@
-"""From the results of drives to findings."""
+"""The evaluation: what differs from the robot's own earlier drives, or from the fleet's."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from iort_analysis.evaluation import texts
-from iort_analysis.evaluation.baselines import Baseline, baseline, fleet_baseline
-from iort_analysis.evaluation.discovery import false_discovery_rates
-from iort_analysis.evaluation.trends import US_PER_DAY, trend
+import numpy as np
+
+from iort_analysis.baselines import US_PER_DAY, Baseline, baseline, fleet_baseline, trend
 from iort_analysis.results import DriveResult, Event, Measured
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.catalog.entries import Parameter
 from iort_contract.messages.analysis import DriveKey, Estimate, Finding
+
+
+def false_discovery_rates(p_values: Sequence[float]) -> list[float]:
+    """For each test the rate of false discoveries among all that are at least as significant.
+
+    By Benjamini and Yekutieli: right whatever the tests have to do with each other, and the parameters of one
+    drive have much.
+    """
+    p = np.asarray(p_values, dtype=float)
+    if not len(p):
+        return []
+    order = np.argsort(p, kind="stable")
+    ranks = np.arange(1, len(p) + 1)
+    scaled = p[order] * len(p) * (1 / ranks).sum() / ranks
+    rates = np.empty(len(p))
+    rates[order] = np.minimum(1.0, np.minimum.accumulate(scaled[::-1])[::-1])
+    found: list[float] = rates.tolist()
+    return found
+
+
+# The sentences of findings.
+
+
+def changed(parameter: Parameter, found: Estimate, expected: Baseline, whose: str) -> str:
+    """What a parameter is, and what was expected."""
+    over = f"{expected.drives} {'earlier drives' if whose == 'its own' else 'other robots'}"
+    return (
+        f"{parameter.meaning}: {_with_interval(found)}, "
+        f"{_compared(found.value - expected.value, expected.value, found.unit)} {whose} baseline of "
+        f"{_number(expected.value, found.unit)} over {over}"
+    )
+
+
+def trending(parameter: Parameter, newest: Estimate, change: Estimate, days: float) -> str:
+    """How a parameter developed."""
+    way = "rose" if change.value > 0 else "fell"
+    low, high = sorted((abs(change.low), abs(change.high)))
+    by = f"{_number(abs(change.value), change.unit)} ({_digits(low)} to {_digits(high)})"
+    return f"{parameter.meaning}: {way} by {by} in {days:.0f} days, to {_number(newest.value, newest.unit)}"
+
+
+def complete(finding: Finding, explained: Sequence[Finding]) -> str:
+    """The finding's text with the others that it explains, and with what else the cause may be."""
+    sentences = [finding.text]
+    if explained:
+        sentences.append("This goes with it: " + "; ".join(other.text for other in explained))
+    if alternatives := KINDS[finding.kind].alternatives:
+        sentences.append(f"The data cannot tell this from {' or '.join(alternatives)}")
+    return ". ".join(sentences)
+
+
+def rounded(estimate: Estimate) -> Estimate:
+    """The estimate with the digits that it deserves: three of its interval's width, or six without one."""
+    size = estimate.high - estimate.low or 1e-3 * abs(estimate.value)
+    if not size:
+        return estimate
+    places = 2 - math.floor(math.log10(size))
+    value, low, high = (round(float(each), places) for each in estimate[:3])
+    return Estimate(value, low, high, estimate.unit)
+
+
+def _with_interval(estimate: Estimate) -> str:
+    value, low, high, unit = estimate
+    return f"{_number(value, unit)} ({_digits(low)} to {_digits(high)})"
+
+
+def _compared(change: float, baseline: float, unit: str) -> str:
+    way = "above" if change > 0 else "below"
+    # A share of nearly nothing says nothing.
+    if abs(baseline) > abs(change) / 10:
+        return f"{abs(change / baseline):.0%} {way}"
+    return f"{_number(abs(change), unit)} {way}"
+
+
+def _number(value: float, unit: str) -> str:
+    return _digits(value) if unit == "1" else f"{_digits(value)} {unit}"
+
+
+def _digits(value: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+# From the results of drives to findings.
 
 # A finding counts up to this rate of false discoveries among those of one evaluation.
 FALSE_DISCOVERY_RATE = 0.05
@@ -75,12 +159,12 @@ class _Comparison:
         if min(p_up, p_down) < _UNUSUAL:
             self.unusual.add(parameter.name)
         if parameter.kind:
-            finding = _of_parameter(result, parameter, texts.changed(parameter, found, expected, whose))
+            finding = _of_parameter(result, parameter, changed(parameter, found, expected, whose))
             self.findings.append(
                 replace(
                     finding,
-                    effect=texts.rounded(effect),
-                    baseline=texts.rounded(expected.interval(found.unit)),
+                    effect=rounded(effect),
+                    baseline=rounded(expected.interval(found.unit)),
                     p=p,
                 )
             )
@@ -128,13 +212,13 @@ def _trends(result: DriveResult, earlier: Sequence[Measured]) -> Iterable[Findin
         p = {"up": found.p_up, "down": found.p_down, "either": 2 * min(found.p_up, found.p_down)}
         slope, low, high, _ = found.per_day
         effect = Estimate(slope * found.days, low * found.days, high * found.days, newest.unit)
-        finding = _of_parameter(result, parameter, texts.trending(parameter, newest, effect, found.days))
+        finding = _of_parameter(result, parameter, trending(parameter, newest, effect, found.days))
         at = having[0].estimates[name]
         yield replace(
             finding,
             subject=f"{name}_trend",
-            effect=texts.rounded(effect),
-            baseline=texts.rounded(at),
+            effect=rounded(effect),
+            baseline=rounded(at),
             p=min(1.0, p[parameter.worse]),
         )
 
@@ -164,7 +248,7 @@ def _of_event(result: DriveResult, event: Event) -> Finding:
         stream=event.stream,
         fields=event.fields,
         text=event.text,
-        effect=None if event.effect is None else texts.rounded(event.effect),
+        effect=None if event.effect is None else rounded(event.effect),
         p=event.p,
     )
 
@@ -205,7 +289,7 @@ def _explained(findings: Iterable[Finding]) -> list[Finding]:
             first, *beside = sorted(changes, key=_place) or events
             beside = [] if first in events else beside
             beside += [other for name in KINDS[kind].explains for other in kinds.get(name, ())]
-            kept += [replace(first, text=texts.complete(first, beside))]
+            kept += [replace(first, text=complete(first, beside))]
             kept += [event for event in events if event is not first]
     return sorted(kept, key=lambda finding: finding.id)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.laps.path import Floats
+from iort_analysis.mining.paths import Floats
 
 # Fields of any stream that tell the car's turns.
 _TURNS = ("steering_angle", "angular_velocity.z", "angular.z", "gyro_z", "data")

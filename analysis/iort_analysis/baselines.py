@@ -1,4 +1,4 @@
-"""A baseline: what earlier drives let expect of the next one, by a robust random-effects model."""
+"""Baselines, means and trends over several drives' estimates of a parameter."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iort_analysis.statistics.intervals import sides
-from iort_analysis.statistics.student import tail
+from iort_analysis.statistics.distributions import sides, tail
 from iort_contract.messages.analysis import Estimate
 
 # How many drives the catalogue's word on a healthy car's spread is worth.
@@ -93,3 +92,72 @@ def fleet_baseline(robots: Sequence[Sequence[Estimate]], expected_spread: float)
     between = baseline(means, 2 * expected_spread)
     within = math.sqrt(sum(one.spread**2 for one in own) / len(own))
     return between._replace(spread=math.hypot(between.spread, within))
+
+
+# Several drives' estimates of a parameter as one.
+
+
+def combined(estimates: Sequence[Estimate]) -> Estimate:
+    """The mean of at least one drive's estimates.
+
+    What the drives differ by beyond their intervals widens the mean's (DerSimonian and Laird's model, with
+    Hartung and Knapp's interval): two drives that disagree say little.
+    """
+    if len(estimates) == 1:
+        return estimates[0]
+    values = np.array([one.value for one in estimates])
+    errors = np.array([(one.high - one.low) / 2 / sides() for one in estimates])
+    errors = np.maximum(errors, 1e-9 * max(float(np.abs(values).max()), 1e-12))
+    weights, among = errors**-2.0, len(values) - 1
+    surplus = float((weights * (values - np.average(values, weights=weights)) ** 2).sum()) - among
+    scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
+    # 0 where one drive is so much surer than the others that its weight is the whole.
+    between = max(0.0, surplus / scaled) if scaled > 0 else 0.0
+    weights = 1 / (errors**2 + between)
+    mean = float(np.average(values, weights=weights))
+    scatter = float((weights * (values - mean) ** 2).sum()) / among
+    # Drives that agree by chance are no reason for less than their own errors give.
+    known = sides() / math.sqrt(float(weights.sum()))
+    reach = max(known, sides(among) * math.sqrt(scatter / float(weights.sum())))
+    return Estimate(mean, mean - reach, mean + reach, estimates[0].unit)
+
+
+# Trends over drives, by the slopes between all pairs (Theil and Sen).
+
+US_PER_DAY = 86_400_000_000
+# The slopes between pairs take memory of the square of this.
+_MOST = 500
+
+
+class Trend(NamedTuple):
+    """A change per day, the days it was seen over, and the chance of such a rise and of such a fall."""
+
+    per_day: Estimate
+    days: float
+    p_up: float
+    p_down: float
+
+
+def trend(times_us: Sequence[int], values: Sequence[float], unit: str) -> Trend:
+    """The trend of at least two values at different times; of the newest 500 of them."""
+    times = np.asarray(times_us[-_MOST:], dtype=np.int64)
+    found = np.asarray(values[-_MOST:], dtype=float)
+    days = (times - times[0]) / US_PER_DAY
+    one, other = np.triu_indices(len(days), 1)
+    apart, up = days[other] - days[one], found[other] - found[one]
+    slopes = np.sort(up[apart != 0] / apart[apart != 0])
+    n, pairs = len(found), len(slopes)
+    concordance = float(np.sign(slopes).sum())
+    # The variance of the number of rising pairs less the falling ones, with ties among the values.
+    ties = np.unique(found, return_counts=True)[1]
+    variance = (n * (n - 1) * (2 * n + 5) - float((ties * (ties - 1) * (2 * ties + 5)).sum())) / 18
+    deviation = math.sqrt(max(variance, 0.0)) or math.inf
+    half = sides() * deviation if math.isfinite(deviation) else 0.0
+    # Sen's ends, outwards from where they fall between two slopes.
+    low, high = math.floor((pairs - half) / 2) - 1, math.ceil((pairs + half) / 2)
+    per_day = Estimate(
+        float(np.median(slopes)), float(slopes[max(low, 0)]), float(slopes[min(high, pairs - 1)]), f"{unit}/d"
+    )
+    p_up = tail((concordance - 1) / deviation, math.inf)
+    p_down = tail((-concordance - 1) / deviation, math.inf)
+    return Trend(per_day, float(days.max() - days.min()), p_up, p_down)

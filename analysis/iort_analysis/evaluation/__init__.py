@@ -1,1 +1,0 @@
-"""The evaluation: what differs from the robot's own earlier drives, or from the fleet's."""
