@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any
@@ -75,6 +75,17 @@ def tell(facts: Mapping[str, Any], text: str | Lines, *, as_json: bool) -> None:
     out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
 
 
+def table(*head: str, left: Sequence[str] = (), title: str | None = None) -> Table:
+    """A table without lines, of numbers except in the columns ``left``."""
+    # It takes longer to load than TAB may take.
+    from rich.table import Table  # noqa: PLC0415 - see above
+
+    shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in head:
+        shown.add_column(name, justify="left" if name in left else "right", no_wrap=True)
+    return shown
+
+
 def _number(value: Any) -> int | float:
     if not isinstance(value, Decimal):
         raise TypeError(f"{type(value).__name__} has no form in JSON")
@@ -85,6 +96,7 @@ def _number(value: Any) -> int | float:
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
+    from rich.table import Table
 
     from iort_analysis.archive.stored import PageProgress
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from iort_contract.catalog.analysis import LAPS_TABLE, PARAMETERS, PLACES_TABLE
 from iort_contract.catalog.car import GROUPS
 from iort_contract.messages.analysis import encode_estimate
+from iort_station.cli import console
 from iort_station.cli.console import Lines, out, print_json, reading
 from iort_station.cli.options import AsJson, Force, Robot, When, examples, ranged, say, to_file
 from iort_station.errors import StationError, UsageError
@@ -101,9 +101,8 @@ def _print(run: RunLaps) -> None:
     if table is None:
         out.print(next(iter(run.mined.missing.values())))
         return
-    shown = Table(box=None, pad_edge=False)
-    for heading in ("lap", "start (UTC)", *(heading for _, heading, _ in _COLUMNS), ""):
-        shown.add_column(heading, justify="left" if heading in {"start (UTC)", ""} else "right", no_wrap=True)
+    figures_of = (heading for _, heading, _ in _COLUMNS)
+    shown = console.table("lap", "start (UTC)", *figures_of, "", left=("start (UTC)", ""))
     for i, lap in enumerate(table["lap"].tolist()):
         mark = "best" if table["best"][i] else "" if table["complete"][i] else "not complete"
         figures = [_figure(float(table[name][i]), digits) for name, _, digits in _COLUMNS]
@@ -147,9 +146,7 @@ def _compare(run: RunLaps, one: int, other: int, *, file: Path | None, force: bo
     if as_json:
         print_json({"run": run.run, "one": one, "other": other, "places": _rows(found)})
         return
-    shown = Table(box=None, pad_edge=False)
-    for heading in ("place m", "delta s", f"lap {one} m/s", f"lap {other} m/s"):
-        shown.add_column(heading, justify="right", no_wrap=True)
+    shown = console.table("place m", "delta s", f"lap {one} m/s", f"lap {other} m/s")
     last = len(found["delta_s"]) - 1
     for i in (round(last * k / _ROWS) for k in range(_ROWS + 1)):
         row = [float(found[name][i]) for name in ("place_m", "delta_s", "one_mps", "other_mps")]
@@ -234,11 +231,8 @@ def _print_calibrate(found: Calibration) -> None:
         names = [one.name for one in group if one.name in found.found]
         if not names:
             continue
-        shown = Table(title=heading, title_justify="left", box=None, pad_edge=False)
-        for column in ("parameter", "value", "from", "to", "unit", "drives"):
-            shown.add_column(
-                column, justify="left" if column in {"parameter", "unit"} else "right", no_wrap=True
-            )
+        head = ("parameter", "value", "from", "to", "unit", "drives")
+        shown = console.table(*head, left=("parameter", "unit"), title=heading)
         for name in names:
             estimate, drives = found.found[name]
             figures = (f"{value:.5g}" for value in (estimate.value, estimate.low, estimate.high))
