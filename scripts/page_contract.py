@@ -10,8 +10,7 @@ from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_ty
 
 from iort_contract import checks, limits, topics
 from iort_contract import page as served
-from iort_contract.catalog import analysis as kinds
-from iort_contract.catalog import analysis as parameters
+from iort_contract.catalog import analysis as findings
 from iort_contract.catalog import vesc
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
@@ -19,7 +18,6 @@ from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM, ROS_UNITS
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import analysis, commands, insights, live, page
-from iort_contract.messages import commands as driving
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -80,10 +78,9 @@ def _constants() -> Iterator[str]:
         topics: ("NAME", "LIVE", "VIEW", "CMD"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
-        kinds: ("ANALYSIS_FAILED",),
-        parameters: ("STYLE_GROUP",),
-        commands: ("MAX_LEASE_MS",),
-        driving: (
+        findings: ("ANALYSIS_FAILED", "STYLE_GROUP"),
+        commands: (
+            "MAX_LEASE_MS",
             "DRIVE_RATE_HZ",
             "DRIVE_LEASE_MS",
             "DRIVE_MAX_RTT_MS",
@@ -107,7 +104,7 @@ def _constants() -> Iterator[str]:
     yield f"export const POSE_STREAM = {json.dumps(POSE_STREAM)};"
     yield f"export const LOG_STREAM = {json.dumps(LOG_STREAM)};"
     yield f"export const DRIVE_STREAM = {json.dumps(DRIVE_STREAM)};"
-    yield f"export const REFUSALS = {json.dumps(driving.REFUSALS, indent=2)} as const;"
+    yield f"export const REFUSALS = {json.dumps(commands.REFUSALS, indent=2)} as const;"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
     yield f"export const ABSENT_FROM: Readonly<Record<string, number>> = {json.dumps(vesc.ABSENT_FROM)};"
