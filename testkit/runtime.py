@@ -107,6 +107,10 @@ class Services:
                 given = {"Parameter": {"Name": "keys", "Value": json.dumps(keys)}}
             elif operation in {"Query", "Scan"}:
                 given = {"Items": self.items, "Count": len(self.items), "ScannedCount": len(self.items)}
+            elif operation == "UpdateItem" and '"UPDATED_NEW"' in body.decode():
+                # Every count that is asked for is at its beginning.
+                changed = json.loads(body)["ExpressionAttributeNames"].values()
+                given = {"Attributes": {name: {"N": "1"} for name in changed}}
             self._answer(asked, operation, json.dumps(given).encode())
         elif path.startswith("/publish/"):
             self._answer(asked, "PubNub", b'[1,"Sent","16000000000000000"]')
