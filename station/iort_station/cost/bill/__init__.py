@@ -1,1 +1,0 @@
-"""A bill's line items by what makes them: the messages, the archive, the analysis, the deployment itself."""
