@@ -6,15 +6,17 @@ import math
 import operator
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Callable, Iterator
 
 import pytest
 
 from iort_agent.common.schema import Place, load
 from iort_agent.errors import ConfigError, SourceError
-from iort_agent.sources.sim import PoseConfig, Sensors, SimConfig, SimGraph
-from iort_agent.sources.sim.driver import HALL, Circuit, Pose, wrapped
-from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.sim import ALL, PoseConfig, Sensors, SimConfig, SimGraph
+from iort_agent.sources.sim.driver import HALL, Circuit, Pose, Wish, wrapped
+from iort_agent.sources.sim.faults import KINDS, STRENGTHS, FaultConfig
+from iort_agent.sources.sim.vehicle import G_MPS2, IDLE_W, Battery, Heat, Vehicle, VehicleConfig, open_voltage
+from iort_agent.sources.vesc_protocol import LAYOUTS
 from iort_contract.catalog.streams import CATALOG, POSE_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.messages.commands import DRIVE_TYPE, DriveLimits
@@ -243,3 +245,239 @@ def test_a_simulated_car_takes_drive_commands_only() -> None:
         SimGraph(ManualClock()).advertise("/cmd_vel", "geometry_msgs/Twist")
     with pytest.raises(SourceError, match="cannot share /pose"):
         SimGraph(ManualClock()).subscribe("/pose", print)
+
+
+# The simulated car's physics, against closed forms.
+
+DT = 0.02
+CAR = VehicleConfig()
+
+
+def steps(vehicle: Vehicle, seconds: float, wish: Wish | None = None) -> Iterator[Vehicle]:
+    for _ in range(round(seconds / DT)):
+        vehicle.step(DT, wish)
+        yield vehicle
+
+
+def test_the_battery_gives_what_the_drive_uses_and_the_losses_are_heat() -> None:
+    vehicle = Vehicle(CAR, 1)
+    joules = dict.fromkeys(("battery", "shaft", "windings", "board", "moving"), 0.0)
+    for car in steps(vehicle, 60):
+        rad_s = car.wheel_mps * CAR.speed_to_erpm_gain * 2 * math.pi / 60
+        winding = car.motor_resistance_ohm - CAR.fet_resistance_ohm
+        joules["battery"] += car.battery.voltage_v * car.battery.current_a * DT
+        joules["shaft"] += 1.5 * rad_s * CAR.flux_linkage_wb * car.motor_a * DT
+        joules["windings"] += 1.5 * winding * car.motor_a**2 * DT
+        joules["board"] += (1.5 * CAR.fet_resistance_ohm * car.motor_a**2 + IDLE_W) * DT
+    used = joules["shaft"] + joules["windings"] + joules["board"]
+    assert joules["battery"] == pytest.approx(used, rel=1e-3)
+    # What the shaft gave is in the car's motion, and in its losses, which only take.
+    moving = 0.5 * (CAR.mass_kg + CAR.rotating_mass_kg) * vehicle.speed_mps**2
+    least_n = CAR.rolling_resistance * CAR.mass_kg * G_MPS2 + CAR.drivetrain_friction_n
+    driven_m = vehicle.counts / 6 * 60 / CAR.speed_to_erpm_gain
+    assert moving + least_n * driven_m < joules["shaft"] < moving + 2.5 * least_n * driven_m
+
+
+def test_at_an_even_speed_the_motor_pushes_against_friction_and_drag_alone() -> None:
+    vehicle = Vehicle(CAR, 1)
+    for _ in steps(vehicle, 20, Wish(3.0, 0.0)):
+        pass
+    against_n = CAR.rolling_resistance * CAR.mass_kg * G_MPS2 + CAR.drivetrain_friction_n
+    against_n += 0.5 * 1.2 * CAR.drag_area_m2 * vehicle.speed_mps**2
+    assert vehicle.speed_mps == pytest.approx(3.0, rel=0.01)
+    assert vehicle.motor_a * CAR.newtons_per_amp * CAR.drivetrain_efficiency == pytest.approx(
+        against_n, rel=1e-3
+    )
+
+
+def test_a_battery_under_an_even_load_sags_at_once_and_then_slowly_to_the_sum_of_its_resistances() -> None:
+    config = VehicleConfig(capacity_ah=1000, charge=0.5)
+    battery = Battery(config)
+    battery.step(100.0, DT)
+    at_once = (battery.open_v - battery.voltage_v) / battery.current_a
+    assert at_once == pytest.approx(config.battery_resistance_ohm, rel=0.01)
+    for _ in range(round(10 * config.battery_slow_s / DT)):
+        battery.step(100.0, DT)
+    in_the_end = (battery.open_v - battery.voltage_v) / battery.current_a
+    both = config.battery_resistance_ohm + config.battery_slow_resistance_ohm
+    assert in_the_end == pytest.approx(both, rel=0.01)
+    assert battery.voltage_v * battery.current_a == pytest.approx(100.0)
+
+
+def test_the_open_voltage_falls_with_the_charge() -> None:
+    curve = [open_voltage(i / 100) for i in range(101)]
+    assert curve == sorted(curve)
+    assert (curve[0], curve[50], curve[100]) == pytest.approx((3.0, 3.73, 4.2), abs=0.01)
+
+
+def test_motor_and_board_warm_up_to_the_temperature_at_which_they_lose_their_heat() -> None:
+    config = VehicleConfig(motor_to_board_w_per_k=0.0)
+    heat = Heat(config)
+    for _ in range(40_000):
+        heat.step(3.0, 2.0, 5.0, 0.5, 1.0)
+    # At 5 m/s the cooling is twice as good, and half of it is left.
+    assert heat.motor_degc - config.ambient_degc == pytest.approx(3.0 / config.motor_cooling_w_per_k)
+    assert heat.board_degc - config.ambient_degc == pytest.approx(2.0 / config.board_cooling_w_per_k)
+    assert heat.winding(0.01) == pytest.approx(0.01 * (1 + 0.0039 * (heat.motor_degc - 25)))
+
+
+def test_wheels_spin_where_the_tyres_have_no_grip_and_hold_again() -> None:
+    slippery = VehicleConfig(friction=0.3)
+    vehicle = Vehicle(slippery, 1)
+    ratios = [car.wheel_mps / car.speed_mps for car in steps(vehicle, 3, Wish(5.0, 0.0)) if car.speed_mps]
+    assert max(ratios) > 1.5
+    # The tyres cannot push harder than their grip, and on a dry floor they do not spin.
+    assert vehicle.speed_mps <= slippery.friction * G_MPS2 * 3
+    assert ratios[-1] == pytest.approx(1.0, abs=0.05)
+    assert all(car.wheel_mps < car.speed_mps * 1.1 for car in steps(Vehicle(CAR, 1), 60))
+
+
+def test_all_fields_are_those_of_the_serial_line_and_agree_with_the_motor() -> None:
+    vehicle = Vehicle(CAR, 1)
+    sensors = Sensors(vehicle, 1, ALL)
+    rows: list[dict[str, Any]] = [sensors.vesc() for _ in steps(vehicle, 60)]
+    newest = LAYOUTS[max(LAYOUTS)]
+    assert sorted(rows[0]) == sorted(number.name for number in newest.numbers)
+    for row in rows[100::37]:
+        rad_s = row["speed"] * 2 * math.pi / 60
+        ohm = CAR.motor_resistance_ohm * (1 + 0.0039 * (row["temp_motor"] - 25)) + CAR.fet_resistance_ohm
+        assert row["avg_vq"] == pytest.approx(rad_s * CAR.flux_linkage_wb + ohm * row["avg_iq"], abs=0.06)
+        watts = 1.5 * (row["avg_vq"] * row["avg_iq"] + row["avg_vd"] * row["avg_id"]) + IDLE_W
+        assert row["voltage_input"] * row["current_input"] == pytest.approx(watts, abs=4 + 0.04 * abs(watts))
+        assert math.sqrt(3) * math.hypot(row["avg_vd"], row["avg_vq"]) / row[
+            "voltage_input"
+        ] == pytest.approx(abs(row["duty_cycle"]), abs=0.012)
+
+
+# The simulated car's faults: each changes what it should, by what it names, and nothing else.
+
+
+def samples(*faults: FaultConfig, seconds: float = 60.0, seed: int = 1) -> list[dict[str, Any]]:
+    vehicle = Vehicle(CAR, seed, faults=faults)
+    sensors = Sensors(vehicle, seed)
+    return [sensors.vesc() for _ in steps(vehicle, seconds)]
+
+
+def drive_with(*faults: FaultConfig) -> dict[str, list[tuple[int, Any]]]:
+    out: dict[str, list[tuple[int, Any]]] = {"vesc": [], "pose": []}
+    source = SimConfig(duration_s=300, faults=faults).build(ManualClock(now_us=0))
+    source.run(lambda stream, t_us, values: out[stream].append((t_us, values)), threading.Event())
+    return out
+
+
+# What a fault changes at once, and what it leaves as it is: the value of a car that has driven with it.
+SEEN: dict[str, Callable[[Vehicle], float]] = {
+    "worn_battery": lambda car: (car.battery.open_v - car.battery.voltage_v) / car.battery.current_a,
+    "added_friction": lambda car: -car.speed_mps,
+    "flat_tyre": lambda car: car.wheel_mps / car.speed_mps,
+    "dragging_brake": lambda car: car.damage.drag_n,
+    "cell_dropout": lambda car: car.damage.lost_v,
+    "cooling_lost": lambda car: car.heat.board_degc,
+    "loose_pinion": lambda car: abs(car.wheel_mps - car.speed_mps),
+    "motor_resistance": lambda car: car.motor_resistance_ohm,
+    "payload": lambda car: car.mass_kg,
+}
+
+
+def mean(kind: str, faults: list[FaultConfig]) -> float:
+    vehicle = Vehicle(CAR, 1, faults=faults)
+    found = [
+        SEEN[kind](car) for car in steps(vehicle, 60) if abs(car.speed_mps) > 1 and car.battery.current_a > 1
+    ]
+    return sum(found) / len(found)
+
+
+@pytest.mark.parametrize("kind", SEEN)
+def test_a_stronger_fault_changes_the_car_more(kind: str) -> None:
+    found = [mean(kind, [])] + [mean(kind, [FaultConfig(kind, strength)]) for strength in STRENGTHS]
+    assert found == sorted(found)
+    assert found[0] < found[1], "a weak fault changes something"
+
+
+def test_faults_have_the_physical_size_that_they_name() -> None:
+    """Steady states of the faulty car, against the healthy one's."""
+
+    def cruise(*faults: FaultConfig) -> Vehicle:
+        vehicle = Vehicle(CAR, 1, faults=faults)
+        for _ in steps(vehicle, 10, Wish(3.0, 0.0)):
+            pass
+        return vehicle
+
+    def force_n(car: Vehicle) -> float:
+        drag_n = 0.5 * 1.2 * CAR.drag_area_m2 * car.speed_mps**2
+        return car.motor_a * CAR.newtons_per_amp * CAR.drivetrain_efficiency - drag_n
+
+    healthy = cruise()
+    assert force_n(cruise(FaultConfig("added_friction", 1.0))) - force_n(healthy) == pytest.approx(
+        1.0, abs=0.01
+    )
+    heavy = cruise(FaultConfig("payload", 1.0))
+    assert force_n(heavy) - force_n(healthy) == pytest.approx(CAR.rolling_resistance * G_MPS2, abs=0.01)
+    flat = cruise(FaultConfig("flat_tyre", 0.1))
+    assert flat.wheel_mps / flat.speed_mps == pytest.approx(1 / 0.9, rel=0.01)
+    joint = cruise(FaultConfig("motor_resistance", 0.01))
+    assert joint.motor_resistance_ohm - healthy.motor_resistance_ohm == pytest.approx(0.01, abs=2e-4)
+    for kind in ("worn_battery", "cooling_lost", "motor_resistance", "cell_dropout"):
+        assert cruise(FaultConfig(kind, "strong")).motor_a == pytest.approx(healthy.motor_a), kind
+
+
+@pytest.mark.parametrize("field", ["voltage_input", "current_motor", "temperature_pcb"])
+def test_a_faulty_sensor_changes_its_own_field_only(field: str) -> None:
+    healthy = samples()
+    stuck = samples(FaultConfig("sensor_stuck", 10.0, 20.0, field))
+    drifting = samples(FaultConfig("sensor_drift", 100.0, 20.0, field))
+    for rows in (stuck, drifting):
+        assert [{**row, field: 0} for row in rows] == [{**row, field: 0} for row in healthy]
+        assert [row[field] for row in rows[:1000]] == [row[field] for row in healthy[:1000]]
+    assert len({row[field] for row in stuck[1001:1499]}) == 1
+    assert stuck[1501:] == healthy[1501:]
+    assert drifting[-1][field] - healthy[-1][field] == pytest.approx(100.0 * 40 / 600, abs=0.06)
+
+
+def test_an_intermittent_can_loses_its_share_of_the_samples_in_gaps_and_no_poses() -> None:
+    fault = FaultConfig("intermittent_can", 0.08, 60.0)
+    with_fault, without = drive_with(fault), drive_with()
+    assert with_fault["pose"] == without["pose"]
+    lossy, healthy = with_fault["vesc"], without["vesc"]
+    assert 1 - len(lossy) / len(healthy) == pytest.approx(0.08 * 240 / 300, abs=0.025)
+    assert lossy[:3000] == healthy[:3000]
+    gaps = [(b[0] - a[0]) / 1e6 for a, b in zip(lossy, lossy[1:]) if b[0] - a[0] > 30_000]
+    assert 0.04 < min(gaps) < max(gaps) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        (
+            {"kind": "worn_batery"},
+            r"faults\[0\].kind: must be one of worn_battery, .*did you mean worn_battery\?",
+        ),
+        ({}, r"faults\[0\].kind: required"),
+        (
+            {"kind": "payload", "strength": "huge"},
+            r"strength: must be weak, middle, strong or a number .*'huge'",
+        ),
+        ({"kind": "payload", "strength": -1}, r"strength: must be weak"),
+        ({"kind": "flat_tyre", "strength": 0.9}, r"strength: must be at most 0.5 for flat_tyre, got 0.9"),
+        (
+            {"kind": "payload", "field": "speed"},
+            r"field: only sensor_stuck and sensor_drift have a field, got payload",
+        ),
+        (
+            {"kind": "sensor_drift", "field": "speed"},
+            r"field: must be one of voltage_input, .* for sensor_drift",
+        ),
+        ({"kind": "sensor_stuck", "field": "x"}, r"field: must be one of current_input"),
+        ({"kind": "payload", "from_s": -1}, r"from_s: must be a number from 0"),
+    ],
+)
+def test_a_wrong_fault_is_refused(fault: dict[str, Any], error: str) -> None:
+    with pytest.raises(ConfigError, match=error):
+        load(SimConfig, {"faults": [fault]}, Place(Path("car.yaml")))
+
+
+def test_faults_are_set_by_name_or_by_number_and_are_in_the_description() -> None:
+    faults = [{"kind": "payload"}, {"kind": "flat_tyre", "strength": 0.07, "from_s": 5}]
+    config = load(SimConfig, {"faults": faults}, Place(Path("car.yaml")))
+    assert [fault.value for fault in config.faults] == [KINDS["payload"].strengths[1], 0.07]
+    assert config.describe() == "simulated car at 50 Hz with payload and flat_tyre"

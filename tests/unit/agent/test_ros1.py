@@ -1,0 +1,369 @@
+"""ROS 1 messages from and to JSON, and how the node connects to publishers."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iort_agent.ros1 import master
+from iort_agent.ros1.json_message import Writer, decode, encode
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import Definition, parse
+from tests.rosbridge_json import as_rosbridge
+from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
+from tests.unit.contract.ros1.ros1_values import HEADER, by_rosbags, definitions, values
+
+MIXED = f"""bool b
+int8 small
+uint64 large
+float32 f
+string s
+int16[2] two
+float64[] many
+time t
+duration ago
+Inner[] inner
+{RULE}
+MSG: a_msgs/Inner
+uint8[] raw
+string[2] names
+"""
+GOOD = {
+    "b": True, "small": -128, "large": 2**64 - 1, "f": 1.5, "s": "grün", "two": [1, -2], "many": [1, 2.5],
+    "t": {"sec": 1, "nanosec": 2}, "ago": {"sec": -1, "nanosec": 999_999_999},
+    "inner": [{"raw": [1, 255], "names": ["a", ""]}],
+}  # fmt: skip
+
+
+def test_json_to_ros_and_back() -> None:
+    definition = parse("a_msgs/A", MIXED)
+    assert decode(definition, encode(definition, GOOD, now_us=T0)) == GOOD
+
+
+def test_json_is_what_rosbags_writes() -> None:
+    import numpy as np
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(MIXED, "a_msgs/msg/A"))
+    types = store.types
+    message = types["a_msgs/msg/A"](
+        True, -128, 2**64 - 1, 1.5, "grün", np.array([1, -2], np.int16), np.array([1, 2.5]),
+        types["builtin_interfaces/msg/Time"](1, 2), types["builtin_interfaces/msg/Duration"](-1, 999_999_999),
+        [types["a_msgs/msg/Inner"](np.array([1, 255], np.uint8), ["a", ""])],
+    )  # fmt: skip
+    expected = bytes(store.serialize_ros1(message, "a_msgs/msg/A"))
+    assert encode(parse("a_msgs/A", MIXED), GOOD, now_us=T0) == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"b": 1}, "b: must be true or false, got 1"),
+        ({"small": 128}, "small: must be a number that fits in int8, got 128"),
+        ({"small": 1.5}, "small: must be an integer, got 1.5"),
+        ({"small": True}, "small: must be an integer, got True"),
+        ({"large": -1}, "fits in uint64"),
+        ({"f": 1e39}, "fits in float32"),
+        ({"f": float("nan")}, "f: must be .*, got nan"),
+        ({"f": 10**400}, "f: must be .*, got inf"),
+        ({"s": 5}, "s: must be a text, got 5"),
+        ({"s": "\ud800"}, "a text of Unicode"),
+        ({"two": [1]}, "two: must have 2 elements, got 1"),
+        ({"two": 1}, "two: must be a list .*, got 1"),
+        ({"many": [1, "2"]}, r"many\.1: must be a number, got '2'"),
+        ({"t": 5.0}, "t: must be an object of sec, nanosec, got 5.0"),
+        ({"t": {"sec": 1}}, r"t\.nanosec: is missing"),
+        ({"t": {"secs": 1}}, r"t\.nanosec: is missing"),
+        (
+            {"t": {"sec": 1, "secs": 1, "nsecs": 2}},
+            "t: must have one spelling of a time, got sec, s",
+        ),
+        (
+            {"t": {"sec": 1, "nanosec": 10**9}},
+            r"t\.nanosec: must be an integer from 0 to 9+, got 10{9}",
+        ),
+        ({"t": {"secs": 1, "nsecs": -1}}, r"t\.nanosec: must be an integer from 0 to 999999999, got -1"),
+        ({"ago": {"sec": -1, "nanosec": -1}}, r"ago\.nanosec: must be .*, got -1"),
+        ({"inner": [{"raw": [256], "names": ["", ""]}]}, r"inner\.0\.raw\.0: must be .*, got 256"),
+        ({"other": 1}, "other: a_msgs/A has no such field"),
+    ],
+)
+def test_json_that_does_not_fit(change: dict[str, Any], error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        encode(parse("a_msgs/A", MIXED), {**GOOD, **change}, now_us=T0)
+
+
+def test_partial_means_zero_and_a_header_means_now() -> None:
+    mixed, pose = parse("a_msgs/A", MIXED), parse("geometry_msgs/PoseStamped", POSE)
+    zero = decode(mixed, encode(mixed, {"s": "x"}, now_us=T0, partial=True))
+    assert zero == {
+        "b": False, "small": 0, "large": 0, "f": 0.0, "s": "x", "two": [0, 0], "many": [],
+        "t": {"sec": 0, "nanosec": 0}, "ago": {"sec": 0, "nanosec": 0}, "inner": [],
+    }  # fmt: skip
+    stamped = decode(pose, encode(pose, POSE_MESSAGE, now_us=T0 + 5))
+    assert stamped["header"] == {"seq": 0, "stamp": {"sec": T0 // 10**6, "nanosec": 5000}, "frame_id": ""}
+    given = {**POSE_MESSAGE, "header": {"seq": 1, "stamp": {"sec": 2, "nanosec": 3}, "frame_id": "map"}}
+    assert decode(pose, encode(pose, given, now_us=T0))["header"] == given["header"]
+
+
+def test_roslibjs_own_spellings_of_times_and_a_header_without_seq() -> None:
+    mixed, pose = parse("a_msgs/A", MIXED), parse("geometry_msgs/PoseStamped", POSE)
+    theirs = {**GOOD, "t": {"secs": 1, "nsecs": 2}, "ago": {"secs": -1, "nsecs": 999_999_999}}
+    assert encode(mixed, theirs, now_us=T0) == encode(mixed, GOOD, now_us=T0)
+    header = {"stamp": {"secs": 2, "nsecs": 3}, "frame_id": "map"}
+    found = decode(pose, encode(pose, {**POSE_MESSAGE, "header": header}, now_us=T0))
+    assert found["header"] == {"seq": 0, "stamp": {"sec": 2, "nanosec": 3}, "frame_id": "map"}
+    with pytest.raises(MessageError, match=r"header\.frame_id: is missing"):
+        encode(pose, {**POSE_MESSAGE, "header": {"stamp": {"sec": 2, "nanosec": 3}}}, now_us=T0)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(list(GOOD)), inner, max_size=9)
+    ),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.sampled_from([*GOOD, "other"]), JSON), st.booleans())
+def test_any_json_is_a_message_or_refused(message: dict[str, Any], partial: bool) -> None:
+    definition = parse("a_msgs/A", MIXED)
+    try:
+        data = encode(definition, {**GOOD, **message}, now_us=T0, partial=partial)
+    except MessageError:
+        return
+    assert encode(definition, decode(definition, data), now_us=T0) == data
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
+    definition = parse("a_msgs/A", MIXED)
+    try:
+        decode(definition, data)
+    except MessageError:
+        return
+
+
+# What a rosbridge server sends, as the bytes of the ROS 1 message that it was made of.
+
+pytest.importorskip("rosbags")
+
+
+def without_numbers(value: Any) -> Any:
+    """What rosbridge does to NaN and the infinities."""
+    if isinstance(value, dict):
+        return {name: without_numbers(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [without_numbers(item) for item in value]
+    return math.nan if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def nulls(value: Any) -> int:
+    if isinstance(value, (dict, list)):
+        return sum(map(nulls, value.values() if isinstance(value, dict) else value))
+    return int(value is None)
+
+
+@settings(deadline=None)  # rosbags makes classes of each definition
+@given(st.data())
+def test_any_message_is_what_rosbags_writes(data: Any) -> None:
+    definition = data.draw(definitions())
+    message = data.draw(values(definition))
+    sent = json.loads(json.dumps(as_rosbridge(definition, message)))
+    writer = Writer(definition)
+    assert writer.write(sent) == by_rosbags(definition, without_numbers(message))
+    assert writer.nulls == nulls(sent)
+    ros2 = json.loads(json.dumps(as_rosbridge(definition, message, ros2=True)))
+    assert writer.write(ros2) == writer.write(sent)
+
+
+WRITTEN_MIXED = f"""Header header
+bool b
+int8 small
+float32 f
+string s
+int16[2] two
+float64[] many
+uint8[] raw
+char[3] three
+bool[] flags
+byte[] signed
+time t
+Inner[] inner
+Plain[2] plain
+{HEADER}{"=" * 80}
+MSG: a_msgs/Inner
+string[2] names
+{"=" * 80}
+MSG: a_msgs/Plain
+float32 x
+duration d
+"""
+WRITTEN: dict[str, Any] = {
+    "header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 2}, "frame_id": "map"},
+    "b": True, "small": -128, "f": 1.5, "s": "grün", "two": [1, -2], "many": [1, 2.5], "raw": "AQL/",
+    "three": "YWJj", "flags": [True, False], "signed": [-1, 127], "t": {"secs": 4, "nsecs": 5},
+    "inner": [{"names": ["a", ""]}],
+    "plain": [{"x": 1, "d": {"secs": -1, "nsecs": 6}}, {"x": None, "d": {"secs": 0, "nsecs": 0}}],
+}  # fmt: skip
+
+
+def mixed() -> Definition:
+    return parse("a_msgs/A", WRITTEN_MIXED)
+
+
+def test_what_rosbridge_sends() -> None:
+    writer = Writer(mixed())
+    back = decode(mixed(), writer.write(WRITTEN))
+    assert math.isnan(back["plain"][1].pop("x"))
+    assert writer.nulls == 1
+    assert back == {
+        **WRITTEN,
+        "header": {"seq": 3, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"},
+        "raw": [1, 2, 255], "three": [97, 98, 99], "t": {"sec": 4, "nanosec": 5},
+        "plain": [{"x": 1, "d": {"sec": -1, "nanosec": 6}}, {"d": {"sec": 0, "nanosec": 0}}],
+    }  # fmt: skip
+
+
+def test_a_header_of_ros_2_has_no_seq() -> None:
+    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
+    message = {**WRITTEN, "header": header, "raw": [1, 2, 255]}
+    assert decode(mixed(), Writer(mixed()).write(message))["header"] == {**header, "seq": 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"b": None}, "b: must be true or false, got None"),
+        ({"small": 128}, "small: must be a number that fits in int8, got 128"),
+        ({"small": None}, "small: must be an integer, got None"),
+        ({"small": 1.5}, "small: must be an integer, got 1.5"),
+        ({"f": 1e39}, "f: must be a number that fits in float32"),
+        ({"f": "1"}, "f: must be a number, got '1'"),
+        ({"s": 5}, "s: must be a text, got 5"),
+        ({"s": "\ud800"}, "s: must be a text of Unicode"),
+        ({"two": [1]}, "two: must have 2 elements, got 1"),
+        ({"two": {"0": 1}}, "two: must be a list of up to"),
+        ({"many": 7}, "many: must be a list of up to .*, got 7"),
+        ({"raw": "a"}, "raw: must be base64"),
+        ({"raw": [256]}, r"raw\.0: must be a number that fits in uint8, got 256"),
+        ({"three": "YWI="}, "three: must have 3 elements, got 2"),
+        ({"t": {"secs": 1}}, r"t\.nanosec: is missing"),
+        ({"t": {"secs": 1, "nanosec": 2}}, "t: must have one spelling of a time"),
+        ({"inner": [{"names": ["a", "b"], "more": 1}]}, r"inner\.0\.more: a_msgs/Inner has no such field"),
+        ({"inner": [None]}, r"inner\.0: must be an object of names, got None"),
+        ({"plain": [{"x": 1}, {"x": 1}]}, r"plain\.0\.d: is missing"),
+        ({"header": {"seq": 1, "frame_id": ""}}, r"header\.stamp: is missing"),
+        ({"other": 1}, "other: a_msgs/A has no such field"),
+    ],
+)
+def test_what_does_not_fit(change: dict[str, Any], error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        Writer(mixed()).write({**WRITTEN, **change})
+
+
+WRITTEN_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(list(WRITTEN)), inner),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.sampled_from([*WRITTEN, "other"]), WRITTEN_JSON) | WRITTEN_JSON)
+def test_any_json_of_rosbridge_is_a_message_or_refused(message: Any) -> None:
+    whole = {**WRITTEN, **message} if isinstance(message, dict) else message
+    try:
+        data = Writer(mixed()).write(whole)
+    except MessageError:
+        return
+    decode(mixed(), data)
+
+
+# Attempts to connect to a publisher, in the place of rospy's own.
+
+TOPIC, URI = "/wheel", "http://127.0.0.1:1"
+CHOSEN = ["TCPROS", "127.0.0.1", 2]
+
+
+class Rospy:
+    """A subscriber, its connections, and a publisher whose answers the test gives."""
+
+    def __init__(self) -> None:
+        self.connections: list[str] = []
+        self.asked, self.answer = threading.Semaphore(0), threading.Semaphore(0)
+        self.protocol_handlers = [self]
+
+    def get_subscriber_impl(self, topic: str) -> Any:
+        return SimpleNamespace(has_connection=self.connections.__contains__) if topic == TOPIC else None
+
+    def get_supported(self) -> list[list[str]]:
+        return [["TCPROS"]]
+
+    def supports(self, protocol: str) -> bool:
+        return protocol == "TCPROS"
+
+    def create_transport(self, _topic: str, uri: str, chosen: list[Any]) -> tuple[int, str, int]:
+        assert chosen == CHOSEN
+        self.connections.append(uri)
+        return 1, "", 0
+
+    def requestTopic(self, *asked: Any) -> tuple[int, str, list[Any]]:  # noqa: N802 - ROS' name
+        assert asked == ("/iort_agent", TOPIC, [["TCPROS"]])
+        self.asked.release()
+        assert self.answer.acquire(timeout=60)
+        return 1, "", CHOSEN
+
+
+@pytest.fixture
+def rospy(monkeypatch: pytest.MonkeyPatch) -> Rospy:
+    found, handlers = Rospy(), type("Handlers", (), {})
+    for name, module in (
+        ("masterslave", SimpleNamespace(ROSHandler=handlers)),
+        ("registration", SimpleNamespace(get_topic_manager=lambda: found)),
+    ):
+        monkeypatch.setitem(sys.modules, f"rospy.impl.{name}", module)
+    monkeypatch.setattr(master, "proxy", lambda *_: found)
+    master.mend("/iort_agent")
+    found.connect = lambda topic=TOPIC: handlers._connect_topic(found, topic, URI)
+    return found
+
+
+def test_two_attempts_at_once_make_one_connection(rospy: Any) -> None:
+    first = threading.Thread(target=rospy.connect)
+    first.start()
+    assert rospy.asked.acquire(timeout=60)
+    # The second begins while the first waits for its answer.
+    rospy.connect()
+    rospy.answer.release()
+    first.join()
+    rospy.connect()
+    assert rospy.connections == [URI]
+
+
+def test_a_publisher_that_did_not_answer_is_tried_again(rospy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(*_: Any) -> None:
+        raise TimeoutError
+
+    answering = rospy.requestTopic
+    monkeypatch.setattr(rospy, "requestTopic", silent)
+    with pytest.raises(TimeoutError):
+        rospy.connect()
+    monkeypatch.setattr(rospy, "requestTopic", answering)
+    rospy.answer.release()
+    rospy.connect()
+    assert rospy.connections == [URI]
+
+
+def test_a_topic_without_subscriber_is_not_connected(rospy: Any) -> None:
+    rospy.connect("/other")
+    assert rospy.connections == []
