@@ -29,8 +29,8 @@ from testkit.dynamodb import TELEMETRY, FakeDynamoDB, item_of, item_of_message
 from tests.archived import FakeS3, archive, compact
 from tests.examples import examples
 from tests.recordings import recording
-from tests.unit.contract.codec.test_columns import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.contract.ros1.ros1_messages import text, u32
+from tests.unit.contract.test_codec import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.functions.summarizing import drive_of
 from tests.unit.station.data.test_queries import cloud_of
 

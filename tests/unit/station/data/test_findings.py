@@ -26,7 +26,7 @@ from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.analysis import RUNNING, SUCCEEDED, Progress
 from iort_station.page import insights
-from tests.unit.contract.messages.test_notes import FIRST_US, OneTable
+from tests.unit.contract.test_messages import FIRST_US, OneTable
 from tests.unit.functions.test_analysis import finding
 
 TOO_SHORT = "the drive must last 240 s"

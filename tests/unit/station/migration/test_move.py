@@ -26,10 +26,9 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.migration import plan, recordings, robots
-from tests.unit.analysis.archive.test_archive import batch_at, item_of
-from tests.unit.analysis.archive.test_archive import written as written_hour
-from tests.unit.contract.messages.test_findings import FINDING
-from tests.unit.contract.messages.test_notes import OneTable, note
+from tests.unit.analysis.test_archive import batch_at, item_of
+from tests.unit.analysis.test_archive import written as written_hour
+from tests.unit.contract.test_messages import FINDING, OneTable, note
 
 TOPIC = build_topic(RECORD, "car7", "vesc")
 DAY = "archive/robot=car7/stream=vesc/date=2026-11-22/day.parquet"

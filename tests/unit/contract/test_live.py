@@ -10,17 +10,32 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.limits import MAX_NEXT_MS, MAX_PUBNUB_BYTES, ContractError
+from iort_contract.limits import (
+    LIVE_MAX_RATE_HZ,
+    LIVE_MIN_RATE_HZ,
+    MAX_NEXT_MS,
+    MAX_PUBNUB_BYTES,
+    ContractError,
+)
 from iort_contract.messages.envelope import event_message, rule_event
 from iort_contract.messages.live import (
+    VIEW_LEASE_MS,
+    Lease,
     LiveSample,
+    decode_lease,
     decode_live,
     decode_live_update,
+    decode_pong,
+    encode_lease,
     encode_live,
+    encode_ping,
+    lease_topic,
     live_update,
 )
 from iort_contract.tables import MESSAGE_BASE64
+from iort_contract.topics import PONG, RULE, build_topic
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,
@@ -28,6 +43,7 @@ from tests.unit.contract.contract_values import (
     MOST_NONFINITE,
     anything,
     boots,
+    json_values,
     names,
     nulled,
     same,
@@ -131,3 +147,87 @@ def test_a_live_update_is_decoded_as_it_was_encoded():
     ):
         with pytest.raises(ContractError):
             decode_live_update(bad)
+
+
+# Pings and their pongs.
+
+
+@given(seqs, times, st.text(st.characters(), max_size=20), st.none() | st.integers(0, 2**53 // 1000))
+def test_pong_round_trip(ping_id, sent_us, padding, received_ms):
+    message = encode_ping(ping_id, sent_us, padding)
+    if received_ms is not None:  # as the rule does
+        message = json.dumps(dict(json.loads(message), received_ms=received_ms)).encode()
+    assert decode_pong(message) == (ping_id, sent_us, received_ms)
+
+
+@pytest.mark.parametrize(
+    ("ping_id", "sent_us"),
+    [(math.nan, 0), (-1, 0), (2**53 + 1, 0), (True, 0), ("1", 0), (1, math.nan), (1, 2**53)],
+)
+def test_an_invalid_ping_is_refused(ping_id, sent_us):
+    with pytest.raises(ContractError, match=r"ping id|sent_us"):
+        encode_ping(ping_id, sent_us)
+
+
+@pytest.mark.parametrize(
+    "pong",
+    [
+        "{}",
+        '{"id":1}',
+        '{"id":"1","sent_us":0}',
+        '{"id":1,"sent_us":0,"received_ms":null}',
+        "[]",
+        '{"id":1,"sent_us":0,"received_ms":1000000000000000}',
+    ],
+)
+def test_an_invalid_pong_is_refused(pong):
+    with pytest.raises(ContractError):
+        decode_pong(pong)
+
+
+def test_a_pong_goes_to_the_robot_that_sent_the_ping():
+    topic = RULES["pong"].action.topic("iort", robot="car")
+    assert topic == build_topic(PONG, "car", RULE)
+
+
+# A viewer's lease is decoded as it was encoded; anything else is refused.
+
+GOOD = Lease(BOOT, 10, VIEW_LEASE_MS)
+rates = st.floats(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ)
+
+
+@given(st.builds(Lease, boots, rates, st.integers(0, VIEW_LEASE_MS), st.booleans()))
+def test_a_lease_is_decoded_as_it_was_encoded(lease: Lease) -> None:
+    assert decode_lease(encode_lease(lease)) == lease
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"viewer": "0" * 33}, "viewer"),
+        ({"rate_hz": math.nan}, "rate_hz must be 0.01 to 10, got nan"),
+        ({"rate_hz": 10.5}, "rate_hz"),
+        # No float is so large.
+        ({"rate_hz": 10**400}, "rate_hz"),
+        ({"lease_ms": VIEW_LEASE_MS + 1}, "lease_ms"),
+        ({"lease_ms": -1}, "lease_ms"),
+        ({"lease_ms": 1.5}, "lease_ms"),
+    ],
+)
+def test_an_invalid_lease_is_refused(changed: dict[str, object], named: str) -> None:
+    with pytest.raises(ContractError, match=named):
+        encode_lease(replace(GOOD, **changed))  # type: ignore[arg-type]  # invalid on purpose
+
+
+@given(st.dictionaries(st.sampled_from(["v", "viewer", "rate_hz", "lease_ms", "broker"]), json_values))
+def test_what_is_no_lease_is_refused(changed: dict[str, object]) -> None:
+    message = {**json.loads(encode_lease(GOOD)), **changed}
+    try:
+        lease = decode_lease(json.dumps(message))
+    except ContractError:
+        return
+    assert decode_lease(encode_lease(lease)) == lease
+
+
+def test_the_topic_is_the_robots_own() -> None:
+    assert lease_topic("car7", "lab2") == "view/lab2/car7/lease"

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import iort_contract
+from iort_contract import expression
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import channel, fleet_name, pubnub_parameter
 from iort_contract.limits import ContractError
@@ -19,6 +24,7 @@ from iort_contract.topics import (
     record_topic,
     rule_name,
 )
+from iort_contract.track import Track, parse_track
 
 robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 namespaces = st.from_regex(r"[a-z][a-z0-9]{0,15}", fullmatch=True)
@@ -120,3 +126,65 @@ def test_any_topic_is_rebuilt_the_same_or_refused(topic):
 def test_a_namespace_has_stricter_rules_than_a_name(namespace):
     with pytest.raises(ContractError, match="namespace"):
         check_namespace(namespace)
+
+
+# A track's CSV file: as the usual tools write it, and what is wrong with others.
+
+SQUARE = Track((0.0, 4.0, 4.0, 0.0), (0.0, 0.0, 3.0, 3.0), (1.1,) * 4, (0.9,) * 4)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# x_m, y_m, w_tr_right_m, w_tr_left_m\n0.0, 0.0, 1.1, 0.9\n4,0,1.1,0.9\n4,3,1.1,0.9\n0,3,1.1,0.9\n",
+        "x_m;y_m;w_right_m;w_left_m\r\n0;0;1.1;0.9\r\n4;0;1.1;0.9\r\n4;3;1.1;0.9\r\n0;3;1.1;0.9\r\n",
+        "0,0,1.1,0.9\n4,0,1.1,0.9\n\n4,0,1.1,0.9\n4,3,1.1,0.9\n0,3,1.1,0.9\n0,0,1.1,0.9",
+        SQUARE.csv(),
+    ],
+    ids=["F1TENTH and TU Munich", "names and semicolons", "doubled points and a closed line", "our own"],
+)
+def test_the_usual_files_are_read(text: str) -> None:
+    assert parse_track(text) == SQUARE
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "4 to 20000 points, got 0"),
+        ("0,0,1,1\n1,0,1,1\n0,0,1,1\n", "4 to 20000 points, got 2"),
+        ("0,0,1,1\n1,0,1\n", "line 2 must be the four numbers x_m, y_m, w_right_m, w_left_m, got '1,0,1'"),
+        ("s;x;y;psi;kappa;vx;ax\n0;1;2;3;4;5;6\n", "line 2 must be the four numbers"),
+        ("0,0,1,1\nx,0,1,1\n", "line 2 must be the four numbers"),
+        ("0,0,1,1\nnan,0,1,1\n", "line 2 must be the four numbers"),
+        ("0,0,1,1\ninf,0,1,1\n", "line 2 must be within 100000 m"),
+        ("0,0,1,-1\n", "line 1: widths must be over 0 m"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_line(text: str, said: str) -> None:
+    with pytest.raises(ContractError, match=said):
+        parse_track(text)
+
+
+# Conditions are also read by the Python of a robot; what they mean is tested against numpy's columns.
+
+
+def test_a_condition_is_read_without_numpy() -> None:
+    node = expression.parse("0 < speed <= 2 and abs(current) > 1.5 and mode in ('a', 'b') or pose.x is None")
+    columns = {
+        "speed": [1, 3, 3],
+        "current": [-2, -2, -2],
+        "mode": ["b", "b", "b"],
+        "pose.x": [0.5, 0.5, None],
+    }
+    assert expression.names(node) == set(columns)
+    assert expression.holds(node, columns, 3) == [True, False, True]
+
+
+# Every module of the contract can be imported, on the robot's oldest Python too (`make test-oldest`).
+
+MODULES = [one.name for one in pkgutil.walk_packages(iort_contract.__path__, "iort_contract.")]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_module_can_be_imported(name: str) -> None:
+    assert importlib.import_module(name).__doc__

@@ -1,0 +1,435 @@
+"""Commands and fleet messages are decoded as they were encoded; invalid ones are not encoded."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from dataclasses import replace
+from decimal import Decimal
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iort_contract.catalog.analysis import KINDS, PARAMETERS
+from iort_contract.findings_table import FindingsTable
+from iort_contract.limits import ContractError
+from iort_contract.messages.analysis import (
+    MAX_NOTE_CHARACTERS,
+    DriveKey,
+    Estimate,
+    Finding,
+    Note,
+    decode_finding,
+    decode_note,
+    encode_finding,
+    encode_note,
+)
+from iort_contract.messages.batch import decode_batch, encode_batch
+from iort_contract.messages.commands import (
+    Command,
+    FleetMessage,
+    decode_command,
+    decode_fleet,
+    encode_command,
+    encode_fleet,
+)
+from iort_contract.messages.live import decode_live, decode_pong, encode_live
+from iort_contract.messages.questions import (
+    FIRST_US,
+    LAST_US,
+    QueryAnswer,
+    QueryRequest,
+    decode_query_answer,
+    decode_query_request,
+    encode_query_answer,
+    encode_query_request,
+    packed_samples,
+    unpacked_samples,
+)
+from tests.examples import examples
+from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
+
+T0 = 1_700_000_000_000_000
+MESSAGES = st.dictionaries(
+    st.text(max_size=3),
+    st.integers()
+    | st.booleans()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.lists(st.none(), max_size=2),
+    max_size=4,
+)
+KEYS = ["v", "session", "started_us", "seq", "sent_us", "valid_ms", "lease_ms", "message", "boot"]
+TIMES = st.integers(0, 2**53 - 1)
+
+
+@given(
+    st.text("0123456789abcdef", min_size=8, max_size=32), st.tuples(TIMES, TIMES), st.integers(0, 2**53),
+    st.tuples(st.integers(1, 60_000), st.none() | st.integers(1, 10_000)), MESSAGES,
+)  # fmt: skip
+def test_a_command_is_decoded_as_it_was_encoded(
+    session: str, times: tuple[int, int], seq: int, holds: tuple[int, int | None], message: Any
+) -> None:
+    command = Command(session, min(times), seq, max(times), holds[0], message, holds[1])
+    assert decode_command(encode_command(command)) == command
+
+
+@given(st.integers(0, 2**53), TIMES, MESSAGES)
+def test_a_fleet_message_is_decoded_as_it_was_encoded(seq: int, sent: int, message: Any) -> None:
+    heard = FleetMessage("0badcafe", seq, sent, message)
+    assert decode_fleet(encode_fleet(heard)) == heard
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": "x"}, {"session": None}, {"seq": -1}, {"seq": True}, {"started_us": T0 + 1},
+        {"sent_us": 1.5}, {"sent_us": 2**60}, {"valid_ms": 0}, {"valid_ms": 60_001}, {"lease_ms": 0},
+        {"lease_ms": 10_001}, {"message": []}, {"message": None}, {"message": {"a": float("nan")}},
+        {"takeover": 1}, {"ends": None}, {"by": ""}, {"by": "a" * 65}, {"by": "a\nb"},
+        {"message": {"a": "x" * 200_000}}, {"message": {"a": {1, 2}}},
+    ],
+)  # fmt: skip
+def test_an_invalid_command_is_refused(change: dict[str, Any]) -> None:
+    good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
+    with pytest.raises(ContractError):
+        encode_command(replace(good, **change))
+
+
+ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.text(max_size=9) | st.just({})
+
+
+@given(st.dictionaries(st.sampled_from(KEYS), ANYTHING) | st.binary(max_size=40))
+def test_any_other_input_raises_the_contracts_error(content: Any) -> None:
+    payload = content if isinstance(content, bytes) else json.dumps(content).encode()
+    for read in (decode_command, decode_fleet):
+        with pytest.raises(ContractError):
+            read(payload)
+
+
+# Query messages are decoded as they were encoded; invalid ones are refused.
+
+REQUEST = QueryRequest("car", "vesc", 5, 9, ("speed",), "speed > 1", True, {"topic": {"S": "t"}})
+TIMES_US, COLUMNS = [1_700_000_000_000_000, 1_700_000_000_020_000], {"speed": [1.5, None]}
+SAMPLES = packed_samples(TIMES_US, COLUMNS)
+ANSWER = QueryAnswer(2, ("speed",), 3, 1, 1, "codec", {"temp_fet": 2}, {"topic": {"S": "t"}}, SAMPLES)
+
+
+@pytest.mark.parametrize("request_", [REQUEST, QueryRequest("car", "vesc")])
+def test_a_request_is_decoded_as_it_was_encoded(request_: QueryRequest) -> None:
+    assert decode_query_request(json.loads(encode_query_request(request_))) == request_
+
+
+def test_a_request_needs_only_robot_and_stream_and_its_times_are_clamped() -> None:
+    assert decode_query_request({"robot": "car", "stream": "vesc"}) == QueryRequest("car", "vesc")
+    far = decode_query_request({"robot": "car", "stream": "vesc", "start_us": -(2**60), "end_us": 2**60})
+    assert (far.start_us, far.end_us) == (FIRST_US, LAST_US)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"robot": "a/b"}, "robot name must be"),
+        ({"robot": None}, "robot must be a text"),
+        ({"stream": "+"}, "stream name must be"),
+        ({"start_us": 1.5}, "start_us must be an integer"),
+        ({"end_us": True}, "end_us must be an integer"),
+        ({"fields": "speed"}, "fields must be a list"),
+        ({"fields": [1]}, "fields must be a list"),
+        ({"where": 1}, "where must be a text"),
+        ({"token": "t"}, "token must be an object"),
+    ],
+)
+def test_an_invalid_request_is_refused(change: dict[str, object], reason: str) -> None:
+    with pytest.raises(ContractError, match=reason):
+        decode_query_request({"robot": "car", "stream": "vesc", **change})
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [ANSWER, QueryAnswer(url="https://there"), QueryAnswer(samples=b""), QueryAnswer(error="no condition")],
+)
+def test_an_answer_is_decoded_as_it_was_encoded(answer: QueryAnswer) -> None:
+    assert decode_query_answer(json.dumps(encode_query_answer(answer))) == answer
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"codec": "steps"},
+        {"samples": None},
+        {"url": "https://there"},
+        {"samples": "%"},
+        {"n": "many"},
+        {"fields": [1]},
+        {"absent": [1]},
+        {"reason": 1},
+    ],
+)
+def test_an_invalid_answer_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ContractError):
+        decode_query_answer(json.dumps({**encode_query_answer(ANSWER), **change}))
+
+
+def test_samples_are_unpacked_as_they_were_packed() -> None:
+    assert unpacked_samples(SAMPLES) == (TIMES_US, COLUMNS)
+    assert unpacked_samples(packed_samples([], {})) == ([], {})
+    with pytest.raises(ContractError, match="packs"):
+        unpacked_samples(SAMPLES[:-3])
+
+
+# Every decoder accepts a valid message and raises `ContractError` for any other input.
+
+DECODERS = [decode_batch, decode_live, decode_pong]
+decoders = st.sampled_from(DECODERS)
+
+
+# Values of boto3 and Python that JSON does not have.
+python_values = json_values | st.decimals() | st.binary(max_size=8) | st.sets(st.integers(), max_size=2)
+awkward = st.sampled_from(
+    [
+        Decimal("NaN"),
+        Decimal("sNaN"),
+        Decimal("Infinity"),
+        Decimal("1E+125"),
+        Decimal("1E+999999999999"),
+        Decimal("1E-130"),
+        Decimal("1.0"),
+        Decimal("-0"),
+        10**5000,
+        2**53,
+        2**63,
+        1e308,
+        math.nan,
+        math.inf,
+        -0.0,
+        "",
+        "1",
+        b"1",
+        bytearray(b"1"),
+        (),
+        "\ud800",
+        object(),
+    ]
+)
+
+
+def envelopes():
+    return st.sampled_from([encode_batch(GOOD), encode_live(GOOD_LIVE)]).map(json.loads)
+
+
+@given(decoders, st.binary(max_size=200))
+def test_any_bytes_are_decoded_or_refused(decoder, message):
+    decode_or_refuse(decoder, message)
+
+
+@given(decoders, st.text(st.characters(), max_size=200))
+def test_any_text_is_decoded_or_refused(decoder, message):
+    decode_or_refuse(decoder, message)
+
+
+@given(decoders, json_values)
+def test_any_json_is_decoded_or_refused(decoder, value):
+    decode_or_refuse(decoder, json.dumps(value))
+    decode_or_refuse(decoder, json.dumps(value).encode("utf-16"))
+
+
+@given(st.sampled_from(DECODERS[:2]), st.dictionaries(st.text(max_size=4), python_values, max_size=4))
+def test_any_table_item_is_decoded_or_refused(decoder, item):
+    decode_or_refuse(decoder, item)
+
+
+@examples(300)
+@given(st.data(), python_values | awkward)
+def test_a_message_with_one_key_replaced_is_decoded_or_refused(data, value):
+    envelope = data.draw(envelopes())
+    envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
+    for decoder in DECODERS[:2]:
+        decode_or_refuse(decoder, envelope)
+
+
+@examples(200)
+@given(st.data(), json_values)
+def test_a_text_with_one_key_replaced_is_decoded_or_refused(data, value):
+    envelope = data.draw(envelopes())
+    envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
+    for decoder in DECODERS:
+        decode_or_refuse(decoder, json.dumps(envelope))
+
+
+@pytest.mark.parametrize("good", [encode_batch(GOOD), encode_live(GOOD_LIVE)], ids=["batch", "live"])
+def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
+    decoder = decode_batch if b"codec" in good else decode_live
+    for key in json.loads(good):
+        envelope = json.loads(good)
+        del envelope[key]
+        with pytest.raises(ContractError, match=key):
+            decoder(json.dumps(envelope))
+
+
+@examples(300)
+@given(batches(), st.data())
+def test_a_damaged_message_is_decoded_or_refused(batch, data):
+    message = bytearray(encode_batch(batch))
+    at = data.draw(st.integers(0, len(message) - 1))
+    message[at] = data.draw(st.integers(0, 255))
+    decode_or_refuse(decode_batch, bytes(message))
+    decode_or_refuse(decode_batch, bytes(message[:at]))
+
+
+@examples(200)
+@given(st.data())
+def test_damaged_compressed_samples_are_decoded_or_refused(data):
+    envelope = json.loads(encode_batch(GOOD))
+    packed = bytearray(base64.b64decode(envelope["samples"]))
+    at = data.draw(st.integers(0, len(packed) - 1))
+    packed[at] ^= data.draw(st.integers(1, 255))
+    decode_or_refuse(decode_batch, dict(envelope, samples=base64.b64encode(packed).decode()))
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"null",
+        b"\xef\xbb\xbf{}",
+        b"\xed\xa0\x80",
+        b'{"v":' + b"[" * DEEP,
+        b'{"v":' + b"[" * 900 + b"]" * 900 + b"}",
+        b'{"v":1e999}',
+        b'{"v":NaN}',
+        b'{"v":1,"seq":' + b"9" * 5000 + b"}",
+        "\ud800",
+        '{"v":"\ud800"}',
+        None,
+        7,
+        [],
+    ],
+)
+def test_an_invalid_message_is_refused(decoder, message):
+    with pytest.raises(ContractError):
+        decoder(message)
+
+
+def test_the_error_for_a_long_value_is_short():
+    with pytest.raises(ContractError) as caught:
+        decode_batch(dict(json.loads(encode_batch(GOOD)), codec="x" * 10_000))
+    assert len(str(caught.value)) < 200
+
+
+def test_the_contracts_error_is_a_value_error():
+    assert issubclass(ContractError, ValueError)
+
+
+# Findings survive JSON, and anything else is refused.
+
+FINDING = Finding(
+    drive=DriveKey("car7", 1_700_000_000_000_000, "00c0ffee"),
+    kind="battery_worn",
+    severity="warning",
+    subject="battery_resistance_ohm",
+    from_us=1_700_000_000_000_000,
+    to_us=1_700_000_060_000_000,
+    stream="vesc",
+    fields=("voltage_input", "current_input"),
+    text="the internal resistance has grown",
+    effect=Estimate(0.03, 0.02, 0.04, "ohm"),
+    p=0.001,
+)
+
+
+def test_a_finding_survives_json() -> None:
+    assert decode_finding(json.loads(json.dumps(encode_finding(FINDING)))) == FINDING
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fields": "voltage_input"},
+        {"p": "small"},
+        {"p": 10**400},
+        {"effect": {"value": 1}},
+        {"kind": 7},
+        {"run": None},
+    ],
+)
+def test_what_is_no_finding_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ContractError):
+        decode_finding({**encode_finding(FINDING), **change})
+
+
+def test_a_whole_number_is_a_float_too() -> None:
+    assert repr(decode_finding({**encode_finding(FINDING), "p": 0}).p) == "0.0"
+
+
+def test_every_parameter_names_a_kind_that_exists() -> None:
+    assert {parameter.kind for parameter in PARAMETERS.values()} - {""} <= KINDS.keys()
+
+
+# Notes survive their row of the table, by time, and anything else is refused.
+
+FIRST_NOTE_US = 1_700_000_000_000_000
+
+
+def note(seconds: int = 0, **given: Any) -> Note:
+    told = {"robot": "car7", "text": "changed tyre", "by": "ada@lab", "salt": f"{seconds:08x}"}
+    return Note(t_us=FIRST_NOTE_US + seconds * 1_000_000, **{**told, **given})
+
+
+class OneTable:
+    """The calls of DynamoDB's client that the table of findings makes."""
+
+    def __init__(self) -> None:
+        self.items: dict[tuple[str, str], Any] = {}
+
+    def put_item(self, *, TableName: str, Item: Any) -> None:
+        self.items[Item["robot"]["S"], Item["finding"]["S"]] = Item
+
+    def delete_item(self, *, TableName: str, Key: Any, ReturnValues: str) -> dict[str, Any]:
+        found = self.items.pop((Key["robot"]["S"], Key["finding"]["S"]), None)
+        return {} if found is None else {"Attributes": found}
+
+    def query(self, **query: Any) -> dict[str, Any]:
+        robot, first, last = (
+            query["ExpressionAttributeValues"][f":{n}"]["S"] for n in ("robot", "first", "last")
+        )
+        keys = sorted(key for key in self.items if key[0] == robot and first <= key[1] <= last)
+        return {"Items": [self.items[key] for key in reversed(keys)]}
+
+
+def test_notes_are_rows_beside_the_findings() -> None:
+    table = FindingsTable(OneTable(), "findings")
+    table.put_finding(FINDING)
+    for seconds in (0, 60, 120):
+        table.put_note(note(seconds))
+    table.put_note(note(text="another car", robot="car8"))
+    assert [one.id for one in table.notes("car7")] == [note(s).id for s in (120, 60, 0)]
+    # From a time, inclusive, to a time, exclusive.
+    assert list(table.notes("car7", FIRST_NOTE_US, FIRST_NOTE_US + 120_000_000, most=1)) == [note(60)]
+    assert list(table.findings("car7")) == [FINDING]
+    assert list(table.drives("car7")) == []
+    assert table.remove_note("car7", note(60).id)
+    assert not table.remove_note("car7", note(60).id)
+    assert list(table.notes("car7")) == [note(120), note(0)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"text": " "},
+        {"text": "x" * (MAX_NOTE_CHARACTERS + 1)},
+        {"by": "x" * 65},
+        {"t_us": -1},
+        {"t_us": 10**16},
+        {"salt": "XYZ"},
+        {"robot": "car 7"},
+    ],
+)
+def test_what_is_no_note_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ContractError):
+        decode_note({**encode_note(note()), **change})
+    with pytest.raises(ContractError):
+        encode_note(decode_note({**vars(note()), **change}))
