@@ -26,7 +26,7 @@ from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.analysis import RUNNING, SUCCEEDED, Progress
 from iort_station.page import insights
-from tests.unit.contract.test_messages import FIRST_US, OneTable
+from tests.unit.contract.test_messages import FIRST_NOTE_US, OneTable
 from tests.unit.functions.test_analysis import finding
 
 TOO_SHORT = "the drive must last 240 s"
@@ -89,13 +89,13 @@ def table(monkeypatch):
 
 def test_the_page_writes_lists_and_deletes_notes(table):
     for at in (0, 60):
-        asked = {"robot": "car7", "text": f" after {at} s ", "t_us": str(FIRST_US + at * 1_000_000)}
+        asked = {"robot": "car7", "text": f" after {at} s ", "t_us": str(FIRST_NOTE_US + at * 1_000_000)}
         told = insights.write_note(None, asked)["notes"]
-    assert [(one["t_us"] - FIRST_US, one["text"]) for one in told] == [
+    assert [(one["t_us"] - FIRST_NOTE_US, one["text"]) for one in told] == [
         (60_000_000, "after 60 s"),
         (0, "after 0 s"),
     ]
-    part = {"robot": "car7", "from_us": str(FIRST_US), "to_us": str(FIRST_US + 1)}
+    part = {"robot": "car7", "from_us": str(FIRST_NOTE_US), "to_us": str(FIRST_NOTE_US + 1)}
     assert [one["text"] for one in insights.notes(None, part)["notes"]] == ["after 0 s"]
     assert insights.remove_note(None, {"robot": "car7", "id": told[0]["id"]})["notes"] == told[1:]
 
@@ -106,7 +106,7 @@ def test_a_wrong_note_is_refused_and_nothing_is_written(table):
     with pytest.raises(UsageError, match="must be the id of a note"):
         stored.remove_note(None, "car7", "parameters#1")
     with pytest.raises(StationError, match="has no note"):
-        stored.remove_note(None, "car7", f"{FIRST_US}-00000000")
+        stored.remove_note(None, "car7", f"{FIRST_NOTE_US}-00000000")
     assert table.items == {}
 
 
