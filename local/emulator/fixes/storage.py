@@ -226,7 +226,7 @@ def close_own_paths() -> None:
       (https://docs.aws.amazon.com/IAM/latest/UserGuide/reference_sigv.html).
     ministack: answers unsigned requests below /_ministack/. One erases everything, others show the messages
       of queues and the code of functions, or change settings, whoever on this machine asks.
-    Test: tests/local/emulator/test_own_paths.py::test_nobody_erases_or_reads_a_cloud_without_a_signature
+    Test: tests/local/emulator/test_object_fixes.py::test_nobody_erases_or_reads_a_cloud_without_a_signature
     Patch: none; ministack's own users want these addresses
     """
     app.app = _refusing(app.app)

@@ -212,7 +212,7 @@ def unreadable_payload() -> bool:
 
 
 def queue_lock() -> bool:
-    """Send a message, and check whether the lock was taken. (test_queue_fixes.py loses messages.)"""
+    """Send a message, and check whether the lock was taken. (test_object_fixes.py loses messages.)"""
     lock = MagicMock()
     with patch.object(sqs, "_queues_lock", lock), request_scope("000000000000", "eu-west-1"):
         url = sqs._act_create_queue({"QueueName": "gaps-queue-lock"}, "")["QueueUrl"]
