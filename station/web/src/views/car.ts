@@ -25,7 +25,8 @@ import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { may } from "../server/admission";
 import { NotesPanel } from "../widgets/notes_panel";
-import type { Services, Speed, View } from "./view";
+import type { Speed } from "../widgets/status_bar";
+import type { Services, View } from "./view";
 
 // Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;

@@ -8,6 +8,7 @@ import type { Looks } from "../link/viewing";
 import type { Alarms } from "../live/alarms";
 import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
+import type { Speed } from "../widgets/status_bar";
 
 /** What the page has for its views. */
 export interface Services {
@@ -20,12 +21,6 @@ export interface Services {
   readonly drive: DrivePanel;
   /** The view has other contents: the page arranges it again. */
   readonly changed: () => void;
-}
-
-/** A speed as the bar shows it. */
-export interface Speed {
-  readonly text: string;
-  readonly old: boolean;
 }
 
 /** A view. What one does not have, it does not need. */

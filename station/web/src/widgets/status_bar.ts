@@ -8,7 +8,6 @@ import type { Viewing } from "../link/viewing";
 import type { LinkState } from "../link/worker_messages";
 import type { Alarms } from "../live/alarms";
 import type { Fleet } from "../live/fleet";
-import type { Speed } from "../views/view";
 
 const UNABLE =
   "This page can only listen: a car sends a value every few seconds until somebody else looks at it more closely.";
@@ -19,6 +18,12 @@ const WORDS = {
   live: "Connected",
   lost: "Connection lost",
 } as const;
+
+/** A speed as the bar shows it. */
+export interface Speed {
+  readonly text: string;
+  readonly old: boolean;
+}
 
 export class StatusBar {
   private reconnected: { readonly at: number; readonly downFor: number } | undefined;
