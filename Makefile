@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-all test-fast test-oldest mutants check setup prove-mixed wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -40,8 +40,10 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadsc
 test: setup ## run every test but the heaviest: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(PYTEST) -m "not heavy"
 
-test-all: setup ## run every test, also those of minutes, which CI runs: options as for test
-	@$(PYTEST)
+test-heavy: setup ## run the scenarios that take minutes: options as for test
+	@$(PYTEST) -m heavy
+
+test-all: test test-heavy ## run every test, as CI does: options as for test
 
 test-fast: setup ## run the unit tests that need no emulator, browser or ROS: while you work, WORKERS=2
 	@$(BIN)/python -m pytest tests/unit --numprocesses $(or $(WORKERS),2) --dist loadscope --no-loadscope-reorder \
