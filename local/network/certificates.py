@@ -8,19 +8,24 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import trustme
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from iort_station.output import write_private
+from iort_agent.common.private_files import write_below
 from local.processes import LocalError
 
 # A server's certificate in the network, and what is left of it when it gets a new one.
 LASTS_S = 90 * 86_400.0
 RENEWED_S = 30 * 86_400.0
+
+
+def _write(path: Path, content: bytes) -> None:
+    """A file for its owner alone. The robot's tests have no station, whose writer would do."""
+    write_below(path.parent, PurePath(path.name), content, sync=True)
 
 
 class Authority:
@@ -35,8 +40,8 @@ class Authority:
             return
         self._authority = trustme.CA(organization_name="iort", organization_unit_name="this machine")
         if folder is not None:
-            write_private(own, self.pem.encode())
-            write_private(key, self._authority.private_key_pem.bytes())
+            _write(own, self.pem.encode())
+            _write(key, self._authority.private_key_pem.bytes())
 
     @property
     def pem(self) -> str:
@@ -52,7 +57,7 @@ class Authority:
         leaf = self.issue(name, *hosts)
         certificate_path, key_path = folder / f"{name}.pem", folder / f"{name}.key"
         certificate_path.write_bytes(leaf.cert_chain_pems[0].bytes() + self.pem.encode())
-        write_private(key_path, leaf.private_key_pem.bytes())
+        _write(key_path, leaf.private_key_pem.bytes())
         return certificate_path, key_path
 
     def issue(self, name: str, *hosts: str, lasts_s: float | None = None) -> trustme.LeafCert:
@@ -114,7 +119,7 @@ class ServerCertificate:
         if self.path.exists() and self._good():
             return False
         leaf = self.authority.issue(self.name, *self.hosts, lasts_s=self.lasts_s)
-        write_private(self.path, leaf.private_key_and_cert_chain_pem.bytes() + self.authority.pem.encode())
+        _write(self.path, leaf.private_key_and_cert_chain_pem.bytes() + self.authority.pem.encode())
         return True
 
     def context(self) -> ssl.SSLContext:

@@ -62,7 +62,8 @@ def write_below(
     """Write a file, or replace the file or link of that name. Returns its modification time in nanoseconds,
     as the file system rounds it.
 
-    With ``sync`` the content is on the disk before the file gets its name. Raises `OSError`.
+    With ``sync`` the content is on the disk before the file gets its name, and the name when this returns.
+    Raises `OSError`.
     """
     with folder_of(root, name, make=True) as folder:
         # Nobody can guess this name, so nobody can take it first.
@@ -79,6 +80,8 @@ def write_below(
                     os.fsync(descriptor)
                 written_ns = os.fstat(descriptor).st_mtime_ns
             os.replace(temporary, name.name, src_dir_fd=folder, dst_dir_fd=folder)
+            if sync:
+                os.fsync(folder)
         except BaseException:
             with contextlib.suppress(OSError):
                 os.unlink(temporary, dir_fd=folder)
