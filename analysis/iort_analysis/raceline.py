@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.results import AnalysisError
+from iort_analysis import AnalysisError
 from iort_analysis.statistics import quadratic
 from iort_contract.track import Track
 

@@ -14,14 +14,6 @@ from iort_contract.messages.analysis import DriveKey, Estimate, decode_estimate,
 # The package's exceptions.
 
 
-class AnalysisError(Exception):
-    """The root of the package's exceptions."""
-
-
-class ArchiveError(AnalysisError):
-    """An object of the archive that is missing or damaged; the text says which."""
-
-
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
 Table: TypeAlias = Mapping[str, NDArray[Any]]
 

@@ -125,13 +125,13 @@ def calibration(robot: str, _body: Mapping[str, Any]) -> dict[str, Any]:
 def raceline(robot: str, body: Mapping[str, Any]) -> dict[str, Any]:
     """The line from a ``track`` and a ``car``. Raises `RefusedError` for what is neither."""
     # Only here is numpy needed.
+    from iort_analysis import AnalysisError  # noqa: PLC0415 - see above
     from iort_analysis.raceline import (  # noqa: PLC0415 - see above
         Limits,
         least_curvature,
         profile,
         reference,
     )
-    from iort_analysis.results import AnalysisError  # noqa: PLC0415 - see above
 
     try:
         track, car = _track(body.get("track")), _car(robot, body.get("car", {}))

@@ -63,7 +63,7 @@ def test_one_of_two_simultaneous_nodes_waits_and_neither_ends(graph: Graph) -> N
     def settled() -> bool:
         """Whether one has the name and all messages during 200 of them."""
         holder, before = registered(graph, "/iort_agent"), [newest(one) for one in both]
-        until(lambda: newest(*both) >= max(before) + 200, seconds=WAIT_S)
+        until(lambda: newest(*both) >= max(before) + 200, within_s=WAIT_S)
         heard = [newest(one) > n for one, n in zip(both, before, strict=True)]
         return heard.count(True) == 1 and registered(graph, "/iort_agent") == holder
 
@@ -88,15 +88,15 @@ def test_a_shut_down_node_ends_the_source(graph: Graph) -> None:
 
 def test_the_status_names_the_waiting_source_and_other_sources_continue(graph: Graph, tmp_path: Path) -> None:
     taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
-    until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
+    until(lambda: registered(graph, "/iort_agent"), within_s=WAIT_S)
     agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
     (alarm,) = until(agent.waits, within_s=WAIT_S)
     assert alarm.startswith(f"source waits: {WAITS}")
     assert alarm.endswith("set sources[].node")
     before = agent.samples("vesc")
-    until(lambda: agent.samples("vesc") > before, seconds=WAIT_S)
+    until(lambda: agent.samples("vesc") > before, within_s=WAIT_S)
     taker.kill()
-    until(lambda: agent.waits() == [], seconds=WAIT_S)
+    until(lambda: agent.waits() == [], within_s=WAIT_S)
     assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
 
 
@@ -110,7 +110,7 @@ def test_roslaunch_arguments_are_honoured(graph: Graph, tmp_path: Path) -> None:
     graph.environment["ROS_MASTER_URI"] = master
     agent.process.until_said("_rate:=5 is ignored")
     Cars(graph).publisher("pub", topic="/robot1/wheel")
-    until(lambda: agent.samples("wheel") > 5, seconds=WAIT_S)
+    until(lambda: agent.samples("wheel") > 5, within_s=WAIT_S)
     assert registered(graph, "/lab/recorder").startswith("http://127.0.0.1:")
     assert registered(graph, "/iort_agent") == ""
     # Its log line has the topic's name in the graph.

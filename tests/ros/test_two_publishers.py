@@ -60,7 +60,7 @@ def stored(
                 return {}  # the agent is too busy to answer
             return {name: streams.get(name, {}).get("samples", 0) for name in SENT}
 
-        until(lambda: samples_by_stream() == SENT, seconds=300)
+        until(lambda: samples_by_stream() == SENT, within_s=300)
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()

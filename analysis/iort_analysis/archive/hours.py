@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from iort_analysis.results import ArchiveError
+from iort_analysis import ArchiveError
 from iort_analysis.samples.batches import Item, Part, RefusedItems, Wanted
 from iort_analysis.samples.blocks import join
 from iort_analysis.samples.seconds import Batches, batches_of

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
+from iort_analysis import ArchiveError
 from iort_analysis.archive.hours import Archive, HourFile, Stores, is_expiring, key_of, merged, within
-from iort_analysis.results import ArchiveError
 from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
 from iort_analysis.samples.blocks import Block, join
 from iort_analysis.samples.seconds import Batches, batches_of

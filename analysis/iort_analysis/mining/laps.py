@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import AnalysisError
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.paths import Crossings, Floats, Gate, Path, find_gate, path_of
 from iort_analysis.mining.patterns import find_pattern, odometer
-from iort_analysis.results import AnalysisError, Mined, Table
+from iort_analysis.results import Mined, Table
 from iort_analysis.statistics.distributions import mean_of, sides
 from iort_contract.catalog.analysis import LAPS_TABLE, PARAMETERS, PLACES_TABLE
 from iort_contract.messages.analysis import Estimate

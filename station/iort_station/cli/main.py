@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_analysis.results import AnalysisError
+from iort_analysis import AnalysisError
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cli.options import CloudOptions, say
 from iort_station.cli.verbs import Verbs

@@ -10,8 +10,9 @@ from itertools import islice
 
 import numpy as np
 
+from iort_analysis import AnalysisError
 from iort_analysis.mining.laps import compare
-from iort_analysis.results import AnalysisError, Mined
+from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
 from iort_contract.catalog.analysis import ANALYSIS_FAILED, GROUPS, KINDS, LAPS_TABLE, PLACES_TABLE
 from iort_contract.messages.analysis import AnalysedDrive, AnalysisRequest, Estimate, Finding

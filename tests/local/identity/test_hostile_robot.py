@@ -81,7 +81,7 @@ def test_each_of_a_thousand_unmatched_messages_is_kept_once(embedded, bundle):
         for message in sent:
             robot.publish(record_topic(car.robot, VESC_STREAM), message)
     until(
-        lambda: sum(1 for _ in quarantine.entries(embedded.cloud, robot=car.robot)) == len(sent), seconds=300
+        lambda: sum(1 for _ in quarantine.entries(embedded.cloud, robot=car.robot)) == len(sent), within_s=300
     )
     assert kept(embedded, car.robot) == dict.fromkeys(sent, 1)
 

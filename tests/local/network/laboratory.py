@@ -55,7 +55,7 @@ class Laboratory:
                 cwd=ROOT,
                 log=self.folder / "up.log",
             )
-            self.wait_ready = lambda: until(lambda: self._is_ready(told_by), seconds=400)
+            self.wait_ready = lambda: until(lambda: self._is_ready(told_by), within_s=400)
             try:
                 if ready:
                     self.wait_ready()

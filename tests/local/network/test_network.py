@@ -98,7 +98,7 @@ def test_a_first_deployment_that_a_kill_interrupts_is_made_up_for(laboratory):
     log = laboratory.state / "cdk-deploy.log"
     with laboratory.running(ready=False):
         # The middle one of eight stacks.
-        until(lambda: log.exists() and "processing: creating stack" in log.read_text(), seconds=400)
+        until(lambda: log.exists() and "processing: creating stack" in log.read_text(), within_s=400)
         laboratory.kill()
     with laboratory.running():
         assert "registered" in laboratory.iort("robots", "add", "car0", "--out", str(laboratory.folder))

@@ -62,5 +62,5 @@ def test_expensive_batches_of_one_robot_do_not_delay_other_robots(embedded, bund
     stored = list(audit.batches(embedded.cloud, bad.robot, VESC_STREAM))
     assert [batch.seq for batch in stored] == list(range(count))
     # After the robot has stopped, the waiting batches are summarised automatically.
-    until(lambda: len(seconds_of(embedded, bad.robot)) >= count, seconds=600)
+    until(lambda: len(seconds_of(embedded, bad.robot)) >= count, within_s=600)
     assert [s - first for s in seconds_of(embedded, good.robot)] == list(range(len(expected)))

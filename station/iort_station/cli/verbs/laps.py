@@ -129,8 +129,8 @@ def _as_json(run: RunLaps) -> dict[str, Any]:
 
 
 def _compare(run: RunLaps, one: int, other: int, *, file: Path | None, force: bool, as_json: bool) -> None:
+    from iort_analysis import AnalysisError  # noqa: PLC0415 - as above
     from iort_analysis.mining.laps import compare  # noqa: PLC0415 - as above
-    from iort_analysis.results import AnalysisError  # noqa: PLC0415 - as above
 
     places = run.mined.tables.get(PLACES_TABLE)
     if places is None:

@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from iort_analysis import AnalysisError
 from iort_analysis.mining import laps, style
 from iort_analysis.mining.laps import Laps, compare, find_laps
 from iort_analysis.mining.paths import path_of
-from iort_analysis.results import AnalysisError
 from iort_analysis.samples.blocks import Block
 from tests.unit.analysis.drives import START_US, Driven, crossed_s, driven, sampled
 
