@@ -103,9 +103,9 @@ class Page {
           "p",
           { class: "read-only", role: "status" },
           el("b", {}, "Read-only"),
-          `: ${why.replace(/\.$/, "")}. The command `,
+          `: ${why.split(":")[0]}. A link of `,
           el("code", {}, "iort invite"),
-          " prints a link that gives one more browser the stop, the wheel and every other action.",
+          " gives one more browser the stop, the wheel and every other action.",
         ),
       );
     for (const tab of TABS) byId(`to-${tab}`).setAttribute("href", route({ view: tab }));

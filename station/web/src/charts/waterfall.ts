@@ -59,7 +59,7 @@ export class Waterfall {
               class: "label",
               title: "from leaving the car to arriving at the page, which then has to draw it",
             },
-            `median of ${MEDIAN_S} s, car to page`,
+            "car to page",
           ),
           this.median.node,
           el("span", { class: "unit" }, "ms"),
