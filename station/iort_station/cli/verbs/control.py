@@ -110,8 +110,8 @@ def _message(text: str) -> dict[str, Any]:
 # that are named are stopped before anything is looked up.
 
 _POLL_S, _AGAIN_S = 0.1, 2.0
-# A robot that is connected answers sooner.
-_SOON_S = 1.0
+# A robot that is connected answers sooner, and so does the registry.
+_SOON_S, _LOOK_S = 1.0, 0.5
 _ELSEWHERE = (
     f"By itself ends what a stick drives, {DRIVE_LEASE_MS / 1000:g} s after the last command that the car "
     f"got, and what `iort send` moves, at the end of its lease: {MAX_LEASE_MS / 1000:g} s at most. A planner "
@@ -150,9 +150,14 @@ def stop(
     sent = [name for name in names if name not in failed]
     if names and not sent:
         _not_done("; ".join(f"{name}: {why}" for name, why in failed.items()), release=release)
-    if sent:
-        say(f"{'release' if release else 'stop'} sent to {', '.join(sent)}")
     lookup = _Lookup(cloud, sent, presence)
+    # Words may wait for the registry, and the stop itself never does.
+    lookup.known.wait(_LOOK_S)
+    strangers = dict(lookup.strangers)
+    for why in strangers.values():
+        say(why)
+    if heard := [name for name in sent if name not in strangers]:
+        say(f"{'release' if release else 'stop'} sent to {', '.join(heard)}")
     answers = dict.fromkeys(names) | _wait(cloud, lookup, sent, seconds, release=release, everyone=everyone)
     failed |= lookup.strangers
     stays = {name for name, one in answers.items() if everyone and release and one and one.alone}
@@ -208,19 +213,23 @@ def _motion(cloud: Cloud, names: Iterable[str]) -> dict[str, Motion | None]:
 
 class _Lookup(threading.Thread):
     """What the registry knows of robots that were stopped, while they answer: nothing waits for it but who
-    does not answer. ``strangers`` has the names that nobody registered, whose stop is taken back; ``away``
-    those that are not connected."""
+    does not answer. ``strangers`` has the names that nobody registered, whose stop is taken back: they are
+    ``known`` first. ``away`` has those that are not connected."""
 
     def __init__(self, cloud: Cloud, names: list[str], presence: Mapping[str, RobotPresence]) -> None:
         super().__init__(daemon=True)
         self._cloud, self._names = cloud, names
         self.strangers: dict[str, str] = {}
+        self.known = threading.Event()
         self.away = {name for name in names if name in presence and not presence[name]["online"]}
-        if not presence:
+        if presence:
+            self.known.set()
+        else:
             self.start()
 
     def run(self) -> None:
         self.strangers = stopping.take_back(self._cloud, self._names)
+        self.known.set()
         for name in self._names:
             with suppress(StationError, BotoCoreError, ClientError):
                 if name not in self.strangers and not registry.get(self._cloud, name).get(ONLINE):

@@ -326,8 +326,10 @@ def test_a_robot_that_is_away_is_not_waited_for_nor_said_to_stand(cloud):
     assert done.exit_code == 0
 
 
-def test_a_stranger_is_no_stopped_robot(cloud):
+def test_a_stranger_is_no_stopped_robot_and_said_before_anything_else(cloud):
     done = iort_stop(cloud, "car9", "--seconds", str(GUARD_S))
+    assert done.stderr.startswith("iort: robot car9 is not registered; the nearest: car")
+    assert "sent to" not in done.stderr
     assert "car9: NOT STOPPED: robot car9 is not registered" in done.stdout
     assert done.exit_code == 1
     assert "car9" not in cloud.states
