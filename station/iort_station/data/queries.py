@@ -20,15 +20,7 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.questions import (
-    FIRST_US,
-    LAST_US,
-    QueryAnswer,
-    QueryRequest,
-    decode_query_answer,
-    encode_query_request,
-    unpacked_samples,
-)
+from iort_contract.messages import questions
 from iort_contract.ros1.message import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud, invoke
@@ -248,11 +240,11 @@ def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterat
 
     Raises `StationError` if the function fails, and at the end for a field that no sample has.
     """
-    request = QueryRequest(
+    request = questions.QueryRequest(
         selection.robot,
         selection.stream,
-        FIRST_US if selection.start_us is None else selection.start_us,
-        LAST_US if selection.end_us is None else selection.end_us,
+        questions.FIRST_US if selection.start_us is None else selection.start_us,
+        questions.LAST_US if selection.end_us is None else selection.end_us,
         selection.fields,
         selection.where,
         reading.scan,
@@ -282,11 +274,11 @@ def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterat
         yield Block(block.times_us, {name: block.columns[name] for name in names})
 
 
-def _invoke(cloud: Cloud, request: QueryRequest) -> QueryAnswer:
-    event = encode_query_request(request)
+def _invoke(cloud: Cloud, request: questions.QueryRequest) -> questions.QueryAnswer:
+    event = questions.encode_query_request(request)
     text = invoke(cloud, "processing", "QueryFunction", event, "the query function")
     try:
-        answer = decode_query_answer(text)
+        answer = questions.decode_query_answer(text)
     except ContractError as error:
         raise StationError(f"{error}: deploy the current stacks") from error
     if answer.error:
@@ -294,9 +286,9 @@ def _invoke(cloud: Cloud, request: QueryRequest) -> QueryAnswer:
     return answer
 
 
-def _unpacked(cloud: Cloud, answer: QueryAnswer) -> Block:
+def _unpacked(cloud: Cloud, answer: questions.QueryAnswer) -> Block:
     packed = _download(cloud, str(answer.url)) if answer.samples is None else answer.samples
-    times_us, columns = unpacked_samples(packed)
+    times_us, columns = questions.unpacked_samples(packed)
     times = np.array(times_us, dtype=np.int64)
     return Block(times, {name: column_of(column) for name, column in columns.items()})
 

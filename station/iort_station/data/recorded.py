@@ -18,35 +18,13 @@ from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Pages, Sour
 from iort_analysis.samples.batches import ATTRIBUTES, Item, RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, objects
 from iort_analysis.samples.seconds import reach, summarized
-from iort_contract import expression
+from iort_contract import dynamodb, expression, tables
 from iort_contract.archive import ArchiveTable, Hour
 from iort_contract.catalog.derived import SOURCES
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.codec import flat_second
-from iort_contract.dynamodb import (
-    SummaryTable,
-    TelemetryTable,
-    deserialize,
-    seconds_between,
-    starting_between,
-    with_samples_between,
-)
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.batch import BatchId, batch_id
-from iort_contract.tables import (
-    ABSENT,
-    BATCH,
-    BATCHES,
-    EXPIRES_S,
-    GAPS,
-    MISSING_BATCHES,
-    NONFINITE,
-    RECEIVED_MS,
-    SAMPLES,
-    SECOND,
-    STATS,
-    TOPIC,
-)
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection, derive, holds
@@ -54,14 +32,14 @@ from iort_station.errors import unknown
 from iort_station.fleet import registry
 
 
-def telemetry_table(cloud: Cloud) -> TelemetryTable:
+def telemetry_table(cloud: Cloud) -> dynamodb.TelemetryTable:
     """The deployment's telemetry table."""
-    return TelemetryTable(cloud.client("dynamodb"), cloud.output("storage", "TelemetryTable"))
+    return dynamodb.TelemetryTable(cloud.client("dynamodb"), cloud.output("storage", "TelemetryTable"))
 
 
-def summary_table(cloud: Cloud) -> SummaryTable:
+def summary_table(cloud: Cloud) -> dynamodb.SummaryTable:
     """The deployment's summary table."""
-    return SummaryTable(cloud.client("dynamodb"), cloud.output("storage", "SummaryTable"))
+    return dynamodb.SummaryTable(cloud.client("dynamodb"), cloud.output("storage", "SummaryTable"))
 
 
 def topic_of(cloud: Cloud, robot: str, stream: str) -> str:
@@ -104,22 +82,29 @@ def last_reports(cloud: Cloud, robot: str) -> Iterator[Item]:
     start of its run, so that the earlier ones say nothing more."""
     recorded = Recorded(cloud, robot, ACCOUNT_STREAM)
     last: dict[str, BatchId] = {}
-    for item in recorded.headers(starting_between(None, None)):
+    for item in recorded.headers(dynamodb.starting_between(None, None)):
         with suppress(ContractError):
-            report = batch_id(item[BATCH]["S"])
+            report = batch_id(item[tables.BATCH]["S"])
             # Its number decides, since the car's clock may be set back.
             if report.boot not in last or last[report.boot].seq <= report.seq:
                 last[report.boot] = report
     for report in last.values():
         # An agent that does not batch sends a report in several messages.
-        keys = starting_between(report.t_us - MAX_BATCH_SPAN_US, report.t_us)
-        for items in recorded.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
+        keys = dynamodb.starting_between(report.t_us - MAX_BATCH_SPAN_US, report.t_us)
+        for items in recorded.items(keys, (*ATTRIBUTES, tables.RECEIVED_MS)):
             yield from items
 
 
 _SECOND_US = 1_000_000
 # The counts of a second.
-_COUNTS = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
+_COUNTS = (
+    tables.SAMPLES,
+    tables.BATCHES,
+    tables.MISSING_BATCHES,
+    tables.GAPS,
+    tables.NONFINITE,
+    tables.ABSENT,
+)
 
 
 @dataclass
@@ -184,7 +169,7 @@ def _blocks(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Bl
     stored = stored_seconds(cloud, selection, scan=reading.scan) if recorded.reads_table else iter(())
     table = Pages(stored, _second)
     first, last = _range_s(selection)
-    keys = with_samples_between(selection.start_us, selection.end_us)
+    keys = dynamodb.with_samples_between(selection.start_us, selection.end_us)
     for start_s, end_s in _spans(recorded.archived(keys)):
         start, end = max(start_s, first or start_s), min(end_s, end_s if last is None else last + 1)
         yield from map(_block_of_seconds, table.until(start))
@@ -210,7 +195,7 @@ def _computed(
 ) -> Iterator[Block]:
     """The seconds from ``first`` until ``end``, made from their batches."""
     vehicle = registry.vehicle_of(cloud, selection.robot)
-    keys = starting_between(*reach(first, end))
+    keys = dynamodb.starting_between(*reach(first, end))
     wanted = _needs(selection)
     before = recorded.before(reach(first, end)[0])
     earlier = () if before is None else recorded.batches(only(before), wanted)
@@ -221,7 +206,7 @@ def _computed(
 def _needs(selection: Selection) -> Callable[[str], bool]:
     """Which fields decide about the answer."""
     named = selection.named()
-    if selection.fields is None or ABSENT in named:
+    if selection.fields is None or tables.ABSENT in named:
         return lambda _name: True
     fields = named | {name.rpartition("_")[0] for name in named}
     fields |= {source for name in fields & SOURCES.keys() for source in SOURCES[name]}
@@ -231,7 +216,7 @@ def _needs(selection: Selection) -> Callable[[str], bool]:
 def stored_seconds(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:
     """Pages of the summary's seconds that start in the selection's range, in order of time."""
     topic = topic_of(cloud, selection.robot, selection.stream)
-    pages = summary_table(cloud).pages(topic, seconds_between(*_range_s(selection)), scan=scan)
+    pages = summary_table(cloud).pages(topic, dynamodb.seconds_between(*_range_s(selection)), scan=scan)
     if not scan:
         yield from ahead(page.items for page in pages)
     else:
@@ -246,7 +231,7 @@ def _range_s(selection: Selection) -> tuple[int | None, int | None]:
 
 
 def _second(item: Item) -> int:
-    return int(item[SECOND]["N"])
+    return int(item[tables.SECOND]["N"])
 
 
 def in_column_order(block: Block) -> Block:
@@ -260,17 +245,19 @@ def in_column_order(block: Block) -> Block:
 def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
     if name in there:
         return [name]
-    return [full for statistic in STATS if (full := f"{name}_{statistic}") in there]
+    return [full for statistic in tables.STATS if (full := f"{name}_{statistic}") in there]
 
 
 def _block_of_seconds(items: Sequence[Item]) -> Block:
     rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
-    names = dict.fromkeys(name for row in rows for name in row if name not in {TOPIC, SECOND, EXPIRES_S})
-    times = objects([row[SECOND] for row in rows]).astype("int64") * 1_000_000
+    names = dict.fromkeys(
+        name for row in rows for name in row if name not in {tables.TOPIC, tables.SECOND, tables.EXPIRES_S}
+    )
+    times = objects([row[tables.SECOND] for row in rows]).astype("int64") * 1_000_000
     return Block(times, {name: column_of([row.get(name) for row in rows]) for name in names})
 
 
 def _value(value: Any) -> Any:
     if "L" in value:
         return [_value(each) for each in value["L"]]
-    return float(value["N"]) if "N" in value else deserialize(value)
+    return float(value["N"]) if "N" in value else dynamodb.deserialize(value)

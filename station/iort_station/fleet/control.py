@@ -16,13 +16,7 @@ from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.commands import (
-    DRIVEN_BY_ANOTHER,
-    MAX_BY_CHARACTERS,
-    NO_LEASE,
-    Command,
-    encode_command,
-)
+from iort_contract.messages import commands
 from iort_contract.messages.shadow import (
     FIELDS,
     MOTION_STOPPED,
@@ -289,8 +283,8 @@ VALID_MS, ANSWER_S = 2_000, 10.0
 
 # A robot of which the registry does not yet know that it is connected may still answer.
 _ADVICE = {
-    NO_LEASE: "say by --lease-ms how long it may move, such as --lease-ms 500",
-    DRIVEN_BY_ANOTHER: "wait for the end of the other lease, or take the wheel by --takeover",
+    commands.NO_LEASE: "say by --lease-ms how long it may move, such as --lease-ms 500",
+    commands.DRIVEN_BY_ANOTHER: "wait for the end of the other lease, or take the wheel by --takeover",
 }
 
 
@@ -298,7 +292,7 @@ class Sent(NamedTuple):
     """A command that was sent. ``outcome`` is `ACCEPTED`, the robot's reason, or None without an answer;
     ``offline`` says that the registry does not know it to be connected, or is empty."""
 
-    command: Command
+    command: commands.Command
     outcome: str | None
     offline: str = ""
 
@@ -317,7 +311,7 @@ def operator() -> str:
         name = getpass.getuser()
     except (OSError, KeyError):  # no such user, as in a container
         name = "unknown"
-    return "".join(filter(str.isprintable, name))[:MAX_BY_CHARACTERS] or "unknown"
+    return "".join(filter(str.isprintable, name))[: commands.MAX_BY_CHARACTERS] or "unknown"
 
 
 def send(cloud: Cloud, robot: str, name: str, message: Mapping[str, Any], **given: Any) -> Sent:
@@ -348,7 +342,7 @@ def sending(
     now_us = time.time_ns() // 1000
     try:
         topic = build_topic(CMD, robot, name, cloud.namespace)
-        command = Command(
+        command = commands.Command(
             session=secrets.token_hex(8),
             started_us=now_us,
             seq=0,
@@ -360,7 +354,7 @@ def sending(
             by=operator(),
             takeover=takeover,
         )
-        payload = encode_command(command)
+        payload = commands.encode_command(command)
     except ContractError as error:
         raise UsageError(str(error)) from error
     shadow.data.publish(topic=topic, qos=1, payload=payload)

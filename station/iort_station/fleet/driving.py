@@ -25,28 +25,11 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.streams import DRIVE_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
-from iort_contract.messages.commands import (
-    CLOCK_UNKNOWN,
-    DRIVE_ANSWER_MS,
-    DRIVE_CLOCK_KEPT_MS,
-    DRIVE_CORRECTIONS,
-    DRIVE_ENDS,
-    DRIVE_LEASE_MS,
-    DRIVE_MARGIN_MS,
-    DRIVE_MAX_AGE_MS,
-    DRIVE_MAX_RTT_MS,
-    DRIVEN_BY_ANOTHER,
-    LOST,
-    REFUSALS,
-    STOPPED,
-    UNTIMELY,
-    Command,
-    DriveLimits,
-)
+from iort_contract.messages import commands
 from iort_contract.messages.live import LiveSample
 from iort_contract.topics import ACCEPTED
 
-_ANSWER_US = DRIVE_ANSWER_MS * 1000
+_ANSWER_US = commands.DRIVE_ANSWER_MS * 1000
 # Between two samples of the stream `drive`, at most.
 _SAMPLE_US = round(1e6 / LIVE_MAX_RATE_HZ)
 
@@ -100,7 +83,7 @@ def _bounds(
     bounds: list[tuple[int, int]], at_us: int, offset_us: int, better: Callable[[int, int], int]
 ) -> list[tuple[int, int]]:
     """The bounds that are believed, the tightest first: a newer one replaces those that it betters."""
-    young = [one for one in bounds if at_us - one[0] < DRIVE_CLOCK_KEPT_MS * 1000]
+    young = [one for one in bounds if at_us - one[0] < commands.DRIVE_CLOCK_KEPT_MS * 1000]
     return [*(one for one in young if better(one[1], offset_us) != offset_us), (at_us, offset_us)]
 
 
@@ -110,7 +93,7 @@ class Driver:
 
     def __init__(
         self,
-        limits: DriveLimits,
+        limits: commands.DriveLimits,
         by: str,
         top_mps: float,
         new_name: Callable[[], str] = lambda: secrets.token_hex(8),
@@ -181,7 +164,7 @@ class Driver:
         if stream == DRIVE_STREAM:
             self._answer(live.sample, live, now_us)
 
-    def tick(self, now_us: int) -> Command | None:
+    def tick(self, now_us: int) -> commands.Command | None:
         """The command to send now, if any; called `DRIVE_RATE_HZ` times a second."""
         still_us = now_us - (now_us if self._ticked_us is None else self._ticked_us)
         self._ticked_us = now_us
@@ -220,25 +203,25 @@ class Driver:
     def _finish(self) -> None:
         """Give the car up, if this driver may have it."""
         if self._standing or self.phase in (Phase.STARTING, Phase.DRIVING):
-            self._stops = DRIVE_ENDS
+            self._stops = commands.DRIVE_ENDS
         self._standing = self.takeover = False
 
     def _against(self, now_us: int) -> str:
         """Why the car must not be driven now."""
         if self._clockless:
-            return REFUSALS[CLOCK_UNKNOWN]
+            return commands.REFUSALS[commands.CLOCK_UNKNOWN]
         age_us = self.age_us(now_us)
         if age_us is None:
             return "nothing has been heard of the car yet"
-        if age_us > DRIVE_MAX_AGE_MS * 1000:
-            return f"the newest sample is {age_us // 1000} ms old, {DRIVE_MAX_AGE_MS} ms are allowed"
+        if age_us > commands.DRIVE_MAX_AGE_MS * 1000:
+            return f"the newest sample is {age_us // 1000} ms old, {commands.DRIVE_MAX_AGE_MS} ms are allowed"
         return ""
 
     def _unanswered(self, now_us: int) -> str:
         if self.phase is Phase.STARTING:
             return "the car does not answer" if now_us - self._began_us > _ANSWER_US else ""
         waited_us = now_us - min(self._waiting.values(), default=now_us)
-        return _slow(waited_us) if waited_us > DRIVE_MAX_RTT_MS * 1000 + _SAMPLE_US else ""
+        return _slow(waited_us) if waited_us > commands.DRIVE_MAX_RTT_MS * 1000 + _SAMPLE_US else ""
 
     def _answer(self, told: Mapping[str, Any], live: LiveSample, now_us: int) -> None:
         driver = told.get("driver")
@@ -258,7 +241,7 @@ class Driver:
             if live.offset_us is not None:
                 self._clock.answered(left_us, live.t_us + live.offset_us)
         moves = self.phase in (Phase.STARTING, Phase.DRIVING)
-        if outcome == STOPPED:
+        if outcome == commands.STOPPED:
             if moves:
                 self._end("the car was stopped")
         elif outcome != ACCEPTED:
@@ -266,39 +249,39 @@ class Driver:
                 self._refused(str(outcome), now_us)
         elif not moves:
             return
-        elif self.rtt_us is not None and self.rtt_us > DRIVE_MAX_RTT_MS * 1000:
+        elif self.rtt_us is not None and self.rtt_us > commands.DRIVE_MAX_RTT_MS * 1000:
             self._end(_slow(self.rtt_us))
         elif self.phase is Phase.STARTING:
             self.phase, self.takeover, self._standing = Phase.DRIVING, False, True
 
     def _refused(self, outcome: str, now_us: int) -> None:
-        if outcome == DRIVEN_BY_ANOTHER:
+        if outcome == commands.DRIVEN_BY_ANOTHER:
             has = "has taken over" if self._standing else "drives this car"
             self._end(f"{self.driver or 'somebody'} {has}", lost=True)
-        elif outcome in LOST:
-            self._end(REFUSALS.get(outcome, outcome), lost=True)
+        elif outcome in commands.LOST:
+            self._end(commands.REFUSALS.get(outcome, outcome), lost=True)
         elif self.phase is Phase.HOLDING:
             return  # the next command may pass
         elif (
             self.phase is Phase.STARTING
             and not self._standing
-            and outcome in UNTIMELY
-            and self._corrections < DRIVE_CORRECTIONS
+            and outcome in commands.UNTIMELY
+            and self._corrections < commands.DRIVE_CORRECTIONS
         ):
             self._corrections += 1
             self._begin(now_us)
         else:
-            self._end(REFUSALS.get(outcome, outcome))
+            self._end(commands.REFUSALS.get(outcome, outcome))
 
-    def _command(self, stick: Stick, now_us: int, *, ends: bool = False) -> Command:
+    def _command(self, stick: Stick, now_us: int, *, ends: bool = False) -> commands.Command:
         seq, limits = self._seq, self.limits
         self._seq += 1
         self._waiting[seq] = now_us
-        kept_us = _ANSWER_US + DRIVE_LEASE_MS * 1000
+        kept_us = _ANSWER_US + commands.DRIVE_LEASE_MS * 1000
         self._waiting = {one: at_us for one, at_us in self._waiting.items() if now_us - at_us < kept_us}
         top_mps = min(self.top_mps, limits.max_speed_mps)
-        lease_ms = max(1, _lease_ms(limits) - DRIVE_MARGIN_MS)
-        return Command(
+        lease_ms = max(1, _lease_ms(limits) - commands.DRIVE_MARGIN_MS)
+        return commands.Command(
             session=self._session,
             started_us=self._started_us,
             seq=seq,
@@ -315,13 +298,13 @@ class Driver:
         return now_us + (self._clock.offset_us() or 0)
 
 
-def _lease_ms(limits: DriveLimits) -> int:
+def _lease_ms(limits: commands.DriveLimits) -> int:
     """How long a command holds the car at most."""
-    return min(DRIVE_LEASE_MS, limits.lease_ms)
+    return min(commands.DRIVE_LEASE_MS, limits.lease_ms)
 
 
 def _slow(rtt_us: int) -> str:
-    return f"the round trip takes {rtt_us // 1000} ms, {DRIVE_MAX_RTT_MS} ms are allowed"
+    return f"the round trip takes {rtt_us // 1000} ms, {commands.DRIVE_MAX_RTT_MS} ms are allowed"
 
 
 def _whole(value: Any) -> int:

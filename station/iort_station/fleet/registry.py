@@ -8,24 +8,12 @@ from dataclasses import asdict
 from decimal import Decimal
 from typing import Any, NamedTuple
 
+from iort_contract import tables
 from iort_contract.catalog import derived
 from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.page import RobotPresence
-from iort_contract.tables import (
-    ADMIT_CLAIM,
-    ADMIT_FINGERPRINT,
-    ADMIT_UNTIL_S,
-    ADMITTED_CERTIFICATE,
-    ADMITTED_MS,
-    CONNECTED_MS,
-    DISCONNECTED_MS,
-    GAIN_SET_MS,
-    MOVED_FROM,
-    ONLINE,
-    ROBOT,
-)
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
@@ -37,7 +25,7 @@ F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
 def given(vehicle: Mapping[str, float]) -> dict[str, float]:
     """Vehicle parameters as somebody gave them: beside a gain its time is noted, since the analysis trusts no
     default."""
-    noted = {GAIN_SET_MS: time.time_ns() // 1_000_000} if "speed_to_erpm_gain" in vehicle else {}
+    noted = {tables.GAIN_SET_MS: time.time_ns() // 1_000_000} if "speed_to_erpm_gain" in vehicle else {}
     return {**vehicle, **noted}
 
 
@@ -64,7 +52,7 @@ def _row(item: Mapping[str, Any]) -> dict[str, Any]:
 def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
     """What is known of the cars whose speed can be told in m/s, by their names."""
     return {
-        str(row[ROBOT]): {
+        str(row[tables.ROBOT]): {
             "speed_to_erpm_gain": float(row["speed_to_erpm_gain"]),
             "speed_to_erpm_offset": float(row.get("speed_to_erpm_offset") or 0),
         }
@@ -84,9 +72,9 @@ def presence(cloud: Cloud) -> dict[str, RobotPresence]:
     """Whether each robot is ``online``, and ``since_ms`` when; None if it has never connected."""
     found: dict[str, RobotPresence] = {}
     for row in listed(cloud):
-        online = bool(row.get(ONLINE))
-        at_ms = row.get(CONNECTED_MS if online else DISCONNECTED_MS)
-        found[str(row[ROBOT])] = {"online": online, "since_ms": None if at_ms is None else int(at_ms)}
+        online = bool(row.get(tables.ONLINE))
+        at_ms = row.get(tables.CONNECTED_MS if online else tables.DISCONNECTED_MS)
+        found[str(row[tables.ROBOT])] = {"online": online, "since_ms": None if at_ms is None else int(at_ms)}
     return found
 
 
@@ -108,7 +96,7 @@ def get(cloud: Cloud, robot: str) -> dict[str, Any]:
 
 def not_registered(cloud: Cloud, robot: str) -> StationError:
     """The error for a robot that is not registered, with the names nearest to it."""
-    known = (str(row[ROBOT]) for row in listed(cloud))
+    known = (str(row[tables.ROBOT]) for row in listed(cloud))
     return unknown(f"robot {robot} is not registered", [robot], known, "iort robots list")
 
 
@@ -126,7 +114,7 @@ def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
     from boto3.dynamodb.types import TypeSerializer  # noqa: PLC0415 - see above
 
     serialize = TypeSerializer().serialize
-    item = {ROBOT: checked(robot), **row}
+    item = {tables.ROBOT: checked(robot), **row}
     numbers = {name: Decimal(repr(value)) for name, value in item.items() if isinstance(value, int | float)}
     dynamodb = cloud.client("dynamodb")
     try:
@@ -134,7 +122,7 @@ def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
             TableName=_table(cloud),
             Item={name: serialize(value) for name, value in {**item, **numbers}.items()},
             ConditionExpression="attribute_not_exists(#robot)",
-            ExpressionAttributeNames={"#robot": ROBOT},
+            ExpressionAttributeNames={"#robot": tables.ROBOT},
         )
     except dynamodb.exceptions.ConditionalCheckFailedException as error:
         raise StationError(f"robot {robot} is already registered; remove it first") from error
@@ -152,7 +140,7 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
             Key=_key(checked(robot)),
             UpdateExpression="SET " + ", ".join(f"#{name} = :{name}" for name in vehicle),
             ConditionExpression="attribute_exists(#robot)",
-            ExpressionAttributeNames={"#robot": ROBOT, **{f"#{name}": name for name in vehicle}},
+            ExpressionAttributeNames={"#robot": tables.ROBOT, **{f"#{name}": name for name in vehicle}},
             ExpressionAttributeValues={f":{name}": {"N": repr(value)} for name, value in vehicle.items()},
             ReturnValues="UPDATED_OLD",
         )
@@ -163,7 +151,7 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
 
 def set_moved(cloud: Cloud, robot: str, origin: str) -> None:
     """Note the deployment that a registered robot has come from."""
-    _update(cloud, robot, f"SET {MOVED_FROM} = :origin", {":origin": {"S": origin}})
+    _update(cloud, robot, f"SET {tables.MOVED_FROM} = :origin", {":origin": {"S": origin}})
 
 
 class ClaimId(NamedTuple):
@@ -176,11 +164,16 @@ class ClaimId(NamedTuple):
 def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) -> None:
     """Allow one certificate for a name within the time, for this claim or for any."""
     values = {":until": {"N": str(int(time.time() + for_s))}}
-    update, before = f"SET {ADMIT_UNTIL_S} = :until", f"{ADMITTED_CERTIFICATE}, {ADMITTED_MS}"
+    update, before = (
+        f"SET {tables.ADMIT_UNTIL_S} = :until",
+        f"{tables.ADMITTED_CERTIFICATE}, {tables.ADMITTED_MS}",
+    )
     if claim is None:
-        update += f" REMOVE {before}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
+        update += f" REMOVE {before}, {tables.ADMIT_CLAIM}, {tables.ADMIT_FINGERPRINT}"
     else:
-        update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint REMOVE {before}"
+        update += (
+            f", {tables.ADMIT_CLAIM} = :claim, {tables.ADMIT_FINGERPRINT} = :fingerprint REMOVE {before}"
+        )
         values[":claim"] = {"S": claim.id.lower().removeprefix("0x")}
         values[":fingerprint"] = {"S": claim.fingerprint}
     _update(cloud, robot, update, values)
@@ -188,7 +181,7 @@ def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) 
 
 def close_name(cloud: Cloud, robot: str) -> None:
     """Allow no further certificate for a name."""
-    _update(cloud, robot, f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}")
+    _update(cloud, robot, f"REMOVE {tables.ADMIT_UNTIL_S}, {tables.ADMIT_CLAIM}, {tables.ADMIT_FINGERPRINT}")
 
 
 def forget(cloud: Cloud, robot: str) -> None:
@@ -202,7 +195,7 @@ def _update(cloud: Cloud, robot: str, expression: str, values: Mapping[str, Any]
         TableName=_table(cloud),
         Key=_key(robot),
         UpdateExpression=expression,
-        ConditionExpression=f"attribute_exists({ROBOT})",
+        ConditionExpression=f"attribute_exists({tables.ROBOT})",
         **valued,
     )
 
@@ -212,4 +205,4 @@ def _table(cloud: Cloud) -> str:
 
 
 def _key(robot: str) -> dict[str, Any]:
-    return {ROBOT: {"S": robot}}
+    return {tables.ROBOT: {"S": robot}}

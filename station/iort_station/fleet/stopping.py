@@ -11,15 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_contract.messages import shadow
 from iort_contract.messages.commands import NO_MOTION, DriveLimits
-from iort_contract.messages.shadow import (
-    MOTION_STOPPED,
-    Pressed,
-    encode_fleet_released,
-    encode_release,
-    encode_stop,
-    nested,
-)
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -44,7 +37,7 @@ class Motion(NamedTuple):
     drive: DriveLimits | None
     stoppable: bool | None = None
     alone: bool = False
-    by: Pressed | None = None
+    by: shadow.Pressed | None = None
 
     @property
     def stands(self) -> bool:
@@ -71,7 +64,7 @@ def stop(cloud: Cloud, robots: Iterable[str], *, by: str, fleet: bool = False) -
     each one for which it failed. ``by`` is who stops them; ``fleet`` is a stop that the release of the fleet
     ends. Whether the names are registered is for `take_back` to see, after the stop.
     """
-    change = encode_stop(_pressed(by), fleet=fleet)
+    change = shadow.encode_stop(_pressed(by), fleet=fleet)
     return _tried(cloud, robots, lambda robot: _change(cloud, robot, change))
 
 
@@ -102,7 +95,7 @@ def release(
     ``seen_ms`` is the time of the newest stop that who releases knows of: one that was stopped again since
     then stays. None releases it in any case.
     """
-    released = encode_release(_pressed(by))
+    released = shadow.encode_release(_pressed(by))
 
     def change(robot: str) -> None:
         state = read(cloud.client("iot-data"), robot)
@@ -112,7 +105,9 @@ def release(
         if not fleet or state.desired.stops.fleet is not None or state.stop_rejected:
             # With the version, so that a stop which somebody asks for at this moment is not lost.
             alone = fleet and state.desired.stopped_alone and not state.stop_rejected
-            _change(cloud, robot, encode_fleet_released() if alone else released, version=state.version)
+            _change(
+                cloud, robot, shadow.encode_fleet_released() if alone else released, version=state.version
+            )
 
     return _changed(cloud, robots, change)
 
@@ -122,15 +117,15 @@ def repeat(cloud: Cloud, robots: Iterable[str]) -> None:
 
     def change(robot: str) -> None:
         state = read(cloud.client("iot-data"), robot)
-        stopped = state.desired.settings.get(MOTION_STOPPED)
+        stopped = state.desired.settings.get(shadow.MOTION_STOPPED)
         # With the version, so that no other change is undone.
-        _change(cloud, robot, nested({MOTION_STOPPED: stopped}), version=state.version)
+        _change(cloud, robot, shadow.nested({shadow.MOTION_STOPPED: stopped}), version=state.version)
 
     _changed(cloud, robots, change)
 
 
-def _pressed(by: str) -> Pressed:
-    return Pressed(by, time.time_ns() // 1_000_000)
+def _pressed(by: str) -> shadow.Pressed:
+    return shadow.Pressed(by, time.time_ns() // 1_000_000)
 
 
 def _change(cloud: Cloud, robot: str, desired: Mapping[str, Any], version: int | None = None) -> None:
@@ -160,10 +155,10 @@ def _tried(cloud: Cloud, robots: Iterable[str], change: Callable[[str], None]) -
 
 def _motion(cloud: Cloud, robot: str) -> Motion:
     state = read(cloud.client("iot-data"), robot)
-    rejected = state.rejected().get(MOTION_STOPPED)
-    stopped = state.reported.settings.get(MOTION_STOPPED)
+    rejected = state.rejected().get(shadow.MOTION_STOPPED)
+    stopped = state.reported.settings.get(shadow.MOTION_STOPPED)
     # A robot may also stand by its car.yaml, or since the shadow that asked for it was deleted.
-    asked = state.desired.settings.get(MOTION_STOPPED, stopped) is True and not state.stop_rejected
+    asked = state.desired.settings.get(shadow.MOTION_STOPPED, stopped) is True and not state.stop_rejected
     notes = state.desired.stops
     return Motion(
         asked=asked,

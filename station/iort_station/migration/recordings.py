@@ -16,15 +16,7 @@ from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.stored import HEADER, ahead
 from iort_analysis.archive.writing import described, write_day
 from iort_analysis.samples.batches import Item
-from iort_contract.archive import (
-    HASH,
-    ArchivedHour,
-    content_hash,
-    hour_key,
-    item_hash,
-    parse_hour,
-    refused_key,
-)
+from iort_contract import archive
 from iort_contract.dynamodb import WRITE_ITEMS, Keys, TableError, TelemetryTable, starting_between, whole
 from iort_contract.tables import BATCH, ENVELOPE, EXPIRES_S
 from iort_contract.topics import parse_topic
@@ -139,11 +131,11 @@ def copy_hours(source: Cloud, target: Cloud, topic: str) -> Hours:
     for row in archive_of(source, topic).rows():
         if row.hour in there:
             continue
-        new: ArchivedHour | None = row
+        new: archive.ArchivedHour | None = row
         if row.key and not copies.copy(row.key, row.sha256):
             # The target has another object of this day, with hours of its own.
             new = copies.copy_hour(row)
-        refused = refused_key(parse_topic(topic), parse_hour(row.hour))
+        refused = archive.refused_key(parse_topic(topic), archive.parse_hour(row.hour))
         if new and (not row.refused or copies.copy(refused)) and _put_row(target, new):
             copied += 1
         else:
@@ -151,7 +143,7 @@ def copy_hours(source: Cloud, target: Cloud, topic: str) -> Hours:
     return Hours(copied, left)
 
 
-def _put_row(target: Cloud, row: ArchivedHour) -> bool:
+def _put_row(target: Cloud, row: archive.ArchivedHour) -> bool:
     """Write a row; returns False if the target has one of this hour by now."""
     return _is_new(
         target.client("dynamodb").put_item,
@@ -187,17 +179,17 @@ class _Objects:
             self._copied[key] = self._put(key, self._read(key, sha256))
         return self._copied[key]
 
-    def copy_hour(self, row: ArchivedHour) -> ArchivedHour | None:
+    def copy_hour(self, row: archive.ArchivedHour) -> archive.ArchivedHour | None:
         """Copy an hour of a day's object into an object of its own, as before the day was joined.
 
         Returns its row; None if the target has such an object already, and is about to point to it.
         """
-        topic, hour = parse_topic(row.topic), parse_hour(row.hour)
+        topic, hour = parse_topic(row.topic), archive.parse_hour(row.hour)
         if self._day is None or self._day[0] != row.key:
             self._day = row.key, ArchiveFile(self._read(row.key, row.sha256))
         into = io.BytesIO()
         write_day({hour: self._day[1]}, into, describe=described(topic.name))
-        content, key = into.getvalue(), hour_key(topic, hour)
+        content, key = into.getvalue(), archive.hour_key(topic, hour)
         if not self._put(key, content):
             return None
         return replace(row, key=key, sha256=hashlib.sha256(content).hexdigest(), size_bytes=len(content))
@@ -273,16 +265,16 @@ def compare(
         more += (their is not None) + sum(1 for _ in theirs)
 
     audited = audit(stream, matched())
-    return Compared(len(hashes), content_hash(hashes), audited, lacking, different, more)
+    return Compared(len(hashes), archive.content_hash(hashes), audited, lacking, different, more)
 
 
 def _batches(cloud: Cloud, robot: str, stream: str, progress: BatchProgress) -> Iterator[_Batch]:
-    attributes = tuple({*ENVELOPE, *HEADER, HASH})
+    attributes = tuple({*ENVELOPE, *HEADER, archive.HASH})
     recorded = Recorded(cloud, robot, stream)
     for items in recorded.items(starting_between(None, None), attributes):
         progress(len(items))
         for item in items:
             header = {name: next(iter(item[name].values())) for name in HEADER if name in item}
-            yield _Batch(key_of(item), item_hash(dict(item)), header)
+            yield _Batch(key_of(item), archive.item_hash(dict(item)), header)
     if recorded.refused.count:
         raise StationError(f"{stream} cannot be compared: {recorded.refused.reason}")

@@ -15,24 +15,8 @@ from typing import Any
 
 import yaml
 
+from iort_contract import tables
 from iort_contract.dynamodb import Item
-from iort_contract.tables import (
-    ADMISSION,
-    ADMITTED_CERTIFICATE,
-    ALERT_PREFIX,
-    ASKED_PREFIX,
-    CONNECTED_MS,
-    DAYS,
-    ENTRY,
-    EXPIRES_S,
-    LAST_MS,
-    MOVED_FROM,
-    OVER_SHARE,
-    PRESENCE,
-    ROBOT,
-    SERIAL,
-    STREAMS,
-)
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.data import findings
@@ -42,8 +26,10 @@ from iort_station.fleet.identity import Bundle
 from iort_station.migration.plan import origin
 
 # What a registry's row says of the deployment and not of the robot.
-_STAYS = frozenset({ROBOT, MOVED_FROM, *DAYS, *PRESENCE, *ADMISSION}) - {SERIAL}
-_COUNTERS = (ALERT_PREFIX, ASKED_PREFIX)
+_STAYS = frozenset({tables.ROBOT, tables.MOVED_FROM, *tables.DAYS, *tables.PRESENCE, *tables.ADMISSION}) - {
+    tables.SERIAL
+}
+_COUNTERS = (tables.ALERT_PREFIX, tables.ASKED_PREFIX)
 
 
 def copy(source: Cloud, target: Cloud, robot: str) -> bool:
@@ -56,10 +42,10 @@ def copy(source: Cloud, target: Cloud, robot: str) -> bool:
         return False
     carried = _carried(row)
     if there is None:
-        registry.enter(target, robot, {**carried, MOVED_FROM: origin(source)})
-    elif MOVED_FROM not in there:
+        registry.enter(target, robot, {**carried, tables.MOVED_FROM: origin(source)})
+    elif tables.MOVED_FROM not in there:
         registry.set_moved(target, robot, origin(source))
-    if there is None or CONNECTED_MS not in there:
+    if there is None or tables.CONNECTED_MS not in there:
         numbers = {name: float(value) for name, value in carried.items() if isinstance(value, Decimal)}
         if there is not None and any(there.get(name) != carried[name] for name in numbers):
             registry.set_vehicle(target, robot, numbers)
@@ -75,7 +61,7 @@ def _carried(row: Mapping[str, Any]) -> dict[str, Any]:
         if name not in _STAYS and not name.startswith(_COUNTERS) and value is not None
     }
     # DynamoDB has no empty set.
-    return {**kept, **({STREAMS: set(kept[STREAMS])} if STREAMS in kept else {})}
+    return {**kept, **({tables.STREAMS: set(kept[tables.STREAMS])} if tables.STREAMS in kept else {})}
 
 
 def _copy_thing(source: Cloud, target: Cloud, robot: str) -> None:
@@ -101,7 +87,7 @@ def _desired(cloud: Cloud, robot: str) -> dict[str, Any]:
         return {}
     desired: dict[str, Any] = json.loads(answer["payload"].read()).get("state", {}).get("desired") or {}
     # Each cloud says itself what is over a robot's share of it.
-    desired.pop(OVER_SHARE, None)
+    desired.pop(tables.OVER_SHARE, None)
     return desired
 
 
@@ -123,7 +109,7 @@ def equip(target: Cloud, robot: str, bundles: Path) -> bool:
     Raises `StationError` if the folder has the bundle of another cloud.
     """
     row = registry.find(target, robot)
-    if row is None or ADMITTED_CERTIFICATE in row or CONNECTED_MS in row:
+    if row is None or tables.ADMITTED_CERTIFICATE in row or tables.CONNECTED_MS in row:
         return False
     bundle = Bundle(robot, bundles / robot)
     if bundle.config.exists():
@@ -152,25 +138,30 @@ def copy_quarantine(source: Cloud, target: Cloud, robot: str) -> int:
     wanted = lacking(source, target, robot)
     client, table = target.client("dynamodb"), target.output("storage", "QuarantineTable")
     for item in _items(source, robot) if wanted else ():
-        if item[ENTRY]["S"] in wanted:
+        if item[tables.ENTRY]["S"] in wanted:
             client.put_item(TableName=table, Item=item)
     return len(wanted)
 
 
 def lacking(source: Cloud, target: Cloud, robot: str) -> set[str]:
     """The ids of the source's messages that the target does not have."""
-    names = {"#robot": ROBOT, "#id": ENTRY, "#expires": EXPIRES_S, "#last": LAST_MS}
+    names = {
+        "#robot": tables.ROBOT,
+        "#id": tables.ENTRY,
+        "#expires": tables.EXPIRES_S,
+        "#last": tables.LAST_MS,
+    }
     keys = {"ProjectionExpression": "#id, #expires, #last", "ExpressionAttributeNames": names}
     # Of a message that was replayed the id is left.
-    there = {item[ENTRY]["S"] for item in _items(target, robot, **keys)}
+    there = {item[tables.ENTRY]["S"] for item in _items(target, robot, **keys)}
     now_s = time.time()
     return {
-        str(item[ENTRY]["S"])
+        str(item[tables.ENTRY]["S"])
         for item in _items(source, robot, **keys)
-        if LAST_MS in item
-        and item[ENTRY]["S"] not in there
+        if tables.LAST_MS in item
+        and item[tables.ENTRY]["S"] not in there
         # DynamoDB is about to delete those that have expired.
-        and (EXPIRES_S not in item or int(item[EXPIRES_S]["N"]) > now_s)
+        and (tables.EXPIRES_S not in item or int(item[tables.EXPIRES_S]["N"]) > now_s)
     }
 
 
@@ -179,7 +170,7 @@ def _items(cloud: Cloud, robot: str, **request: Any) -> Iterator[Item]:
         "TableName": cloud.output("storage", "QuarantineTable"),
         "ConsistentRead": True,
         "KeyConditionExpression": "#robot = :robot",
-        "ExpressionAttributeNames": {"#robot": ROBOT},
+        "ExpressionAttributeNames": {"#robot": tables.ROBOT},
         "ExpressionAttributeValues": {":robot": {"S": robot}},
         **request,
     }

@@ -16,21 +16,7 @@ from botocore.exceptions import ClientError
 from iort_analysis.archive.hours import DAMAGED, Archive, key_of
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import Item, RefusedItems, part
-from iort_contract.archive import (
-    ALL,
-    HOUR_REST_MS,
-    HOUR_US,
-    PENDING,
-    SWEEP,
-    TASK,
-    ArchivedHour,
-    Hour,
-    content_hash,
-    hour_of,
-    item_hash,
-    parse_hour,
-    refused_key,
-)
+from iort_contract import archive
 from iort_contract.tables import TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud, invoke
@@ -40,7 +26,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 
 # The schedule archives an hour at most this long after its end.
-_DUE_US = 2 * HOUR_US
+_DUE_US = 2 * archive.HOUR_US
 # A task takes at most ten minutes.
 _STALLED_S, _POLL_S = 660.0, 1.0
 # So many items are decoded together.
@@ -84,12 +70,12 @@ def archived_topics(cloud: Cloud) -> set[str]:
             ExpressionAttributeNames={"#topic": TOPIC},
         )
     )
-    return {item[TOPIC]["S"] for page in pages for item in page["Items"]} - set(PENDING)
+    return {item[TOPIC]["S"] for page in pages for item in page["Items"]} - set(archive.PENDING)
 
 
 def run(cloud: Cloud, topic: str) -> int:
     """Queue what is over and not archived of a stream; returns the number of hours."""
-    task = {TASK: SWEEP, TOPIC: topic, ALL: True}
+    task = {archive.TASK: archive.SWEEP, TOPIC: topic, archive.ALL: True}
     event = json.dumps(task).encode()
     answer = invoke(cloud, "archive", "ArchiveFunction", event, "the archive's function")
     return int(json.loads(answer)["tasks"])
@@ -124,7 +110,7 @@ def verify(cloud: Cloud, topic: str, progress: Callable[[int], None] = lambda _i
     found = Verified(refused=RefusedItems(topic))
     objects = _Objects(cloud)
     rows = {row.hour: row for row in Archive(stores(cloud), topic, found.refused).rows()}
-    due_us = time.time_ns() // 1000 - HOUR_REST_MS * 1000 - _DUE_US
+    due_us = time.time_ns() // 1000 - archive.HOUR_REST_MS * 1000 - _DUE_US
     pages = telemetry_table(cloud).pages(topic)
     for hour, items in groupby((item for page in pages for item in page.items), key=_hour_of):
         archived = _archived(objects, rows.pop(str(hour), None), found, progress)
@@ -137,7 +123,7 @@ def verify(cloud: Cloud, topic: str, progress: Callable[[int], None] = lambda _i
                 there.add(key)
                 if archived is not None:
                     lacking += key not in archived.hashes
-                    if archived.hashes.get(key) not in {None, item_hash(dict(item))}:
+                    if archived.hashes.get(key) not in {None, archive.item_hash(dict(item))}:
                         other.append(key)
             found.items += len(some)
             progress(len(some))
@@ -153,10 +139,10 @@ def verify(cloud: Cloud, topic: str, progress: Callable[[int], None] = lambda _i
     return found
 
 
-def _hour_of(item: Item) -> Hour | None:
+def _hour_of(item: Item) -> archive.Hour | None:
     """The hour of an item's key; None if a key begins with no time, which the archive passes over."""
     start = key_of(item)[:16]
-    return hour_of(int(start)) if len(start) == 16 and start.isascii() and start.isdigit() else None
+    return archive.hour_of(int(start)) if len(start) == 16 and start.isascii() and start.isdigit() else None
 
 
 @dataclass
@@ -168,7 +154,7 @@ class _Archived:
 
 
 def _archived(
-    objects: _Objects, row: ArchivedHour | None, found: Verified, progress: Callable[[int], None]
+    objects: _Objects, row: archive.ArchivedHour | None, found: Verified, progress: Callable[[int], None]
 ) -> _Archived | None:
     """None if the hour's object is not what the manifest says, which is said then."""
     if row is None:
@@ -197,7 +183,7 @@ class _Objects:
         self._client, self._bucket = cloud.client("s3"), cloud.output("storage", "FilesBucket")
         self._file = lru_cache(maxsize=1)(self._read)
 
-    def archived(self, row: ArchivedHour) -> _Archived:
+    def archived(self, row: archive.ArchivedHour) -> _Archived:
         """Decode an hour; raises `StationError` if it is damaged, or is not what the row says."""
         what = row.key or row.hour
         try:
@@ -205,8 +191,8 @@ class _Objects:
         except DAMAGED as error:
             raise StationError(f"{what} is damaged: {error}") from error
 
-    def _decoded(self, row: ArchivedHour, what: str) -> _Archived:
-        hour = parse_hour(row.hour)
+    def _decoded(self, row: archive.ArchivedHour, what: str) -> _Archived:
+        hour = archive.parse_hour(row.hour)
         hashes: dict[str, str] = {}
         samples, refused = 0, list[Item]()
         if row.key:
@@ -215,10 +201,13 @@ class _Objects:
             samples = sum(len(one.block.times_us) for one in file.pages(hour))
         counts = (len(hashes), samples)
         if row.refused:
-            lines = self._get(refused_key(parse_topic(row.topic), hour)).splitlines()
+            lines = self._get(archive.refused_key(parse_topic(row.topic), hour)).splitlines()
             refused = [json.loads(line) for line in lines]
-            hashes.update({key_of(item): item_hash(dict(item)) for item in refused})
-        if content_hash(sorted(hashes.items())) != row.content or counts != (row.batches, row.samples):
+            hashes.update({key_of(item): archive.item_hash(dict(item)) for item in refused})
+        if archive.content_hash(sorted(hashes.items())) != row.content or counts != (
+            row.batches,
+            row.samples,
+        ):
             raise StationError(f"{what} does not hold what the manifest says")
         return _Archived(hashes, refused)
 

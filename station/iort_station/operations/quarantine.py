@@ -14,38 +14,28 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_contract import tables
 from iort_contract.checks import json_object
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_item
-from iort_contract.tables import (
-    BATCH,
-    BY_LATER,
-    BY_RULE,
-    BY_STREAM,
-    ENTRY,
-    ENVELOPE,
-    FIRST_MS,
-    LAST_MS,
-    PAYLOAD,
-    REASON,
-    RECEIVED_MS,
-    REPLAY,
-    REPLAYS,
-    ROBOT,
-    SEEN,
-    SOURCE,
-    TOPIC,
-)
 from iort_contract.topics import RECORD, as_subscribed
 from iort_station.cloud import Cloud, invoke
 from iort_station.data.recorded import telemetry_table
 from iort_station.errors import StationError
 
-_HEADER = (SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)
-_LISTED = (ROBOT, ENTRY, *_HEADER)
+_HEADER = (
+    tables.SOURCE,
+    tables.TOPIC,
+    tables.REASON,
+    tables.FIRST_MS,
+    tables.LAST_MS,
+    tables.SEEN,
+    tables.REPLAYS,
+)
+_LISTED = (tables.ROBOT, tables.ENTRY, *_HEADER)
 # What goes when a dead letter is deleted.
-CONTENTS = (*_HEADER, PAYLOAD)
+CONTENTS = (*_HEADER, tables.PAYLOAD)
 
 
 @dataclass(frozen=True)
@@ -79,7 +69,7 @@ def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Ite
     request: dict[str, Any] = {
         "TableName": cloud.output("storage", "QuarantineTable"),
         "ProjectionExpression": ", ".join(names),
-        "FilterExpression": f"#{LAST_MS} >= :since",
+        "FilterExpression": f"#{tables.LAST_MS} >= :since",
         "ExpressionAttributeNames": names,
         "ExpressionAttributeValues": {":since": {"N": str(since_ms)}},
     }
@@ -88,7 +78,7 @@ def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Ite
     if robot is None:
         pages = dynamodb.get_paginator("scan").paginate(**request)
     else:
-        request["KeyConditionExpression"] = f"#{ROBOT} = :robot"
+        request["KeyConditionExpression"] = f"#{tables.ROBOT} = :robot"
         request["ExpressionAttributeValues"][":robot"] = {"S": robot}
         pages = dynamodb.get_paginator("query").paginate(**request)
     for page in pages:
@@ -108,12 +98,12 @@ def load(cloud: Cloud, letter: DeadLetter) -> DeadLetter | None:
     answer = cloud.client("dynamodb").get_item(
         TableName=cloud.output("storage", "QuarantineTable"), Key=key(letter), ConsistentRead=True
     )
-    return _letter(answer["Item"]) if LAST_MS in answer.get("Item", ()) else None
+    return _letter(answer["Item"]) if tables.LAST_MS in answer.get("Item", ()) else None
 
 
 def key(letter: DeadLetter) -> dict[str, Any]:
     """The dead letter's key in the table."""
-    return {ROBOT: {"S": letter.robot}, ENTRY: {"S": letter.id}}
+    return {tables.ROBOT: {"S": letter.robot}, tables.ENTRY: {"S": letter.id}}
 
 
 def waiting(cloud: Cloud) -> Waiting:
@@ -146,18 +136,18 @@ def _depth(cloud: Cloud, queue: str) -> int:
 
 def _letter(item: Mapping[str, Any]) -> DeadLetter:
     values = plain(item)
-    source = values.get(SOURCE, "")
+    source = values.get(tables.SOURCE, "")
     return DeadLetter(
-        robot=values[ROBOT],
-        id=values[ENTRY],
+        robot=values[tables.ROBOT],
+        id=values[tables.ENTRY],
         source=source,
-        topic=as_subscribed(values.get(TOPIC, ""), source.removeprefix(f"{BY_RULE} ")),
-        reason=values.get(REASON, ""),
-        first_ms=int(values.get(FIRST_MS, 0)),
-        last_ms=int(values.get(LAST_MS, 0)),
-        seen=int(values.get(SEEN, 0)),
-        replays=int(values.get(REPLAYS, 0)),
-        payload=bytes(values[PAYLOAD]) if PAYLOAD in values else None,
+        topic=as_subscribed(values.get(tables.TOPIC, ""), source.removeprefix(f"{tables.BY_RULE} ")),
+        reason=values.get(tables.REASON, ""),
+        first_ms=int(values.get(tables.FIRST_MS, 0)),
+        last_ms=int(values.get(tables.LAST_MS, 0)),
+        seen=int(values.get(tables.SEEN, 0)),
+        replays=int(values.get(tables.REPLAYS, 0)),
+        payload=bytes(values[tables.PAYLOAD]) if tables.PAYLOAD in values else None,
     )
 
 
@@ -216,7 +206,7 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
     batch = None
     try:
         _check_kind(letter)
-        if letter.source != BY_LATER:
+        if letter.source != tables.BY_LATER:
             batch = _batch(letter)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
@@ -243,11 +233,11 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
 
 
 def _is_rules(letter: DeadLetter) -> bool:
-    return letter.source.startswith(f"{BY_RULE} ")
+    return letter.source.startswith(f"{tables.BY_RULE} ")
 
 
 def _check_kind(letter: DeadLetter) -> None:
-    if letter.source in (BY_STREAM, BY_LATER) and letter.topic:
+    if letter.source in (tables.BY_STREAM, tables.BY_LATER) and letter.topic:
         return
     if not _is_rules(letter) or not letter.topic.startswith(f"{RECORD}/"):
         raise _NotForReplayError("only batches of the record lane are replayed")
@@ -257,10 +247,10 @@ def _batch(letter: DeadLetter) -> Batch:
     """The batch in a dead letter; raises `ContractError`."""
     # The quarantine cuts items that are too large for it.
     value = json_object(letter.payload or b"", "message")
-    if letter.source == BY_STREAM:
+    if letter.source == tables.BY_STREAM:
         return decode_item(plain(value))[1]
-    item = {name: value[name] for name in ENVELOPE if name in value}
-    return decode_item({**item, TOPIC: letter.topic, RECEIVED_MS: letter.first_ms})[1]
+    item = {name: value[name] for name in tables.ENVELOPE if name in value}
+    return decode_item({**item, tables.TOPIC: letter.topic, tables.RECEIVED_MS: letter.first_ms})[1]
 
 
 def _count(cloud: Cloud, letter: DeadLetter) -> None:
@@ -269,7 +259,7 @@ def _count(cloud: Cloud, letter: DeadLetter) -> None:
         Key=key(letter),
         UpdateExpression="ADD #replays :one",
         ConditionExpression="attribute_exists(#last)",
-        ExpressionAttributeNames={"#replays": REPLAYS, "#last": LAST_MS},
+        ExpressionAttributeNames={"#replays": tables.REPLAYS, "#last": tables.LAST_MS},
         ExpressionAttributeValues={":one": {"N": "1"}},
     )
 
@@ -278,7 +268,7 @@ def _publish(cloud: Cloud, letter: DeadLetter, batch: Batch) -> str:
     """Publish to the rule and wait for the stored batch; returns the error, or nothing."""
     if _stored(cloud, letter.topic, batch):
         return ""
-    rule = letter.source.removeprefix(f"{BY_RULE} ")
+    rule = letter.source.removeprefix(f"{tables.BY_RULE} ")
     topic = f"$aws/rules/{rule}/{letter.topic}"
     cloud.client("iot-data").publish(topic=topic, qos=1, payload=letter.payload or b"")
     deadline = time.monotonic() + _CONFIRM_S
@@ -301,14 +291,14 @@ def _put_off(cloud: Cloud, letter: DeadLetter) -> str:
 
 
 def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
-    return telemetry_table(cloud).get(topic, str(batch.id), attributes=(BATCH,)) is not None
+    return telemetry_table(cloud).get(topic, str(batch.id), attributes=(tables.BATCH,)) is not None
 
 
 def _summarize(cloud: Cloud, letter: DeadLetter) -> str:
     """Give the item to Lambda 2; returns the error, or nothing."""
     image: dict[str, Any] = json.loads(letter.payload or b"{}")
     try:
-        said = summarize(cloud, [image], {REPLAY: True})
+        said = summarize(cloud, [image], {tables.REPLAY: True})
     except StationError as error:
         return str(error)
     return "Lambda 2 refuses it; is the current version deployed?" if said["batchItemFailures"] else ""
@@ -321,7 +311,7 @@ def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[s
     """
     changes = [
         {
-            "Keys": {name: item[name] for name in (TOPIC, BATCH)},
+            "Keys": {name: item[name] for name in (tables.TOPIC, tables.BATCH)},
             "NewImage": item,
             "SequenceNumber": str(number),
         }
@@ -344,7 +334,7 @@ def _delete(cloud: Cloud, letter: DeadLetter) -> None:
             TableName=cloud.output("storage", "QuarantineTable"),
             Key=key(letter),
             UpdateExpression="REMOVE " + ", ".join(f"#{name}" for name in CONTENTS),
-            ConditionExpression=f"#{LAST_MS} = :last",
+            ConditionExpression=f"#{tables.LAST_MS} = :last",
             ExpressionAttributeNames={f"#{name}": name for name in CONTENTS},
             ExpressionAttributeValues={":last": {"N": str(letter.last_ms)}},
         )

@@ -10,18 +10,9 @@ from typing import Any, NamedTuple
 
 from iort_analysis.archive.stored import TABLE, PageProgress
 from iort_analysis.samples.batches import Item
+from iort_contract import tables
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import with_samples_between
-from iort_contract.tables import (
-    ENVELOPE,
-    EXPIRES_S,
-    RECEIVED_MS,
-    RECOMPUTE_FROM_S,
-    RECOMPUTED,
-    ROBOT,
-    TOPIC,
-    VEHICLE_CACHE_S,
-)
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, recorded
 from iort_station.data.recorded import Recorded
@@ -30,9 +21,9 @@ from iort_station.errors import StationError
 from iort_station.operations.quarantine import summarize
 
 # Lambda 2 caches the old parameters for this long; the margin is for its running invocations.
-SETTLED_S = VEHICLE_CACHE_S + 5
+SETTLED_S = tables.VEHICLE_CACHE_S + 5
 # The attributes of a batch that Lambda 2 would get from the table's stream.
-_IMAGE = (*ENVELOPE, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S)
+_IMAGE = (*tables.ENVELOPE, tables.TOPIC, tables.ROBOT, tables.RECEIVED_MS, tables.EXPIRES_S)
 # An event may have 6 MB, and takes a second or two.
 _AT_ONCE, _EVENT_BATCHES, _EVENT_BYTES = 4, 100, 2_000_000
 
@@ -63,7 +54,7 @@ def recompute(
     Raises `StationError` if Lambda 2 fails; the seconds written so far are correct. It may be run again.
     """
     selection = _from(robot, stream, since_us)
-    event = {RECOMPUTE_FROM_S: 0 if selection.start_us is None else selection.start_us // 1_000_000}
+    event = {tables.RECOMPUTE_FROM_S: 0 if selection.start_us is None else selection.start_us // 1_000_000}
     # Seconds expire with their batches, so those of the archive's batches have nothing to be corrected.
     recorded = Recorded(cloud, robot, stream, source=TABLE)
     pages = recorded.items(with_samples_between(selection.start_us, None), _IMAGE, progress=progress)
@@ -73,9 +64,9 @@ def recompute(
 
     def count(answer: dict[str, Any]) -> None:
         nonlocal left_out
-        if RECOMPUTED not in answer:
+        if tables.RECOMPUTED not in answer:
             raise StationError("Lambda 2 cannot recompute: deploy the current stacks")
-        seconds.update(answer[RECOMPUTED])
+        seconds.update(answer[tables.RECOMPUTED])
         left_out += len(answer["batchItemFailures"])
 
     with ThreadPoolExecutor(_AT_ONCE) as pool:

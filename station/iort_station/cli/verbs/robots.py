@@ -11,32 +11,10 @@ import typer
 from botocore.exceptions import ClientError
 from rich.table import Table
 
+from iort_contract import tables
 from iort_contract.catalog.car import KNOWN
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.messages.commands import NO_MOTION
-from iort_contract.tables import (
-    ADMISSION,
-    ADMIT_CLAIM,
-    ADMIT_FINGERPRINT,
-    ADMIT_UNTIL_S,
-    ADMITTED_CERTIFICATE,
-    ADMITTED_MS,
-    AGENT_VERSION,
-    ALERT_PREFIX,
-    ASKED_PREFIX,
-    CONNECTED_MS,
-    DAYS,
-    DISCONNECT_REASON,
-    DISCONNECTED_MS,
-    GAIN_SET_MS,
-    LAST_SEEN_MS,
-    ONLINE,
-    OVER_SHARE,
-    PRESENCE,
-    ROBOT,
-    SESSION_VERSION,
-    STREAMS,
-)
 from iort_station.cli import options
 from iort_station.cli.console import Console, Lines, errors, out, print_json, reading, tell
 from iort_station.cli.options import (
@@ -232,7 +210,7 @@ def _change(text: str) -> tuple[str, str | None]:
 
 
 # What the cloud's functions keep in the row for themselves.
-_INTERNAL = {SESSION_VERSION, ADMIT_CLAIM, ADMIT_FINGERPRINT}
+_INTERNAL = {tables.SESSION_VERSION, tables.ADMIT_CLAIM, tables.ADMIT_FINGERPRINT}
 # A pipe has no width at which a line must end.
 _PIPE_WIDTH = 10_000
 # Whether an emergency stop ends its motion; None before the robot has said so.
@@ -305,24 +283,26 @@ def set_(
 def list_(context: typer.Context, as_json: AsJson = False) -> None:
     """List the registered robots: their connections and parameters."""
     cloud = context.obj.cloud()
-    rows = sorted(robots.listed(cloud), key=lambda row: str(row[ROBOT]))
+    rows = sorted(robots.listed(cloud), key=lambda row: str(row[tables.ROBOT]))
     stoppable = {name: one.stoppable for name, one in _motion(cloud, rows).items()}
     if as_json:
-        print_json([{**_as_json(row), "stoppable": stoppable.get(str(row[ROBOT]))} for row in rows])
+        print_json([{**_as_json(row), "stoppable": stoppable.get(str(row[tables.ROBOT]))} for row in rows])
         return
     if not rows:
         errors.print("no robot is registered; `iort robots add NAME` registers one")
         return
     table = Table(box=None, pad_edge=False)
     # A name must be complete to be copied; long parameters have a second line.
-    table.add_column("robot", min_width=max(len(str(row[ROBOT])) for row in rows))
+    table.add_column("robot", min_width=max(len(str(row[tables.ROBOT])) for row in rows))
     for heading in ("connection", "stop", "agent", "parameters"):
         table.add_column(heading, overflow="fold")
     for row in rows:
-        stop = _STOPPABLE[stoppable.get(str(row[ROBOT]))]
-        table.add_row(row[ROBOT], _connection(row), stop, row.get(AGENT_VERSION, ""), _parameters(row))
+        stop = _STOPPABLE[stoppable.get(str(row[tables.ROBOT]))]
+        table.add_row(
+            row[tables.ROBOT], _connection(row), stop, row.get(tables.AGENT_VERSION, ""), _parameters(row)
+        )
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
-    if moving := [str(row[ROBOT]) for row in rows if stoppable.get(str(row[ROBOT])) is False]:
+    if moving := [str(row[tables.ROBOT]) for row in rows if stoppable.get(str(row[tables.ROBOT])) is False]:
         say(f"an emergency stop does NOT stop {', '.join(moving)}: {NO_MOTION}")
 
 
@@ -341,7 +321,7 @@ def show(
             {
                 **_as_json(row),
                 "stoppable": motion.stoppable,
-                OVER_SHARE: over
+                tables.OVER_SHARE: over
                 and {
                     "batches": over.batches,
                     **stamped("since", over.since_ms * 1000),
@@ -371,7 +351,7 @@ def show(
         text = f"over: {over.batches} batches put off since {since}, the last at {last}"
         table.add_row("share", text)
     for key, value in sorted(row.items()):
-        if key != ROBOT:
+        if key != tables.ROBOT:
             table.add_row(key, _value(key, value))
     for one in held:
         until = f", expires {_time(one.expires)}" if one.expires else ""
@@ -401,7 +381,7 @@ def remove(
         robots.remove(cloud, name)
         tell({"removed": name}, f"{name} is removed", as_json=as_json)
         return
-    names = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
+    names = sorted(str(row[tables.ROBOT]) for row in robots.listed(cloud))
     agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
     for one in names:
         robots.remove(cloud, one)
@@ -413,7 +393,7 @@ def remove(
 def _motion(cloud: Cloud, rows: Iterable[Mapping[str, Any]]) -> Mapping[str, stopping.Motion]:
     """Of robots whose shadows may be read."""
     try:
-        return stopping.motion(cloud, [str(row[ROBOT]) for row in rows])
+        return stopping.motion(cloud, [str(row[tables.ROBOT]) for row in rows])
     except ClientError as error:
         say(f"whether a stop ends their motion cannot be read: {error}")
         return {}
@@ -429,44 +409,58 @@ def _parameter(text: str) -> tuple[str, float]:
 
 def _as_json(row: Mapping[str, Any]) -> dict[str, Any]:
     """A robot's row with every attribute that an operator may use; null is not known."""
-    known = dict.fromkeys((ROBOT, *robots.F1TENTH, *PRESENCE, *ADMISSION, *DAYS))
-    told = {**known, **row, ONLINE: bool(row.get(ONLINE)), STREAMS: row.get(STREAMS, [])}
+    known = dict.fromkeys((tables.ROBOT, *robots.F1TENTH, *tables.PRESENCE, *tables.ADMISSION, *tables.DAYS))
+    told = {
+        **known,
+        **row,
+        tables.ONLINE: bool(row.get(tables.ONLINE)),
+        tables.STREAMS: row.get(tables.STREAMS, []),
+    }
     told |= {name: float(row[name]) for name in (*robots.F1TENTH, *KNOWN) if name in row}
-    for name in (CONNECTED_MS, DISCONNECTED_MS, LAST_SEEN_MS, ADMITTED_MS):
+    for name in (tables.CONNECTED_MS, tables.DISCONNECTED_MS, tables.LAST_SEEN_MS, tables.ADMITTED_MS):
         at_ms = told.pop(name)
         told |= stamped(name.removesuffix("_ms"), None if at_ms is None else int(at_ms) * 1000)
-    until_s = told.pop(ADMIT_UNTIL_S)
+    until_s = told.pop(tables.ADMIT_UNTIL_S)
     told |= stamped("admit_until", None if until_s is None else int(until_s) * 1_000_000)
-    for name in [name for name in told if name.startswith(ALERT_PREFIX)]:
+    for name in [name for name in told if name.startswith(tables.ALERT_PREFIX)]:
         told |= stamped(name, int(told[name]) * 1_000_000)
     return {name: value for name, value in told.items() if name not in _INTERNAL}
 
 
 def _connection(row: Mapping[str, Any]) -> str:
-    if row.get(ONLINE):
-        return f"online since {_value(CONNECTED_MS, row[CONNECTED_MS])}"
-    if DISCONNECTED_MS in row:
-        reason = row.get(DISCONNECT_REASON, "")
-        return f"offline since {_value(DISCONNECTED_MS, row[DISCONNECTED_MS])} {reason}".rstrip()
-    if ADMIT_UNTIL_S in row and ADMITTED_CERTIFICATE not in row:
-        late = float(row[ADMIT_UNTIL_S]) < time.time()
-        return f"{'was expected' if late else 'expected'} until {_value(ADMIT_UNTIL_S, row[ADMIT_UNTIL_S])}"
+    if row.get(tables.ONLINE):
+        return f"online since {_value(tables.CONNECTED_MS, row[tables.CONNECTED_MS])}"
+    if tables.DISCONNECTED_MS in row:
+        reason = row.get(tables.DISCONNECT_REASON, "")
+        return (
+            f"offline since {_value(tables.DISCONNECTED_MS, row[tables.DISCONNECTED_MS])} {reason}".rstrip()
+        )
+    if tables.ADMIT_UNTIL_S in row and tables.ADMITTED_CERTIFICATE not in row:
+        until_s = int(row[tables.ADMIT_UNTIL_S])
+        return f"{'was expected' if until_s < time.time() else 'expected'} until {iso_s(until_s * 1_000_000)}"
     return "never connected"
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {ROBOT, GAIN_SET_MS, *DAYS, STREAMS, *PRESENCE, *ADMISSION}
+    known = {
+        tables.ROBOT,
+        tables.GAIN_SET_MS,
+        *tables.DAYS,
+        tables.STREAMS,
+        *tables.PRESENCE,
+        *tables.ADMISSION,
+    }
     return ", ".join(
         f"{key} {value}"
         for key, value in sorted(row.items())
-        if key not in known and not key.startswith((ALERT_PREFIX, ASKED_PREFIX))
+        if key not in known and not key.startswith((tables.ALERT_PREFIX, tables.ASKED_PREFIX))
     )
 
 
 def _value(key: str, value: Any) -> str:
     if key.endswith("_ms"):
         return iso_s(int(value) * 1000)
-    return iso_s(int(value) * 1_000_000) if key == ADMIT_UNTIL_S else str(value)
+    return iso_s(int(value) * 1_000_000) if key == tables.ADMIT_UNTIL_S else str(value)
 
 
 def _time(when: Any) -> str | None:

@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.commands import NO_MOTION, DriveLimits, encode_limits
+from iort_contract.messages.shadow import Pressed, encode_stop
 from iort_station.cli.verbs.control import commands
 from iort_station.cli.verbs.robots import commands as robots
 from iort_station.errors import StationError
-from iort_station.fleet import stopping
 from iort_station.operations.alarms import user
 from iort_station.page import answers, motion
 from testkit.waiting import GUARD_S
@@ -228,7 +228,7 @@ def test_a_stop_at_the_moment_of_a_fleets_release_is_not_lost(cloud):
 def test_a_release_ends_no_stop_that_the_page_does_not_show(cloud, whom):
     act = motion.fleet(cloud).stop
     seen = act({"stopped": "true", **whom})["robots"]["car7"]["at_ms"]
-    newer = stopping.encode_stop(stopping.Pressed("anna", seen + 1), fleet=not whom)
+    newer = encode_stop(Pressed("anna", seen + 1), fleet=not whom)
     cloud.states["car7"] = _merged(cloud.states["car7"], {"desired": newer})
     told = act({"stopped": "false", "seen_ms": str(seen), **whom})
     assert told["failed"] == {"car7": "anna has stopped it again since"}
