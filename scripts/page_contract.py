@@ -78,7 +78,7 @@ def _constants() -> Iterator[str]:
         topics: ("NAME", "LIVE", "VIEW", "CMD"),
         checks: ("BOOT", "FIELD_NAME"),
         vesc: ("TACHOMETER_COUNTS",),
-        findings: ("ANALYSIS_FAILED", "STYLE_GROUP"),
+        findings: ("ANALYSIS_FAILED",),
         commands: (
             "MAX_LEASE_MS",
             "DRIVE_RATE_HZ",

@@ -15,7 +15,7 @@ import numpy as np
 from iort_analysis.drives.building import build
 from iort_analysis.drives.cleaning import MANY_WILD, wild_share
 from iort_analysis.drives.drive import Drive, moving, vescs_of
-from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, style, thermal
+from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, thermal
 from iort_analysis.mining.gain import with_gain
 from iort_analysis.results import DriveResult, Event, Mined
 from iort_analysis.samples.blocks import Block
@@ -32,7 +32,6 @@ MINERS: Mapping[str, Miner] = MappingProxyType(
         "drivetrain": drivetrain.mine,
         "thermal": thermal.mine,
         "laps": laps.mine,
-        "style": style.mine,
     }
 )
 

@@ -6,7 +6,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from iort_contract.catalog.analysis import GROUPS, KINDS, PARAMETERS, STYLE_GROUP
+from iort_contract.catalog.analysis import GROUPS, KINDS, PARAMETERS
 from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.commands import NO_MOTION
@@ -39,11 +39,6 @@ def _estimate(value: float, either: float, unit: str) -> EstimateEntry:
 def drive(days_ago: int, *, failed: str = "", robot: str = "car-1") -> DriveEntry:
     start_us = _NEWEST_US - days_ago * _DAY_US
     grown = 0.04 + 0.003 * max(0, 5 - days_ago)
-    shares = [0.05, 0.16, 0.2, 0.12, 0.27, 0.14, 0.06]
-    styles = {
-        name: _estimate(share, share / 9, "1")
-        for name, share in zip((p.name for p in GROUPS[STYLE_GROUP]), shares, strict=True)
-    }
     return {
         "robot": robot,
         "from_us": start_us,
@@ -57,7 +52,6 @@ def drive(days_ago: int, *, failed: str = "", robot: str = "car-1") -> DriveEntr
             "battery_resistance_ohm": _estimate(grown, 0.002, "ohm"),
             "lap_best_s": _estimate(11.3 + 0.1 * math.sin(days_ago), 0.01, "s"),
             "lap_mean_s": _estimate(12 + 0.1 * math.sin(days_ago), 0.2, "s"),
-            **styles,
         },
         "missing": {} if failed else {"lap_energy_wh": "needs voltage and current of the battery"},
     }

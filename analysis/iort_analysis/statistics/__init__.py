@@ -1,1 +1,1 @@
-"""What miners and evaluation measure with: fits and intervals, distributions, clusters, signals."""
+"""What miners and evaluation measure with: fits and intervals, distributions, signals."""

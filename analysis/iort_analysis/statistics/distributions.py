@@ -1,4 +1,4 @@
-"""Distributions that numpy lacks, normal and Student's t, and intervals of means and shares."""
+"""Distributions that numpy lacks, normal and Student's t, and intervals of means."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def _away(value: float) -> float:
     return value if abs(value) > _TINY else _TINY
 
 
-# Intervals of means and shares.
+# Intervals of means.
 
 
 @cache
@@ -108,11 +108,3 @@ def mean_of(values: NDArray[np.float64]) -> tuple[float, float, float]:
     either = sides(n - 1) * float(values.std(ddof=1)) / math.sqrt(n)
     either = max(either, sides() * quantum(values) / math.sqrt(12 * len(np.unique(values))))
     return mean, mean - either, mean + either
-
-
-def share_of(hits: float, n: float) -> tuple[float, float, float]:
-    """A share of n independent trials, and its interval by Wilson."""
-    share, z = hits / n, sides()
-    middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
-    either = z / (1 + z**2 / n) * math.sqrt(share * (1 - share) / n + z**2 / (4 * n**2))
-    return share, max(0.0, middle - either), min(1.0, middle + either)

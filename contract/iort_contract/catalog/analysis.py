@@ -19,22 +19,6 @@ _LAPS = (
 )
 # The tables of laps: what each took, and when it passed each place.
 LAPS_TABLE, PLACES_TABLE = "laps", "lap_places"
-# How a car is driven, over half a second; `mining.style` says when each is.
-STYLES = {
-    "standing": "the car stands",
-    "hard braking": "the speed falls fast",
-    "hard accelerating": "the speed rises fast",
-    "corner at the limit": "a corner with nearly all the grip that the drive used",
-    "cornering": "a corner below that",
-    "steady fast": "a speed near the drive's highest, held",
-    "steady slow": "a lower speed, held",
-}
-STYLE_TABLE = "style"
-STYLE_GROUP = "Driving style"
-_STYLES = tuple(
-    Parameter(f"style_{style.replace(' ', '_')}_share", "1", f"share of time: {meaning}")
-    for style, meaning in STYLES.items()
-)
 
 # What the motor needs and what its sensors say; currents and speeds as the VESC has them, so that no number
 # of the car need be known.
@@ -125,7 +109,6 @@ GROUPS = {
     "Heat": HEAT,
     "Sensors": _SENSORS,
     "Laps": _LAPS,
-    STYLE_GROUP: _STYLES,
 }
 PARAMETERS = {parameter.name: parameter for group in GROUPS.values() for parameter in group}
 

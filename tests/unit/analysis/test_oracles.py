@@ -13,24 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal, stats
 from scipy.interpolate import BSpline
-from sklearn.cluster import KMeans
-from sklearn.metrics import adjusted_rand_score, silhouette_score
-from sklearn.preprocessing import RobustScaler
 from statsmodels.base.model import GenericLikelihoodModel
 from statsmodels.stats.diagnostic import breaks_cusumolsresid
 from statsmodels.stats.meta_analysis import combine_effects
 from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.proportion import proportion_confint
 from statsmodels.stats.weightstats import DescrStatsW
-from threadpoolctl import threadpool_limits
 
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_analysis.baselines import US_PER_DAY, combined, trend
 from iort_analysis.evaluation import false_discovery_rates
 from iort_analysis.mining import drivetrain
 from iort_analysis.mining.changes import changed
-from iort_analysis.statistics.clusters import cluster, scaled
-from iort_analysis.statistics.distributions import between, mean_of, quantile, share_of, sides, tail
+from iort_analysis.statistics.distributions import between, mean_of, quantile, sides, tail
 from iort_analysis.statistics.fitting import Fit, Prior, fit
 from iort_analysis.statistics.signals import lagged, smooth_basis
 from iort_contract.messages.analysis import Estimate
@@ -62,35 +56,6 @@ def test_the_chance_of_a_change_is_that_of_the_cusum_test() -> None:
     assert np.mean(np.array(found) < 0.1) == pytest.approx(np.mean(np.array(wanted) < 0.1), abs=0.05)
 
 
-# Clusters of windows: scikit-learn is the oracle.
-
-
-def blobs(seed: int, wide: float) -> np.ndarray:
-    chance = np.random.default_rng(seed)
-    middles = chance.uniform(-4, 4, (4, 3))
-    return np.concatenate([middle + chance.normal(0, wide, (100, 3)) for middle in middles])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_clusters_that_are_best_apart(seed: int) -> None:
-    points = blobs(seed, 0.5)
-    # Threads that wait for each other take far longer than one.
-    with threadpool_limits(1):
-        tried = [KMeans(k, n_init=10, random_state=0).fit(points).labels_ for k in range(2, 7)]
-    scores = [silhouette_score(points, labels) for labels in tried]
-    found = cluster(points, 6)
-    # Ours starts three times, not ten.
-    assert found.silhouette == pytest.approx(max(scores), abs=0.01)
-    assert found.silhouette == pytest.approx(silhouette_score(points, found.labels), abs=1e-9)
-    assert adjusted_rand_score(tried[int(np.argmax(scores))], found.labels) > 0.95
-
-
-def test_columns_are_scaled_by_their_middle_and_spread() -> None:
-    points = blobs(1, 2.0)
-    wanted = RobustScaler(quantile_range=(10, 90)).fit_transform(points)
-    np.testing.assert_allclose(scaled(points), np.clip(wanted, -3, 3))
-
-
 # Distributions, intervals and filters: SciPy and statsmodels are the oracles.
 
 
@@ -106,11 +71,6 @@ def test_students_t(p: float, freedom: float) -> None:
 def test_the_interval_of_a_mean(n: int) -> None:
     values = np.random.default_rng(n).normal(3, 2, n)
     assert mean_of(values)[1:] == pytest.approx(DescrStatsW(values).tconfint_mean(alpha=0.1))
-
-
-@pytest.mark.parametrize(("hits", "n"), [(0, 5), (1, 9), (30, 60), (7, 7), (2.5, 11)])
-def test_the_interval_of_a_share(hits: float, n: float) -> None:
-    assert share_of(hits, n)[1:] == pytest.approx(proportion_confint(hits, n, alpha=0.1, method="wilson"))
 
 
 @pytest.mark.parametrize("width", [0.2, 1.0, 4.0])

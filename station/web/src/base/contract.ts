@@ -15,7 +15,6 @@ export const BOOT = /^(?:[0-9a-f]{8,32})$/;
 export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
 export const TACHOMETER_COUNTS = 6;
 export const ANALYSIS_FAILED = "analysis_failed";
-export const STYLE_GROUP = "Driving style";
 export const MAX_LEASE_MS = 10000;
 export const DRIVE_RATE_HZ = 20.0;
 export const DRIVE_LEASE_MS = 500;

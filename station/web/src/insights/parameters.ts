@@ -15,12 +15,11 @@ export class Parameters {
   readonly node = el("div", { class: "insights-groups" });
   private charts: RangeChart[] = [];
 
-  /** Show the parameters of drives, the newest first; `hidden` groups are shown elsewhere. */
-  show({ drives, groups, findings }: InsightsAnswer, hidden: readonly string[]): void {
+  /** Show the parameters of drives, the newest first. */
+  show({ drives, groups, findings }: InsightsAnswer): void {
     this.clear();
     const sound = drives.filter(({ failed }) => failed === "");
     for (const [group, parameters] of Object.entries(groups)) {
-      if (hidden.includes(group)) continue;
       const known = Object.entries(parameters).filter(([name]) =>
         sound.some(({ estimates }) => Object.hasOwn(estimates, name)),
       );

@@ -5,7 +5,6 @@ import {
   type Extent,
   type InsightsAnswer,
   type RunsAnswer,
-  STYLE_GROUP,
 } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
@@ -16,7 +15,6 @@ import { drivesTable } from "../insights/drives_table";
 import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
-import { styles } from "../insights/styles";
 import { may } from "../server/admission";
 import { AnswerError, ask } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
@@ -142,7 +140,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
   private async present(query: Query<"insights">): Promise<void> {
     const { robot } = this;
     const answer = this.answer!;
-    const { findings, drives, groups } = answer;
+    const { findings, drives } = answer;
     const newest = drives[0];
     const of = robot ?? "the fleet";
     const state = newest
@@ -166,12 +164,10 @@ export class InsightsView implements View<RouteTo<"insights">> {
       this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, undefined)] : []));
       return;
     }
-    const bars = styles(drives, groups[STYLE_GROUP] ?? {});
     this.driven.replaceChildren(
-      ...(bars ? [bars] : []),
       ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []),
     );
-    this.parameters.show(answer, [STYLE_GROUP]);
+    this.parameters.show(answer);
     await this.showLaps(robot, chosen, query);
   }
 

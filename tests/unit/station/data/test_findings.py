@@ -47,12 +47,12 @@ def iort(monkeypatch):
 
 def test_a_reason_that_many_share_is_said_once_and_a_share_is_in_percent(iort):
     missing = {"temperature_drift_k": TOO_SHORT, "vesc": "no motor controller", "controller_lag_s": TOO_SHORT}
-    shares = {"style_standing_share": Estimate(0.14, 0.07, 0.26, "1")}
+    shares = {"battery_charge_left": Estimate(0.14, 0.07, 0.26, "1")}
     key = DriveKey("car7", 0, "0badcafe")
 
     said = iort([AnalysedDrive(key, 60_000_000, "job", 3000, shares, missing, {})])
 
-    assert "style_standing_share 14 % (7 to 26)" in said
+    assert "battery_charge_left 14 % (7 to 26)" in said
     # A narrow terminal takes a second line.
     assert f"missing temperature_drift_k, controller_lag_s: {TOO_SHORT}" in " ".join(said)
 
