@@ -1,11 +1,6 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import {
-  type Config,
-  type Extent,
-  type InsightsAnswer,
-  type RunsAnswer,
-} from "../base/contract";
+import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
 import { type Range, readTime, writeTime } from "../base/range";
@@ -164,9 +159,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
       this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, undefined)] : []));
       return;
     }
-    this.driven.replaceChildren(
-      ...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []),
-    );
+    this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
     this.parameters.show(answer);
     await this.showLaps(robot, chosen, query);
   }
