@@ -9,19 +9,35 @@ from dataclasses import dataclass
 from typing import Any
 
 from testkit.target import EMBEDDED, Target
-from testkit.waiting import InstrumentError
+from verify.lab import CannotAskError, Lab
 
 # Prefix of notes beside the answer, such as a version: they are reported, but not compared.
 NOTE = "note_"
 # Phases: the first deployment, its change (a key of the account's own, everybody's identity), and its end.
 FIRST, CHANGED, ENDED = "first deployment", "changed deployment", "end of the deployment"
+# Where AWS documents what: a page is named by its guide and its file, such as "iot:mqtt".
+_AWS = "https://docs.aws.amazon.com"
+GUIDES = {
+    "cfn": f"{_AWS}/AWSCloudFormation/latest/TemplateReference",
+    "cloudwatch": f"{_AWS}/AmazonCloudWatch/latest/monitoring",
+    "cloudwatch-api": f"{_AWS}/AmazonCloudWatch/latest/APIReference",
+    "cognito": f"{_AWS}/cognito/latest/developerguide",
+    "dynamodb": f"{_AWS}/amazondynamodb/latest/developerguide",
+    "dynamodb-api": f"{_AWS}/amazondynamodb/latest/APIReference",
+    "iot": f"{_AWS}/iot/latest/developerguide",
+    "iot-api": f"{_AWS}/iot/latest/apireference",
+    "lambda": f"{_AWS}/lambda/latest/dg",
+    "quotas": f"{_AWS}/general/latest/gr",
+    "s3": f"{_AWS}/AmazonS3/latest/userguide",
+    "s3-api": f"{_AWS}/AmazonS3/latest/API",
+    "scheduler": f"{_AWS}/scheduler/latest/UserGuide",
+    "sqs": f"{_AWS}/AWSSimpleQueueService/latest/SQSDeveloperGuide",
+    "states": f"{_AWS}/step-functions/latest/dg",
+    "states-api": f"{_AWS}/step-functions/latest/apireference",
+}
 
 Seen = Mapping[str, Any]
-Ask = Callable[[Target], Seen]
-
-
-class CannotAskError(InstrumentError):
-    """A question cannot be asked here; the text says why."""
+Ask = Callable[[Lab], Seen]
 
 
 class Verdict(enum.Enum):
@@ -42,8 +58,8 @@ class Question:
     the assumption as JSON values. ``not_embedded`` says why the embedded cloud cannot be asked; "" if it can.
 
     ``ask`` returns the answer in the form of ``expected``, without secrets and without names or times that
-    change between runs; keys that begin with `NOTE` are not compared. It removes everything that it creates,
-    and raises `CannotAskError` if it cannot ask.
+    change between runs; keys that begin with `NOTE` are not compared. It raises `CannotAskError` if it cannot
+    ask.
     """
 
     name: str
@@ -62,29 +78,37 @@ class Question:
 
 
 def question(
-    name: str,
-    *,
-    expected: Seen,
-    relied_on_by: tuple[str, ...],
-    source: str = "",
-    phase: str = FIRST,
-    not_embedded: str = "",
+    name: str, *, expected: Seen, code: str, aws: str = "", phase: str = FIRST, not_embedded: str = ""
 ) -> Callable[[Ask], Question]:
-    """Make a question of the function that asks it; the function's docstring is the assumption."""
+    """Make a question of the function that asks it; the function's docstring is the assumption.
 
-    def made(ask: Ask) -> Question:
+    ``code`` are the files that rely on it and ``aws`` the pages that document it, with spaces between.
+    """
+
+    def decorate(ask: Ask) -> Question:
         return Question(
             name=name,
             assumed=" ".join((ask.__doc__ or "").split()),
             expected=expected,
-            relied_on_by=relied_on_by,
+            relied_on_by=tuple(code.split()),
             ask=ask,
-            source=source,
+            source=pages(aws),
             phase=phase,
             not_embedded=not_embedded,
         )
 
-    return made
+    return decorate
+
+
+def pages(names: str) -> str:
+    """The addresses of AWS' pages, in words. Raises `KeyError` for an unknown guide."""
+    *others, last = [_page(name) for name in names.split()] or [""]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _page(name: str) -> str:
+    guide, _, file = name.partition(":")
+    return name if guide == "https" else f"{GUIDES[guide]}/{file}.html"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +127,7 @@ class Answer:
 def ask(
     question: Question, target: Target, clock: Callable[[], float], expected: Seen | None = None
 ) -> Answer:
-    """Ask one question. A service error is an answer too, and never ends the run.
+    """Ask one question, and undo what it made. A service error is an answer too, and never ends the run.
 
     ``expected`` replaces the question's own value if AWS has been measured.
     """
@@ -115,7 +139,8 @@ def ask(
         return Answer(question=question, verdict=verdict, reason=reason, took_s=clock() - began)
 
     try:
-        seen = json.loads(json.dumps(question.ask(target)))
+        with Lab(target) as lab:
+            seen = json.loads(json.dumps(question.ask(lab)))
     except CannotAskError as error:
         return ended(Verdict.NOT_ASKED, str(error))
     except Exception as error:  # noqa: BLE001 - an answer of another form is one too, and the next are asked

@@ -5,17 +5,14 @@ from __future__ import annotations
 import concurrent.futures
 import json
 import time
-from typing import Any
 
 from iort_contract.messages.envelope import rule_event
 from iort_contract.tables import BY_FUNCTION, TOPIC
-from iort_contract.topics import LAMBDA, PING, build_topic
-from testkit.target import Target, temporary_function
-from testkit.waiting import InstrumentError, until
-from verify.question import CannotAskError, Seen, question
-from verify.tools import lines, only_entry
+from iort_contract.topics import LAMBDA, PING
+from testkit.waiting import until
+from verify.lab import CannotAskError, Lab
+from verify.question import Seen, question
 
-_GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256
 _WITHIN_S = 180.0
 # The newer parameters that functions/ passes to boto3's clients.
@@ -24,20 +21,6 @@ _PARAMETERS = {
     "PutObject": ["ChecksumSHA256", "IfNoneMatch"],
     "UploadPart": ["ChecksumSHA256"],
 }
-# AWS keeps so many executions for functions that reserve none.
-_LIMIT, _CALLS, _UNRESERVED = 10, 20, 100
-_EVENT = "verify: an event ran"
-_HOLDING = f"""
-import time
-
-def handler(event, context):
-    if "event" in event:
-        print("{_EVENT}", flush=True)
-    began = time.time()
-    time.sleep(1 if "event" in event else 4)
-    return [began, time.time()]
-"""
-_RAISING = "def handler(event, context):\n    raise ValueError('not JSON')\n"
 _ENVIRONMENT = ("AWS_LAMBDA_FUNCTION_MEMORY_SIZE", "AWS_LAMBDA_FUNCTION_NAME", "AWS_REGION")
 _RUNTIME = f"""
 import os, sys
@@ -46,7 +29,7 @@ import boto3
 def handler(event, context):
     model = boto3.client("s3", region_name="eu-central-1").meta.service_model
     return {{
-        "python": list(sys.version_info[:2]),
+        "python": "%d.%d" % sys.version_info[:2],
         "boto3": boto3.__version__,
         "unknown": [
             f"{{operation}}.{{name}}"
@@ -66,6 +49,7 @@ def handler(event, context):
 
 @question(
     "functions.runtime",
+    code="functions/upload.py stacks/parts.py functions/live.py",
     expected={
         "parameters_that_boto3_does_not_know": [],
         "environment": list(_ENVIRONMENT),
@@ -73,54 +57,59 @@ def handler(event, context):
         "time_is_limited": True,
         "arn_is_a_functions": True,
     },
-    relied_on_by=("functions/upload.py", "stacks/parts.py", "functions/live.py"),
 )
-def runtime(target: Target) -> Seen:
+def runtime(lab: Lab) -> Seen:
     """boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and the
     context have memory, name and time left."""
-    client = target.cloud.client("lambda")
-    with temporary_function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
-        answer = client.invoke(FunctionName=name, Payload=b"{}")
-        found = json.loads(answer["Payload"].read())
-        if "FunctionError" in answer:
-            raise InstrumentError(f"the function failed: {found}")
-        named = client.get_function_configuration(FunctionName=name)["Runtime"]
+    function = lab.function("runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30)
+    answer = lab.invoke(function)
     return {
-        "parameters_that_boto3_does_not_know": found["unknown"],
-        "environment": found["environment"],
-        "memory_mb": found["memory_mb"],
-        "time_is_limited": 0 < found["remaining_ms"] <= 30_000,
-        "arn_is_a_functions": found["arn"] == "function",
-        "note_runtime": named,
-        "note_python": ".".join(map(str, found["python"])),
-        "note_boto3": found["boto3"],
-        "note_cores": found["cores"],
-        "note_log_format": found["log_format"],
+        "parameters_that_boto3_does_not_know": answer["unknown"],
+        "environment": answer["environment"],
+        "memory_mb": answer["memory_mb"],
+        "time_is_limited": 0 < answer["remaining_ms"] <= 30_000,
+        "arn_is_a_functions": answer["arn"] == "function",
+        "note_runtime": lab.configuration(function)["Runtime"],
+        **{f"note_{name}": answer[name] for name in ("python", "boto3", "cores", "log_format")},
     }
 
 
 @question(
     "functions.python",
+    aws="lambda:lambda-runtimes",
+    code="stacks/parts.py scripts/setup.py",
     expected={"runs_as_named": True},
-    source=f"{_GUIDE}/lambda-runtimes.html",
-    relied_on_by=("stacks/parts.py", "scripts/setup.py"),
     not_embedded="the embedded cloud runs the functions with its host's Python",
 )
-def python(target: Target) -> Seen:
+def python(lab: Lab) -> Seen:
     """The runtime python3.13 runs Python 3.13, for which the layer is built."""
     source = "import sys\n\ndef handler(event, context):\n    return 'python%d.%d' % sys.version_info[:2]\n"
-    client = target.cloud.client("lambda")
-    with temporary_function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
-        named = client.get_function_configuration(FunctionName=name)["Runtime"]
-        runs = json.loads(client.invoke(FunctionName=name, Payload=b"{}")["Payload"].read())
-    return {"runs_as_named": runs == named, "note_python": runs}
+    function = lab.function("python", source, memory_mb=_MEMORY_MB, timeout_s=30)
+    runs = lab.invoke(function)
+    return {"runs_as_named": runs == lab.configuration(function)["Runtime"], "note_python": runs}
 
 
-def _limit(client: Any, name: str) -> None:
+# AWS keeps so many executions for functions that reserve none.
+_LIMIT, _CALLS, _UNRESERVED = 10, 20, 100
+_EVENT = "verify: an event ran"
+_HOLDING = f"""
+import time
+
+def handler(event, context):
+    if "event" in event:
+        print("{_EVENT}", flush=True)
+    began = time.time()
+    time.sleep(1 if "event" in event else 4)
+    return [began, time.time()]
+"""
+
+
+def _limit(lab: Lab, name: str) -> None:
     """Give a function ten executions; a new account has no more for all.
 
     Raises `CannotAskError` if the account has more than ten, and too few to reserve ten.
     """
+    client = lab.client("lambda")
     account = client.get_account_settings()["AccountLimit"]
     if account["UnreservedConcurrentExecutions"] >= _UNRESERVED + _LIMIT:
         client.put_function_concurrency(FunctionName=name, ReservedConcurrentExecutions=_LIMIT)
@@ -130,17 +119,18 @@ def _limit(client: Any, name: str) -> None:
 
 @question(
     "functions.ten_at_once",
+    aws="lambda:lambda-concurrency lambda:invocation-async-error-handling",
+    code="stacks/settings.py stacks/states.py stacks/processing.py",
     expected={"more_than_ten_at_once": False, "throttled": True, "events_run": _CALLS},
-    source=f"{_GUIDE}/lambda-concurrency.html and {_GUIDE}/invocation-async-error-handling.html",
-    relied_on_by=("stacks/settings.py", "stacks/states.py", "stacks/processing.py"),
 )
-def ten_at_once(target: Target) -> Seen:
+def ten_at_once(lab: Lab) -> Seen:
     """Of twenty calls at a limit of ten executions, which is a new account's, ten run at once, and the others
     are refused with 429 (TooManyRequestsException). Twenty events all run: Lambda tries them again."""
-    client, echo = target.cloud.client("lambda"), target.cloud.output("processing", "EchoFunction")
-    since_ms = int(time.time() * 1000)
+    client, echo = lab.client("lambda"), lab.cloud.output("processing", "EchoFunction")
+    since_ms, name = int(time.time() * 1000), lab.function("ten", _HOLDING, memory_mb=128, timeout_s=30)
+    _limit(lab, name)
 
-    def call(name: str) -> tuple[list[float], bool]:
+    def call(_number: int) -> tuple[list[float], bool]:
         """When a call ran, and whether it was refused before, so that botocore tried again."""
         try:
             answer = client.invoke(FunctionName=name, Payload=b"{}")
@@ -149,15 +139,13 @@ def ten_at_once(target: Target) -> Seen:
         return json.loads(answer["Payload"].read()), answer["ResponseMetadata"]["RetryAttempts"] > 0
 
     def events() -> int:
-        return sum(_EVENT in line for line in lines(target, echo, since_ms))
+        return sum(_EVENT in line for line in lab.lines(echo, since_ms))
 
-    with temporary_function(target, "ten", _HOLDING, memory_mb=128, timeout_s=30) as name:
-        _limit(client, name)
-        with concurrent.futures.ThreadPoolExecutor(_CALLS) as pool:
-            calls = list(pool.map(call, [name] * _CALLS))
-        for _ in range(_CALLS):
-            client.invoke(FunctionName=name, InvocationType="Event", Payload=b'{"event": true}')
-        until(lambda: events() >= _CALLS, "twenty events at a limit of ten", within_s=_WITHIN_S)
+    with concurrent.futures.ThreadPoolExecutor(_CALLS) as pool:
+        calls = list(pool.map(call, range(_CALLS)))
+    for _ in range(_CALLS):
+        client.invoke(FunctionName=name, InvocationType="Event", Payload=b'{"event": true}')
+    until(lambda: events() >= _CALLS, "twenty events at a limit of ten", within_s=_WITHIN_S)
     ran = [times for times, _ in calls if times]
     most = max(sum(begin <= at < end for begin, end in ran) for at, _ in ran)
     return {
@@ -169,8 +157,13 @@ def ten_at_once(target: Target) -> Seen:
     }
 
 
+_RAISING = "def handler(event, context):\n    raise ValueError('not JSON')\n"
+
+
 @question(
     "functions.failed_invocation",
+    aws="lambda:invocation-async-retain-records",
+    code="functions/quarantine.py stacks/processing.py",
     expected={
         "source": True,
         "topic": True,
@@ -178,28 +171,20 @@ def ten_at_once(target: Target) -> Seen:
         "says_why": True,
         "message_as_sent": True,
     },
-    source=f"{_GUIDE}/invocation-async-retain-records.html",
-    relied_on_by=("functions/quarantine.py", "stacks/processing.py"),
 )
-def failed_invocation(target: Target) -> Seen:
+def failed_invocation(lab: Lab) -> Seen:
     """A failed asynchronous invocation without retries reaches the destination with its event, the
     function's ARN, the condition RetriesExhausted and the error's message."""
     # No function of ours fails by a message; this one has the destination of one that a rule calls.
-    bundle, client = target.robot("verify-failure"), target.cloud.client("lambda")
-    message = b"\xff no ping"
-    topic = build_topic(PING, bundle.robot, LAMBDA, target.cloud.namespace)
-    event = rule_event(message, topic, int(time.time() * 1000))
-    with temporary_function(target, "raising", _RAISING, memory_mb=128) as name:
-        ours = client.get_function_event_invoke_config(
-            FunctionName=target.cloud.output("processing", "EchoFunction"), Qualifier="$LATEST"
-        )
-        client.put_function_event_invoke_config(
-            FunctionName=name,
-            MaximumRetryAttempts=ours["MaximumRetryAttempts"],
-            DestinationConfig=ours["DestinationConfig"],
-        )
-        client.invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
-        entry = only_entry(target, bundle.robot, within_s=_WITHIN_S)
+    robot, client, message = lab.robot("verify-failure").robot, lab.client("lambda"), b"\xff no ping"
+    event = rule_event(message, lab.topic(PING, robot, LAMBDA), int(time.time() * 1000))
+    name = lab.function("raising", _RAISING, memory_mb=128)
+    echo = lab.cloud.output("processing", "EchoFunction")
+    ours = client.get_function_event_invoke_config(FunctionName=echo, Qualifier="$LATEST")
+    same = {key: ours[key] for key in ("MaximumRetryAttempts", "DestinationConfig")}
+    client.put_function_event_invoke_config(FunctionName=name, **same)
+    client.invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
+    entry = lab.only_entry(robot, within_s=_WITHIN_S)
     return {
         "source": entry.source == f"{BY_FUNCTION} {name}",
         "topic": entry.topic == event[TOPIC],

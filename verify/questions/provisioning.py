@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +23,14 @@ from iort_contract.tables import (
 )
 from iort_station.fleet import identity, registry
 from testkit.mqtt import refusal
-from testkit.target import Target
 from testkit.waiting import InstrumentError
+from verify.lab import Lab
 from verify.question import Seen, question
-from verify.tools import removed_after
 
-_GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
-_HOOK = f"{_GUIDE}/pre-provisioning-hook.html"
-_PROVISION = f"{_GUIDE}/provision-wo-cert.html"
 _REFUSED = re.compile(r"RegisterThing was refused: (\w+)")
 _OPEN_S = 600
 _SERIAL = "verify"
-
-
-_MADE = {
+_DONE = {
     "refused": "",
     "thing_type_is_the_fleets": True,
     "attributes": ["serial", "vehicle"],
@@ -46,159 +40,135 @@ _MADE = {
 }
 
 
-class _RefusedError(InstrumentError):
-    """RegisterThing was refused; the error's text is the code."""
-
-
-@contextmanager
-def _agent() -> Iterator[None]:
-    """Run the agent's code; its errors become this package's error."""
+def _refused(exchange: Callable[[], object]) -> str:
+    """The code with which RegisterThing is refused by the agent's code; "" if it succeeds."""
     try:
-        yield
+        exchange()
     except IdentityError as error:
         if code := _REFUSED.search(str(error)):
-            raise _RefusedError(code[1]) from error
+            return code[1]
         raise InstrumentError(str(error)) from error
-
-
-def _provision(file: Path, robot: str | None = None) -> str:
-    """The code with which RegisterThing is refused; "" if it succeeds."""
-    try:
-        with _agent():
-            provision.provision(file, robot=robot)
-    except _RefusedError as error:
-        return str(error)
     return ""
 
 
-def _claim(target: Target, robot: str | None, folder: Path, *, lasting: bool = False) -> Path:
+def _claim(lab: Lab, robot: str | None, folder: Path, *, lasting: bool = False) -> Path:
     """A claim's file with a serial number: not every machine here has one."""
-    file = identity.claim(target.cloud, robot, out=folder, lasting=lasting)
+    file = identity.claim(lab.cloud, robot, out=folder, lasting=lasting)
     file.write_text(file.read_text() + yaml.safe_dump({"serial": _SERIAL}))
     return file
 
 
-def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any]:
+def _certificates(lab: Lab, robot: str) -> list[str]:
+    """The states of a robot's certificates."""
+    return [certificate.status for certificate in identity.certificates(lab.cloud, robot)]
+
+
+def _provisioned(lab: Lab, robot: str, folder: Path, file: Path) -> dict[str, Any]:
     """The result of a robot's provisioning."""
-    if refused := _provision(file, robot):
+    if refused := _refused(partial(provision.provision, file, robot=robot)):
         return {"refused": refused}
-    thing = target.cloud.client("iot").describe_thing(thingName=robot)
+    thing = lab.client("iot").describe_thing(thingName=robot)
     return {
         "refused": "",
-        "thing_type_is_the_fleets": thing.get("thingTypeName") == fleet_name(target.cloud.namespace),
+        "thing_type_is_the_fleets": thing.get("thingTypeName") == fleet_name(lab.namespace),
         "attributes": sorted(thing["attributes"]),
-        "certificates": [one.status for one in identity.certificates(target.cloud, robot)],
-        "name_is_closed_again": ADMITTED_CERTIFICATE in registry.get(target.cloud, robot),
+        "certificates": _certificates(lab, robot),
+        "name_is_closed_again": ADMITTED_CERTIFICATE in registry.get(lab.cloud, robot),
         "connects": refusal(folder) is None,
     }
 
 
 @question(
     "provisioning.claim_for_minutes",
-    expected=_MADE,
-    source=f"{_PROVISION} and {_HOOK}",
-    relied_on_by=(
-        "station/iort_station/fleet/identity.py",
-        "functions/admit.py",
-        "device/iort_agent/verbs/provision.py",
-        "stacks/fleet.py",
-        "local/patches/certificate_from_csr.patch",
-    ),
+    aws="iot:provision-wo-cert iot:pre-provisioning-hook",
+    code="""station/iort_station/fleet/identity.py functions/admit.py device/iort_agent/verbs/provision.py
+    stacks/fleet.py local/patches/certificate_from_csr.patch""",
+    expected=_DONE,
 )
-def claim_for_minutes(target: Target) -> Seen:
+def claim_for_minutes(lab: Lab) -> Seen:
     """A claim of CreateProvisioningClaim is exchanged for a certificate of the robot's own key. The hook
     admits it, and the template creates the thing and attaches certificate and policy."""
-    with removed_after(target, "verify-own-claim") as (name, folder):
-        return _made(target, name, folder, _claim(target, name, folder))
+    name, folder = lab.removed_after("verify-own-claim")
+    return _provisioned(lab, name, folder, _claim(lab, name, folder))
 
 
 @question(
     "provisioning.claim_that_lasts",
-    expected=_MADE,
-    source=f"{_PROVISION} and {_HOOK}",
-    relied_on_by=(
-        "station/iort_station/fleet/identity.py",
-        "functions/admit.py",
-        "stacks/fleet.py",
-    ),
+    aws="iot:provision-wo-cert iot:pre-provisioning-hook",
+    code="station/iort_station/fleet/identity.py functions/admit.py stacks/fleet.py",
+    expected=_DONE,
 )
-def claim_that_lasts(target: Target) -> Seen:
+def claim_that_lasts(lab: Lab) -> Seen:
     """A claim certificate with the fleet's claim policy is exchanged in the same way."""
-    with removed_after(target, "verify-lasting-claim") as (name, folder):
-        file = _claim(target, None, folder, lasting=True)
-        try:
-            identity.register(target.cloud, name, days=1)
-            return _made(target, name, folder, file)
-        finally:
-            identity.revoke_claims(target.cloud)
+    name, folder = lab.removed_after("verify-lasting-claim")
+    file = _claim(lab, None, folder, lasting=True)
+    lab.undo(identity.revoke_claims, lab.cloud)
+    identity.register(lab.cloud, name, days=1)
+    return _provisioned(lab, name, folder, file)
 
 
 @question(
     "provisioning.claim_known_by",
+    code="functions/admit.py station/iort_station/fleet/registry.py",
     expected={"by_one_of_both": True},
-    relied_on_by=("functions/admit.py", "station/iort_station/fleet/registry.py"),
 )
-def claim_known_by(target: Target) -> Seen:
+def claim_known_by(lab: Lab) -> Seen:
     """The hook's claimCertificateId is the id of CreateProvisioningClaim or the SHA-256 of its certificate.
     AWS does not document which; both are accepted."""
     # Open one name for the claim's id alone, and another for its fingerprint alone.
-    nobody, seen = "0" * 64, {}
+    nobody, known = "0" * 64, dict[str, bool]()
     for which in (ADMIT_CLAIM, ADMIT_FINGERPRINT):
-        with removed_after(target, f"verify-by-{which}") as (name, folder):
-            file = _claim(target, name, folder)
-            row = registry.get(target.cloud, name)
-            known = {ADMIT_CLAIM: nobody, ADMIT_FINGERPRINT: nobody, which: row[which]}
-            by = registry.ClaimId(known[ADMIT_CLAIM], known[ADMIT_FINGERPRINT])
-            registry.open_name(target.cloud, name, for_s=_OPEN_S, claim=by)
-            seen[which] = not _provision(file)
+        name, folder = lab.removed_after(f"verify-by-{which}")
+        file = _claim(lab, name, folder)
+        ids = {ADMIT_CLAIM: nobody, ADMIT_FINGERPRINT: nobody, which: registry.get(lab.cloud, name)[which]}
+        claim = registry.ClaimId(ids[ADMIT_CLAIM], ids[ADMIT_FINGERPRINT])
+        registry.open_name(lab.cloud, name, for_s=_OPEN_S, claim=claim)
+        known[which] = not _refused(partial(provision.provision, file, robot=None))
     return {
-        "by_one_of_both": any(seen.values()),
-        "note_by_the_id": seen[ADMIT_CLAIM],
-        "note_by_the_fingerprint": seen[ADMIT_FINGERPRINT],
+        "by_one_of_both": any(known.values()),
+        "note_by_the_id": known[ADMIT_CLAIM],
+        "note_by_the_fingerprint": known[ADMIT_FINGERPRINT],
     }
 
 
 @question(
     "provisioning.registered_again",
+    code="device/iort_agent/verbs/provision.py functions/admit.py",
     expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
-    relied_on_by=("device/iort_agent/verbs/provision.py", "functions/admit.py"),
 )
-def registered_again(target: Target) -> Seen:
+def registered_again(lab: Lab) -> Seen:
     """RegisterThing with the same certificate and token succeeds again: the agent retries after a lost
     first answer."""
-    # RegisterThing twice, like the agent after a lost first answer.
-    with removed_after(target, "verify-again") as (name, folder):
-        claim = load_claim(_claim(target, name, folder))
-        _, request = make_key(name)
-        parameters = {ROBOT_PARAMETER: name, SERIAL_PARAMETER: _SERIAL}
-        with _agent(), Exchange(claim) as exchange:
+    name, folder = lab.removed_after("verify-again")
+    claim, (_, request) = load_claim(_claim(lab, name, folder)), make_key(name)
+    parameters = {ROBOT_PARAMETER: name, SERIAL_PARAMETER: _SERIAL}
+    try:
+        with Exchange(claim) as exchange:
             _, token = exchange.certify(request)
             first = exchange.register(token, parameters)
-            code = ""
-            try:
-                with _agent():
-                    exchange.register(token, parameters)
-            except _RefusedError as error:
-                code = str(error)
-        held = identity.certificates(target.cloud, name)
-    return {
-        "first_is_its_own": first == name,
-        "again_refused": code,
-        "certificates": [one.status for one in held],
-    }
+            refused = _refused(partial(exchange.register, token, parameters))
+    except IdentityError as error:
+        raise InstrumentError(str(error)) from error
+    own, certificates = first == name, _certificates(lab, name)
+    return {"first_is_its_own": own, "again_refused": refused, "certificates": certificates}
 
 
 @question(
     "provisioning.name_taken",
+    aws="iot:pre-provisioning-hook",
+    code="functions/admit.py",
     expected={"first": "", "second_is_refused": True, "certificates": 1},
-    source=_HOOK,
-    relied_on_by=("functions/admit.py",),
 )
-def name_taken(target: Target) -> Seen:
+def name_taken(lab: Lab) -> Seen:
     """The hook refuses a second certificate for a taken name, and RegisterThing fails with it; the
     certificate is not attached."""
-    with removed_after(target, "verify-taken") as (name, folder):
-        file = _claim(target, name, folder)
-        first, second = _provision(file), _provision(file)
-        held = identity.certificates(target.cloud, name)
-    return {"first": first, "second_is_refused": bool(second), "certificates": len(held), "note_code": second}
+    name, folder = lab.removed_after("verify-taken")
+    file = _claim(lab, name, folder)
+    first, second = (_refused(partial(provision.provision, file, robot=None)) for _ in range(2))
+    certificates = len(_certificates(lab, name))
+    return {
+        "first": first,
+        "second_is_refused": bool(second),
+        "certificates": certificates,
+        "note_code": second,
+    }

@@ -39,7 +39,7 @@ from iort_contract.tables import (
 from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
 from testkit.dynamodb import QUARANTINE, TOPIC_OF_CAR
 from tests.rule_sql import evaluate
-from verify.tools import spoofed
+from verify.lab import spoofed
 
 RAW = b"\xff\x00not JSON, not even text"
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
