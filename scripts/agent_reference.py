@@ -18,33 +18,20 @@ from iort_agent.errors import ConfigError
 _PLACE = Place(Path("car.yaml"), "key")
 
 
-class Section(NamedTuple):
-    """A mapping of car.yaml: its path, what it is, and a row for each key."""
+class Part(NamedTuple):
+    """A mapping of car.yaml, or a command of `iort-agent`: its path, what it is, and a row for each key."""
 
     path: str
     meaning: str
-    rows: list[tuple[str, str, str]]
+    rows: list[tuple[str, ...]]
 
 
-class Command(NamedTuple):
-    """A command of `iort-agent`: its name, what it does, and a row for each option."""
-
-    name: str
-    meaning: str
-    rows: list[tuple[str, str]]
-
-
-def commands() -> list[Command]:
-    """Every command."""
-    (choices,) = (
-        action.choices
-        for action in command_line()._actions  # noqa: SLF001 - argparse has no other way to list them
-        if isinstance(action, argparse._SubParsersAction)  # noqa: SLF001 - as above
-    )
-    return [
-        Command(name, parser.description or "", [_option(action) for action in parser._actions[1:]])  # noqa: SLF001 - as above
-        for name, parser in choices.items()
-    ]
+def commands() -> Iterator[Part]:
+    """Every command of `iort-agent`."""
+    for action in command_line()._actions:  # noqa: SLF001 - argparse has no other way to list them
+        if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001 - as above
+            for name, parser in action.choices.items():
+                yield Part(name, parser.description or "", [*map(_option, parser._actions[1:])])  # noqa: SLF001 - as above
 
 
 def _option(action: argparse.Action) -> tuple[str, str]:
@@ -53,19 +40,16 @@ def _option(action: argparse.Action) -> tuple[str, str]:
     return f"`{' '.join((*action.option_strings, str(values))).strip()}`", f"{action.help}{required}"
 
 
-def sections() -> list[Section]:
-    """Every section, each before those within it."""
-    return list(_sections("", Config))
-
-
-def _sections(path: str, cls: type[Any]) -> Iterator[Section]:
+def sections(path: str = "", cls: type[Any] = Config) -> Iterator[Part]:
+    """Every section of car.yaml, each before those within it."""
     rules, fields = rules_of(cls), dataclasses.fields(cls)
-    rows = [(f"`{field.name}`", _default(field), _allowed(rules[field.name])) for field in fields]
-    meaning = re.sub(r"``(.+?)``", r"`\1`", " ".join((cls.__doc__ or "").split()))
-    yield Section(path, meaning, rows)
+    rows: list[tuple[str, ...]] = [
+        (f"`{field.name}`", _default(field), _allowed(rules[field.name])) for field in fields
+    ]
+    yield Part(path, re.sub(r"``(.+?)``", r"`\1`", " ".join((cls.__doc__ or "").split())), rows)
     for field in fields:
         for suffix, inner in _nested(rules[field.name]):
-            yield from _sections(f"{path}.{field.name}{suffix}".lstrip("."), inner)
+            yield from sections(f"{path}.{field.name}{suffix}".lstrip("."), inner)
 
 
 def _nested(rule: Rule, suffix: str = "") -> Iterator[tuple[str, type[Any]]]:
@@ -75,16 +59,12 @@ def _nested(rule: Rule, suffix: str = "") -> Iterator[tuple[str, type[Any]]]:
     """
     found = inspect.getclosurevars(rule)
     for name, value in {**found.globals, **found.nonlocals}.items():
-        if _is_section(value):
+        if inspect.isclass(value) and value is not Place and dataclasses.is_dataclass(value):
             yield suffix, value
         elif name == "classes" and isinstance(value, Mapping):
             yield from ((f"{suffix}, type {kind}", cls) for kind, cls in value.items())
         elif name in found.nonlocals and inspect.isfunction(value) and value.__name__.endswith("rule"):
             yield from _nested(value, suffix)
-
-
-def _is_section(value: Any) -> bool:
-    return inspect.isclass(value) and dataclasses.is_dataclass(value) and value is not Place
 
 
 def _default(field: dataclasses.Field[Any]) -> str:

@@ -10,8 +10,9 @@ import html
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,13 @@ import iort_station.errors
 from bench.report import Ratio
 from bench.sections.cost import fleets
 from iort_agent.sources.sim import faults as sim_faults
+from iort_contract.catalog import alarms as catalogued
+from iort_contract.catalog.alarms import Alarm
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.catalog.derived import DERIVED
-from iort_contract.catalog.entries import Parameter
+from iort_contract.catalog.metrics import METRICS
 from iort_contract.catalog.questions import CAR_LIMITS, QUESTIONS
+from iort_contract.catalog.rules import RULES, Call, Store
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC
 from iort_contract.cloud import PUBNUB
@@ -35,65 +39,16 @@ from iort_contract.messages.commands import REFUSALS
 from iort_contract.messages.questions import REASONS
 from iort_station.cli.main import app
 from iort_station.cost import model, report
-from iort_station.cost.model import deployment_dollars_per_month
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
-from scripts import agent_reference, cloud_tables
-from scripts.page_contract import formula, page_contract
+from scripts import agent_reference
+from scripts import page_contract as typescript
+from scripts.page_contract import formula
+from stacks.settings import CONTEXT_KEYS, ROOT, Settings
 
-__all__ = [
-    "agent_manual",
-    "alarms",
-    "car_limits",
-    "car_yaml",
-    "cost",
-    "decisions",
-    "derived",
-    "errors",
-    "example",
-    "faults",
-    "fields",
-    "finding_kinds",
-    "finding_parameters",
-    "headline",
-    "manual",
-    "measured",
-    "metrics",
-    "month",
-    "page_contract",
-    "questions",
-    "reasons",
-    "refusals",
-    "rules",
-    "settings",
-    "spending",
-    "stream",
-]
-
-ROOT = Path(__file__).resolve().parent.parent
+Row = Iterable[str]
 FILES = tuple(
-    ROOT / name
-    for name in (
-        "README.md",
-        "docs/decisions/index.md",
-        "docs/explanation/benchmark.md",
-        "docs/explanation/findings.md",
-        "docs/how-to/alarms.md",
-        "docs/how-to/ask.md",
-        "docs/how-to/simulated-car.md",
-        "docs/reference/car-yaml.md",
-        "docs/reference/clients.md",
-        "docs/reference/deployment.md",
-        "docs/reference/errors.md",
-        "docs/reference/fields.md",
-        "docs/reference/metrics.md",
-        "docs/explanation/cost.md",
-        "docs/reference/iort-agent.md",
-        "docs/reference/iort.md",
-        "docs/reference/messages.md",
-        "docs/explanation/processing.md",
-        "docs/explanation/security.md",
-    )
+    page for page in (ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))) if "[[[cog" in page.read_text()
 )
 PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"
 EXAMPLES = ROOT / "docs" / "examples"
@@ -108,147 +63,169 @@ def main(*files: Path, check: bool = False) -> int:
     return int(Cog().main([*command, *map(str, files or (*FILES, PAGE))]))
 
 
-def fields() -> None:
-    """The VESC's fields, from the catalogue."""
-    rows = []
+page_contract = typescript.page_contract
+
+
+def table(*head: str) -> Callable[[Callable[..., Iterable[Row]]], Callable[..., None]]:
+    """Turn a function that gives a table's rows into a part that prints the table."""
+
+    def decorate(rows: Callable[..., Iterable[Row]]) -> Callable[..., None]:
+        @wraps(rows)
+        def part(*arguments: str) -> None:
+            _table(head, rows(*arguments), right=False)
+
+        return part
+
+    return decorate
+
+
+def _codes(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+@table("field", "unit", "meaning", "group", "ROS")
+def fields() -> Iterator[Row]:
+    """The VESC's fields."""
     for field in VESC.fields:
         unit = f"{field.unit} (ROS 2: {field.ros2_unit})" if field.ros2_unit else field.unit
-        versions = ", ".join(map(str, field.ros))
-        rows.append((f"`{field.name}`", unit, field.meaning, field.group, versions))
-    _table(("field", "unit", "meaning", "group", "ROS"), rows, right=False)
+        yield f"`{field.name}`", unit, field.meaning, field.group, ", ".join(map(str, field.ros))
 
 
-def faults() -> None:
+@table("fault", "what it does", "weak, middle, strong", "unit")
+def faults() -> Iterator[Row]:
     """The faults of a simulated car, with their strengths."""
-    rows = []
     for name, kind in sim_faults.KINDS.items():
         strengths = {", ".join(f"{one:g}" for one in of): field for field, of in kind.by_field.items()}
         if len(strengths) < 2:
             strengths = {", ".join(f"{one:g}" for one in kind.strengths): ", ".join(kind.by_field)}
-        told = "; ".join(f"{of} ({field})" if field else of for of, field in strengths.items())
-        rows.append((f"`{name}`", kind.meaning, told, kind.unit))
-    _table(("fault", "what it does", "weak, middle, strong", "unit"), rows, right=False)
+        texts = (f"{of} ({field})" if field else of for of, field in strengths.items())
+        yield f"`{name}`", kind.meaning, "; ".join(texts), kind.unit
 
 
-def finding_kinds() -> None:
-    """The kinds of findings, from the catalogue."""
-    rows = [
-        (
-            f"`{kind.name}`",
-            kind.meaning,
-            kind.action,
-            "; ".join(kind.alternatives) or "-",
-            ", ".join(f"`{name}`" for name in kind.explains) or "-",
-        )
-        for kind in KINDS.values()
-    ]
-    _table(("kind", "meaning", "what to do", "cannot be told from", "explains"), rows, right=False)
+@table("kind", "meaning", "what to do", "cannot be told from", "explains")
+def finding_kinds() -> Iterator[Row]:
+    """The kinds of findings."""
+    for kind in KINDS.values():
+        others, explained = "; ".join(kind.alternatives), _codes(kind.explains)
+        yield f"`{kind.name}`", kind.meaning, kind.action, others or "-", explained or "-"
 
 
-def finding_parameters() -> None:
-    """The parameters whose changes are findings, from the catalogue."""
-    rows = [
-        (f"`{one.name}`", one.meaning, one.worse, f"`{one.kind}`", _least_change(one))
-        for one in PARAMETERS.values()
-        if one.kind
-    ]
-    _table(("parameter", "meaning", "worse", "kind", "smallest change"), rows, right=False)
+@table("parameter", "meaning", "worse", "kind", "smallest change")
+def finding_parameters() -> Iterator[Row]:
+    """The parameters whose changes are findings."""
+    for one in PARAMETERS.values():
+        if one.kind:
+            least = [f"{one.least_share:.0%}"] if one.least_share else []
+            least += [f"{one.least:g} {one.unit}".removesuffix(" 1")] if one.least else []
+            yield f"`{one.name}`", one.meaning, one.worse, f"`{one.kind}`", " and ".join(least)
 
 
-def _least_change(parameter: Parameter) -> str:
-    parts = [f"{parameter.least_share:.0%}"] if parameter.least_share else []
-    parts += [f"{parameter.least:g} {parameter.unit}".removesuffix(" 1")] if parameter.least else []
-    return " and ".join(parts)
+@table("derived field", "unit", "meaning", "formula")
+def derived() -> Iterator[Row]:
+    """The derived fields."""
+    yield from ((f"`{d.name}`", d.unit, d.meaning, f"`{formula(d)}`") for d in DERIVED.values())
 
 
-def derived() -> None:
-    """The derived fields, from the catalogue."""
-    rows = [(f"`{d.name}`", d.unit, d.meaning, f"`{formula(d)}`") for d in DERIVED.values()]
-    _table(("derived field", "unit", "meaning", "formula"), rows, right=False)
+@table("field", "unit", "meaning")
+def stream(name: str) -> Iterator[Row]:
+    """The fields of a stream."""
+    yield from ((f"`{field.name}`", field.unit or "-", field.meaning) for field in CATALOG[name].fields)
 
 
-def stream(name: str) -> None:
-    """The fields of a stream, from the catalogue."""
-    rows = [(f"`{field.name}`", field.unit or "-", field.meaning) for field in CATALOG[name].fields]
-    _table(("field", "unit", "meaning"), rows, right=False)
-
-
-def settings() -> None:
+@table("key", "default", "meaning")
+def settings() -> Iterator[Row]:
     """The deployment's parameters."""
-    _table(("key", "default", "meaning"), cloud_tables.settings_rows(), right=False)
+    for name, field in Settings.model_fields.items():
+        if name in CONTEXT_KEYS:
+            default = str(field.default).replace(f"{ROOT}/", "").lower()
+            shown = "none" if default in ("none", "{}", "") else default.removesuffix(".0")
+            yield f"`{name}`", shown, field.description or ""
 
 
-def spending() -> None:
+@table("who", "what", "at most", "held by", "dollars a day")
+def spending() -> Iterable[Row]:
     """What one robot and one stranger can spend at most, by the default deployment's templates."""
     from scripts import ceilings  # noqa: PLC0415 - the CDK takes seconds to load
 
-    _table(("who", "what", "at most", "held by", "dollars a day"), ceilings.rows(), right=False)
+    return ceilings.rows()
 
 
-def questions() -> None:
-    """The questions that a robot may ask, from the catalogue."""
-    rows = [
-        (
-            f"`{q.name}`",
-            q.meaning,
-            str(q.per_hour),
-            str(q.timeout_s),
-            *map(_kib, (q.max_question_bytes, q.max_answer_bytes)),
-        )
-        for q in QUESTIONS.values()
-    ]
-    head = ("question", "answer", "a robot and hour", "s at most", "question, KiB", "answer, KiB")
-    _table(head, rows, right=False)
+@table("question", "answer", "a robot and hour", "s at most", "question, KiB", "answer, KiB")
+def questions() -> Iterator[Row]:
+    """The questions that a robot may ask."""
+    for q in QUESTIONS.values():
+        sizes = (f"{size / 1024:g}" for size in (q.max_question_bytes, q.max_answer_bytes))
+        yield f"`{q.name}`", q.meaning, str(q.per_hour), str(q.timeout_s), *sizes
 
 
-def car_limits() -> None:
-    """The limits of a car in the question raceline, from the catalogue."""
-    rows = [
-        (
-            f"`{one.name}`",
-            one.unit,
-            one.meaning,
-            f"{one.default:g}",
-            ", ".join(f"`{p}`" for p in one.calibrated),
-        )
-        for one in CAR_LIMITS.values()
-    ]
-    _table(("limit", "unit", "meaning", "default", "from the calibration"), rows, right=False)
+@table("limit", "unit", "meaning", "default", "from the calibration")
+def car_limits() -> Iterator[Row]:
+    """The limits of a car in the question raceline."""
+    for one in CAR_LIMITS.values():
+        yield f"`{one.name}`", one.unit, one.meaning, f"{one.default:g}", _codes(one.calibrated)
 
 
-def _code(name: str) -> str:
-    return f"`{name}`"
-
-
-def _kib(size: int) -> str:
-    return f"{size / 1024:g}"
-
-
-def reasons() -> None:
+@table("`refused`", "meaning")
+def reasons() -> Iterator[Row]:
     """Why a question has no answer."""
-    _table(("`refused`", "meaning"), [(f"`{name}`", text) for name, text in REASONS.items()], right=False)
+    yield from ((f"`{name}`", text) for name, text in REASONS.items())
 
 
-def refusals() -> None:
+@table("`outcome`", "meaning")
+def refusals() -> Iterator[Row]:
     """Why a motion was refused."""
-    _table(("`outcome`", "meaning"), [(f"`{name}`", text) for name, text in REFUSALS.items()], right=False)
+    yield from ((f"`{name}`", text) for name, text in REFUSALS.items())
 
 
-def rules() -> None:
-    """The topic rules, from the catalogue."""
-    _table(("rule", "what it does", "messages go to", "from"), cloud_tables.rule_rows(), right=False)
+@table("rule", "what it does", "messages go to", "from")
+def rules() -> Iterator[Row]:
+    """The topic rules: what each does, where its messages go, and its SELECT."""
+    for rule in RULES.values():
+        action = rule.action
+        if isinstance(action, Store):
+            target = f"table {action.table}"
+        elif isinstance(action, Call):
+            target = f"function `{action.function}`"
+        else:
+            target = f"topic `{action.lane}/.../{action.name}`"
+        yield f"`{rule.name}`", rule.meaning, target, f"`{rule.statement().split(' FROM ')[1]}`"
 
 
-def metrics() -> None:
-    """The metrics of the functions, from the catalogue."""
-    head = ("metric", "function", "unit", "statistic", "chart", "alarm")
-    _table(head, cloud_tables.metric_rows(), right=False)
+@table("metric", "function", "unit", "statistic", "chart", "alarm")
+def metrics() -> Iterator[Row]:
+    """The metrics of the functions."""
+    for metric in METRICS.values():
+        alarm = "yes" if metric.alarm else ""
+        yield f"`{metric.name}`", metric.function, metric.unit, metric.statistic, metric.chart.title, alarm
 
 
-def alarms() -> None:
-    """The alarms, from the catalogue."""
-    head = ("alarm", "what happened", "goes off", "what to do")
-    _table(head, cloud_tables.alarm_rows(), right=False)
+@table("alarm", "what happened", "goes off", "what to do")
+def alarms() -> Iterator[Row]:
+    """The alarms."""
+    ours = {metric.name: metric.alarm for metric in METRICS.values() if metric.alarm}
+    account = {name: alarm for (_, name), alarm in catalogued.OF_THE_ACCOUNT.items()}
+    # The resource's name stands before these.
+    resources = {f"...{ending}": alarm for ending, alarm in catalogued.OF_RESOURCES.items()}
+    for name, alarm in {**ours, **resources, **catalogued.OF_ONE_RESOURCE, **account}.items():
+        yield f"`{name}`", alarm.meaning, _condition(alarm), alarm.action
+
+
+def _condition(alarm: Alarm) -> str:
+    limit = f"`{alarm.threshold}`" if isinstance(alarm.threshold, str) else f"{alarm.threshold:g}"
+    often = f", {alarm.periods} of {alarm.within} minutes" if alarm.within else ""
+    if alarm.periods > 1 and not alarm.within:
+        often = f", {alarm.periods} minutes in a row"
+    return f"{'below' if alarm.below else 'above'} {limit}{often}"
+
+
+@table("error", "meaning")
+def errors() -> Iterator[Row]:
+    """The errors of the agent and of the station."""
+    for module in (iort_agent.errors, iort_station.errors):
+        for name, cls in vars(module).items():
+            if isinstance(cls, type) and issubclass(cls, Exception):
+                meaning = (cls.__doc__ or "").strip().splitlines()[0].replace("``", "`")
+                yield f"`{module.__name__}.{name}`", meaning
 
 
 def cost(name: str) -> None:
@@ -270,24 +247,24 @@ def cost(name: str) -> None:
 
 def month() -> None:
     """What the default deployment costs a month with a robot, all in, and what PubNub adds."""
+
+    def dollars(usage: Usage) -> tuple[float, float]:
+        """For the driving, and for the deployment itself."""
+        driving = model.dollars_per_month(model.bill(usage), usage)
+        return driving, sum(model.deployment_dollars_per_month(usage).values())
+
     usage = Usage(robots=1, hours_per_day=2.0)
-    driving, fixed = _month(usage)
     by_pubnub = replace(usage, live_transport=PUBNUB)
+    driving, fixed = dollars(usage)
     plan = model.pubnub_mau_dollars_per_month(by_pubnub) or 0.0
-    more = sum(_month(by_pubnub)) + plan - driving - fixed
-    total = f"${driving + fixed:.0f} a month"
-    print(f"With one robot that drives two hours a day, watched live, the default deployment costs {total}")
+    more = sum(dollars(by_pubnub)) + plan - driving - fixed
     print(
-        f"on AWS at most, all in, at list prices: ${driving:.0f} for the driving with archive and analysis,"
+        "With one robot that drives two hours a day, watched live, the default deployment costs "
+        f"${driving + fixed:.0f} a month\n"
+        f"on AWS at most, all in, at list prices: ${driving:.0f} for the driving with archive and analysis,\n"
+        "the rest for itself, mostly for metrics and alarms.\n"
+        f"Live over PubNub instead of AWS IoT adds ${more:.0f}, with PubNub's smallest plan."
     )
-    print("the rest for itself, mostly for metrics and alarms.")
-    print(f"Live over PubNub instead of AWS IoT adds ${more:.0f}, with PubNub's smallest plan.")
-
-
-def _month(usage: Usage) -> tuple[float, float]:
-    """AWS' dollars a month for the driving, and for the deployment itself."""
-    driving = model.dollars_per_month(model.bill(usage), usage)
-    return driving, sum(deployment_dollars_per_month(usage).values())
 
 
 def headline() -> None:
@@ -330,19 +307,8 @@ def car_yaml() -> None:
 def agent_manual() -> None:
     """The command `iort-agent`."""
     for command in agent_reference.commands():
-        print(f"\n## `iort-agent {command.name}`\n\n{command.meaning}\n")
+        print(f"\n## `iort-agent {command.path}`\n\n{command.meaning}\n")
         _table(("option", "meaning"), command.rows, right=False)
-
-
-def errors() -> None:
-    """The errors of the agent and of the station."""
-    rows = []
-    for module in (iort_agent.errors, iort_station.errors):
-        for name, cls in vars(module).items():
-            if isinstance(cls, type) and issubclass(cls, Exception):
-                meaning = (cls.__doc__ or "").strip().splitlines()[0].replace("``", "`")
-                rows.append((f"`{module.__name__}.{name}`", meaning))
-    _table(("error", "meaning"), rows, right=False)
 
 
 def example(name: str) -> None:
