@@ -87,7 +87,7 @@ def _invoked(calls: int, memory_mb: int) -> list[LineItem]:
 
 
 def _items(**units: float) -> list[LineItem]:
-    return [LineItem("", "", price, count) for price, count in units.items()]
+    return [LineItem("", price, count) for price, count in units.items()]
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:

@@ -23,7 +23,7 @@ from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.live import LiveSample, encode_live, encode_ping, live_update
+from iort_contract.messages.live import LiveSample, live_update
 from iort_contract.statistics import summarize_second
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
@@ -45,10 +45,9 @@ def main() -> None:
     """Print the constants of station/iort_station/cost/model.py."""
     for samples in SAMPLES:
         print(f"    Measured{tuple(batch_sizes(samples, 1.0))},")
-    print(f"OWN_ITEM_BYTES = {own_item_bytes()}")
-    print(f"ARCHIVED_SHARE = {archived_share():.2f}")
     for name, size in message_sizes().items():
-        print(f"    {name}: int = {size}")
+        print(f"{name} = {size}")
+    print(f"ARCHIVED_SHARE = {archived_share():.2f}")
 
 
 def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
@@ -65,17 +64,17 @@ def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
 
 
 def message_sizes() -> dict[str, int]:
-    """The sizes of messages and items with one sample, by the field of `iort_station.cost.model.Sizes`."""
+    """The sizes of messages and items with one sample, by the name of `iort_station.cost.model`."""
     (first,) = simulated_drive(1, after_s=_WARM_S)
     live = LiveSample(_BOOT, 100_000, _T_US, _T_US + 500, first)
     flat = {"boot": _BOOT, "seq": 100_000, "t": _T_US, **first}
+    update = json.dumps(live_update(_ROBOT, VESC_STREAM, live, _MS, _T_US), separators=(",", ":"))
+    sample = json.dumps(flat, separators=(",", ":"))
     return {
-        "live": len(encode_live(live)) + len(build_topic("live", _ROBOT, VESC_STREAM)),
-        "ping": len(encode_ping(100_000, _T_US)) + len(build_topic("ping", _ROBOT, "lambda")),
-        "update": len(json.dumps(live_update(_ROBOT, VESC_STREAM, live, _MS, _T_US), separators=(",", ":"))),
-        "sample": len(json.dumps(flat, separators=(",", ":")))
-        + len(build_topic(RECORD, _ROBOT, VESC_STREAM)),
-        "sample_item": item_bytes({**flat, **_rule()}),
+        "UPDATE_BYTES": len(update),
+        "OWN_ITEM_BYTES": own_item_bytes(),
+        "SAMPLE_BYTES": len(sample) + len(build_topic(RECORD, _ROBOT, VESC_STREAM)),
+        "SAMPLE_ITEM_BYTES": item_bytes({**flat, **_rule()}),
     }
 
 

@@ -10,7 +10,7 @@ from bench.sections import Declared
 from iort_contract.cloud import PUBNUB
 from iort_station.cost import model, report
 from iort_station.cost.prices import AS_OF, REGION
-from iort_station.cost.report import Rows, Scale, on_paper, times
+from iort_station.cost.report import Rows, times
 from iort_station.cost.usage import Usage
 from testkit.target import Say, Target
 
@@ -19,26 +19,23 @@ ROBOTS = (1, 100, 10_000, 1_000_000)
 
 def fleets(usage: Usage) -> Rows:
     """A column a fleet: the need of each quota as a multiple of it, and dollars a month."""
-    scales = [on_paper(replace(usage, robots=robots)) for robots in ROBOTS]
-    head = (
-        "needed, as a multiple of the default quota",
-        *(f"{scale.robots:,} robot{'s' * (scale.robots > 1)}" for scale in scales),
-    )
-    body: list[tuple[str, ...]] = []
-    for need in scales[-1].needs:
-        needs = [next(n.times for n in scale.needs if n.name == need.name) for scale in scales]
-        body.append((need.name, *(f"**{times(value)}**" if value > 1 else times(value) for value in needs)))
-    body.append(("breaks first", *(_first(scale) for scale in scales)))
-    body.append(("AWS, dollars a month", *(f"{scale.aws_dollars_per_month:,.0f}" for scale in scales)))
+    fleets = [replace(usage, robots=robots) for robots in ROBOTS]
+    needs = [{need.name: need.times for need in report.needs(fleet)} for fleet in fleets]
+    head = ("needed, as a multiple of the default quota", *map(report.robots, ROBOTS))
+    body: list[tuple[str, ...]] = [
+        (name, *(f"**{times(of[name])}**" if of[name] > 1 else times(of[name]) for of in needs))
+        for name in needs[-1]
+    ]
+    first = (next(iter(of.items())) for of in needs)
+    body.append(("breaks first", *(name if value > 1 else "none" for name, value in first)))
+    bills = {"AWS, dollars a month": model.bill}
     if usage.live_transport == PUBNUB:
-        dollars = (f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales)
-        body.append(("PubNub by transactions, a month", *dollars))
-        body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
+        bills["PubNub by transactions, a month"] = model.pubnub_bill
+    for what, bill in bills.items():
+        body.append((what, *(f"{model.dollars_per_month(bill(fleet), fleet):,.0f}" for fleet in fleets)))
+    if usage.live_transport == PUBNUB:
+        body.append(("PubNub, publishes/s", *(f"{usage.live_hz * robots:,.0f}" for robots in ROBOTS)))
     return Rows(head, body)
-
-
-def _first(scale: Scale) -> str:
-    return scale.breaks_first.name if scale.breaks_first.times > 1 else "none"
 
 
 # Computed, not measured: the same settings have the same cost.

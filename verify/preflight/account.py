@@ -7,7 +7,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import rule_name
-from iort_station.cost.report import on_paper
+from iort_station.cost import report
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import UNRESERVED, Settings
@@ -22,7 +22,7 @@ BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
 POLICY_VERSIONS = 5
 # The quotas should suffice for this fleet.
 ROBOTS = 100
-# Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/scale.py).
+# Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/report.py).
 IOT_CORE = "iotcore"
 RULES_QUOTA = "Maximum number of rules per AWS account"
 QUOTAS = {
@@ -160,7 +160,7 @@ def quotas(clients: Clients, settings: Settings) -> Found:
             f"{len(others)} rules of others and {len(ours)} of ours exceed the limit {values[RULES_QUOTA]:g}",
             "remove rules, or ask for more ('Service Quotas', AWS IoT Core)",
         )
-    needs = {need.name: need.needed for need in on_paper(Usage()).needs}
+    needs = {need.name: need.needed for need in report.needs(Usage())}
     robots = {name: values[name] / needs[need] for name, need in QUOTAS.items() if name in values}
     if CONNECTS_QUOTA in values:
         # After an outage the whole fleet reconnects within a minute.

@@ -1,4 +1,4 @@
-"""The cost model: the usage of each capability, in units of the price list, times the prices. Pure.
+"""The cost model: what each capability takes, in units of the price list, times the prices. Pure.
 
 `bill` has the line items for a `Usage`. `thesis_bill` has them for the same driving in the layout of the
 thesis that this project started from: each sample is one message, two items and one push. The rest is a
@@ -8,8 +8,8 @@ deployment's own month, a robot-year in the archive, and PubNub.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from math import ceil
 from typing import NamedTuple
 
@@ -24,16 +24,14 @@ METER, WRITE, READ, PUBNUB_UNIT = 5 * 1024, 1024, 4 * 1024, 2048
 _ITEM_OVERHEAD = 100
 _HOUR_S, _YEAR_DAYS = 3600.0, 365
 
-# --- sizes, as `python -m bench.load.message_sizes` measures them -------------------------------------
-
-# The telemetry item of one sample of the agent's metrics.
-OWN_ITEM_BYTES = 236
-# The archive's Parquet beside the items that are in it, of an hour that is driven from end to end.
-ARCHIVED_SHARE = 0.60
+# --- sizes, as `python -m bench.load.message_sizes` measures them ---------------------------------------
 
 
 class Measured(NamedTuple):
-    """Bytes of a batch's message and item, and of a second's summary, by their number of samples."""
+    """Bytes of a batch's message and item, and of a second's summary, by their number of samples.
+
+    Messages count with their topics, as AWS meters them; items with names and values.
+    """
 
     samples: int
     record: int
@@ -56,33 +54,19 @@ TABLE = (
     Measured(1000, 5444, 5424, 576),
     Measured(2000, 10368, 10348, 600),
 )
+# An update for PubNub, the telemetry item of one sample of the agent's metrics, and the thesis' flat JSON
+# message and item of one sample.
+UPDATE_BYTES, OWN_ITEM_BYTES, SAMPLE_BYTES, SAMPLE_ITEM_BYTES = 480, 236, 356, 277
+# The archive's Parquet beside the items that are in it, of an hour that is driven from end to end.
+ARCHIVED_SHARE = 0.60
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Bytes of messages with their topics, as AWS meters them, and of items with names and values.
-
-    ``sample`` is one sample as a flat JSON message.
-    """
-
-    record: int
-    telemetry_item: int
-    summary_item: int
-    live: int = 402
-    ping: int = 71
-    update: int = 480
-    sample: int = 356
-    sample_item: int = 277
-
-
-def sizes_of(rate_hz: float, batch_s: float) -> Sizes:
+def sizes_of(rate_hz: float, batch_s: float) -> Measured:
     """The sizes for a VESC's stream at this rate, in batches of this length."""
-    batch = _interpolated(rate_hz * batch_s)
-    return Sizes(batch.record, batch.telemetry_item, _interpolated(rate_hz).summary_item)
+    return _interpolated(rate_hz * batch_s)._replace(summary_item=_interpolated(rate_hz).summary_item)
 
 
 def _interpolated(samples: float) -> Measured:
-    """The sizes for a number of samples, interpolated between the two nearest rows."""
     rounded = min(max(1, round(samples)), TABLE[-1].samples)
     i = bisect_left(TABLE, (rounded,))
     above, below = TABLE[i], TABLE[max(0, i - 1)]
@@ -99,29 +83,22 @@ def units(size: int, unit: int) -> int:
 
 # --- what the capabilities take -------------------------------------------------------------------------
 
-# Units of a robot-hour by the price's name, of what makes them.
-Table = dict[str, dict[str, float]]
+# Units of a robot-hour by the price's name.
+Table = dict[str, float]
 # A shard of a stream is a partition of the table. Lambda 2 is invoked once a window, or once these records
 # are there; a test compares both with the stack. The thesis had no window: Lambda polls a shard 4 times a
 # second.
 _PARTITION_WRITES = 1000.0
 WINDOW_S, RECORDS_A_CALL = 2.0, 500
 _THESIS_POLLS_PER_S, _THESIS_RECORDS_A_CALL = 4.0, 100
+# Billed milliseconds of Lambda 2 for each batch in an event, which only AWS knows.
+_SUMMARIZE_BATCH_MS = 5.0
 # Bytes that the functions log in embedded metric format; a test compares them with functions/. Lambda 1
 # gathers its metrics: each environment logs a line in `_GATHER_S`, or sooner with a hundred values of one
 # metric; it has four values a message. Lambda 2 logs a line about itself, and one about each stream.
-_GATHER_S, _MOST_VALUES, _LIVE_LINE, _LIVE_VALUES = 10.0, 100.0, 480, 24
-_SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 310, 300, 220, 230
+_GATHER_S, _MOST_VALUES, _LIVE_VALUES = 10.0, 100.0, 24
+_LIVE_LINE, _SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 480, 310, 300, 220, 230
 _ANSWER_LINE, _ARCHIVE_LINE, _ANALYSIS_LINE = 260, 330, 260
-# A robot subscribes, with one filter a packet, to four answers of its shadow, three of its pings, its
-# viewers and commands. Then it fetches its shadow of less than 1 KB: a request, and an answer that it
-# acknowledges. AWS meters CONNECT, SUBSCRIBE and a device's PUBACK, not the broker's answers or keep-alives.
-SUBSCRIPTIONS = 9
-_SHADOW_MESSAGES = 3
-# `iort send` publishes, the robot receives and acknowledges. Of a question the robot publishes; the function
-# publishes, the robot receives and acknowledges. The function reads the newest drives' parameters, of some
-# 1 KB each; its time is a calibration's.
-_COMMAND_MESSAGES, _QUESTION_MESSAGES, _QUESTION_MS, _QUESTION_READS = 3, 4, 30.0, 13
 # Lambda's own log lines for an invocation.
 _REQUEST = "8f507cfc-xmpl-4697-b07a-ac58fc914c95"
 PLATFORM_LINES = (
@@ -130,6 +107,14 @@ PLATFORM_LINES = (
     f"REPORT RequestId: {_REQUEST}\tDuration: 12.34 ms\tBilled Duration: 13 ms\t"
     "Memory Size: 256 MB\tMax Memory Used: 81 MB\t\n"
 )
+# A robot subscribes, with one filter a packet, to four answers of its shadow, three of its pings, its
+# viewers and commands. Then it fetches its shadow of less than 1 KB: a request, and an answer that it
+# acknowledges. AWS meters CONNECT, SUBSCRIBE and a device's PUBACK, not the broker's answers or keep-alives.
+SUBSCRIPTIONS, _SHADOW_MESSAGES = 9, 3
+# `iort send` publishes, the robot receives and acknowledges. Of a question the robot publishes; the function
+# publishes, the robot receives and acknowledges. The function reads the newest drives' parameters, of some
+# 1 KB each; its time is a calibration's.
+_COMMAND_MESSAGES, _QUESTION_MESSAGES, _QUESTION_MS, _QUESTION_READS = 3, 4, 30.0, 13
 # The archive, as stacks/archive.py and stacks/storage.py deploy it; a test compares them. Billed seconds of
 # an hour or a day, of 180,000 samples in it (2.2 s of processor, as measured), and of a run that only plans;
 # the first and the last are assumptions.
@@ -154,73 +139,57 @@ _ANALYSED_SAMPLE_S, _RESULT_BYTES, _RESULT_MONTHS = 1.6 / 180_000, 5e5 / 180_000
 _STATES, _CALLS, _PLANNED_DAYS, _COMPARED_ROWS = 5, 3, 2, 320
 
 
-def _function(
-    usage: Usage,
-    calls: float,
-    *,
-    memory_mb: int,
-    billed_ms: float,
-    logged: float,
-    compute: str = "compute_arm",
-) -> dict[str, float]:
+def _function(usage: Usage, calls: float, memory_mb: int, billed_ms: float, logged: float) -> Table:
     """A function's invocations; ``logged`` counts the bytes of its own log lines in an hour."""
-    if usage.function_logs == "all":
-        logged += calls * len(PLATFORM_LINES)
+    logged += calls * len(PLATFORM_LINES) * (usage.function_logs == "all")
     gb_s = calls * memory_mb / 1024 * billed_ms / 1000
-    return {"invocation": calls, compute: gb_s, "logs": logged / 1e9}
+    return {"invocation": calls, "compute_arm": gb_s, "logs": logged / 1e9}
 
 
-def _kept(usage: Usage, count: float, size: int) -> dict[str, float]:
-    """The storage of ``count`` items an hour, in gigabyte-months."""
-    gb_months = count * (size + _ITEM_OVERHEAD) / 1e9 * usage.retention_days / MONTH_DAYS
+def _kept(usage: Usage, *items: tuple[float, int]) -> Table:
+    """The storage of items in gigabyte-months: how many an hour, and of what size."""
+    stored = sum(count * (size + _ITEM_OVERHEAD) for count, size in items)
+    gb_months = stored / 1e9 * usage.retention_days / MONTH_DAYS
     return {"storage": gb_months, **({"recovery": gb_months} if usage.recoverable else {})}
 
 
 def _connection(usage: Usage) -> Table:
     connects = usage.connects_per_hour
-    # The broker publishes when a connection begins and when it ends.
+    # The broker publishes when a connection begins and when it ends: presence.
     events = 2 * connects
-    logged = events * _PRESENCE_LINE
     return {
-        "minutes": {"connection": 60},
-        "CONNECT and SUBSCRIBE": {"message": connects * (1 + SUBSCRIPTIONS)},
-        "shadow request, answer and PUBACK": {"message": connects * _SHADOW_MESSAGES},
-        "the shadow read": {"shadow": connects},
-        "presence": {
-            **dict.fromkeys(("rule", "action", "write"), events),
-            **_function(usage, events, memory_mb=256, billed_ms=20.0, logged=logged),
-        },
+        "connection": 60,
+        "message": connects * (1 + SUBSCRIPTIONS + _SHADOW_MESSAGES),
+        "shadow": connects,
+        **dict.fromkeys(("rule", "action", "write"), events),
+        **_function(usage, events, 256, 20.0, events * _PRESENCE_LINE),
     }
 
 
 def _record(usage: Usage) -> Table:
-    """By Basic Ingest, which has no messaging charge."""
+    """By Basic Ingest, which has no messaging charge; then telemetry and summary."""
     sizes = sizes_of(usage.rate_hz, usage.batch_s)
     batches, own = usage.batches_per_s * _HOUR_S, usage.own_batches_per_s * _HOUR_S
     metered = batches * units(sizes.record, METER)
     # The batches of one stream in an event; one query reads them and those of the second before.
-    of_stream = usage.stream_batches_per_s
-    together = max(1.0, of_stream * _shards_of(usage) / summarize_calls_per_s(usage))
+    of_stream, calls_per_s = usage.stream_batches_per_s, summarize_calls_per_s(usage)
+    together = max(1.0, of_stream * _shards_of(usage) / calls_per_s)
     read = ceil(together + max(1.0, of_stream)) * sizes.telemetry_item
     # A second whose batches arrive in two events is written twice.
     seconds_written = batches * min(1.0, 1 / of_stream + (of_stream > 1) / together)
-    calls = summarize_calls_per_s(usage) * _HOUR_S / usage.robots
+    seconds = min(batches, usage.streams * _HOUR_S)
+    written = batches * units(sizes.telemetry_item, WRITE) + seconds_written * units(
+        sizes.summary_item, WRITE
+    )
+    calls = calls_per_s * _HOUR_S / usage.robots
+    logged = calls * _SUMMARIZE_LINE + (batches / together + own) * _HEALTH_LINE
+    ms = usage.summarize_ms + _SUMMARIZE_BATCH_MS * (batches + own) / calls
     return {
-        "batches": {"rule": metered, "action": metered},
-        "telemetry written": {"write": batches * units(sizes.telemetry_item, WRITE)},
-        "telemetry kept": _kept(usage, batches, sizes.telemetry_item),
-        "summary written": {"write": seconds_written * units(sizes.summary_item, WRITE)},
-        "summary kept": _kept(usage, min(batches, usage.streams * _HOUR_S), sizes.summary_item),
-        "Lambda 2": {
-            "read": batches / together * units(read, READ),
-            **_function(
-                usage,
-                calls,
-                memory_mb=usage.summarize_memory_mb,
-                billed_ms=usage.summarize_ms + usage.summarize_batch_ms * (batches + own) / calls,
-                logged=calls * _SUMMARIZE_LINE + (batches / together + own) * _HEALTH_LINE,
-            ),
-        },
+        **dict.fromkeys(("rule", "action"), metered),
+        "write": written,
+        "read": batches / together * units(read, READ),
+        **_kept(usage, (batches, sizes.telemetry_item), (seconds, sizes.summary_item)),
+        **_function(usage, calls, usage.summarize_memory_mb, ms, logged),
     }
 
 
@@ -228,49 +197,41 @@ def _own(usage: Usage) -> Table:
     """The agent's own streams, of a sample a batch; Lambda 2's calls are counted with the others."""
     own = usage.own_batches_per_s * _HOUR_S
     return {
-        "batches": {"rule": own, "action": own},
-        "telemetry and summary": {"write": 2 * own, "read": own},
-        "kept": _kept(usage, 2 * own, OWN_ITEM_BYTES),
+        **dict.fromkeys(("rule", "action", "read"), own),
+        "write": 2 * own,
+        **_kept(usage, (2 * own, OWN_ITEM_BYTES)),
     }
 
 
 def _live(usage: Usage) -> Table:
     by_pubnub = usage.live_per_s * _HOUR_S if usage.live_transport == PUBNUB else 0.0
-    logged = _live_lines_per_s(usage) * _HOUR_S / usage.robots * _LIVE_LINE + by_pubnub * _LIVE_VALUES
-    function = _function(
-        usage, by_pubnub, memory_mb=usage.live_memory_mb, billed_ms=usage.live_ms, logged=logged
-    )
-    # Two more rules, for faults and a low battery, evaluate each that passes the broker; an action is billed.
-    passing = usage.live_at_broker_per_s * _HOUR_S
-    table = {
-        "leases, sent and received": {"message": 2 * usage.leases_per_s * _HOUR_S},
-        "messages": {"message": passing, "rule": 2 * passing, "action": 2 * passing},
-        "Lambda 1": {"rule": by_pubnub, "action": by_pubnub, **function},
+    logged = live_lines_per_s(usage) * _HOUR_S / usage.robots * _LIVE_LINE + by_pubnub * _LIVE_VALUES
+    # By AWS IoT each viewer receives each message, and is connected.
+    receivers = usage.viewers if usage.live_transport == IOT else 0
+    passing, leases = usage.live_at_broker_per_s * _HOUR_S, usage.leases_per_s * _HOUR_S
+    return {
+        # A lease is sent and received.
+        "message": 2 * leases + passing * (1 + receivers),
+        # Two more rules, for faults and a low battery, evaluate each that passes the broker.
+        **dict.fromkeys(("rule", "action"), 2 * passing + by_pubnub),
+        "connection": 60 * usage.watched * receivers / usage.robots,
+        **_function(usage, by_pubnub, usage.live_memory_mb, usage.live_ms, logged),
     }
-    if usage.live_transport == IOT:
-        minutes = 60 * usage.watched * usage.viewers / usage.robots
-        table["viewers"] = {"message": passing * usage.viewers, "connection": minutes}
-    return table
 
 
 def _commands(usage: Usage) -> Table:
-    return {"sent, received, acknowledged": {"message": _COMMAND_MESSAGES * usage.command_hz * _HOUR_S}}
+    return {"message": _COMMAND_MESSAGES * usage.command_hz * _HOUR_S}
 
 
 def _questions(usage: Usage) -> Table:
-    """Questions that fit into a message, with their answers."""
-    asked = usage.questions_per_hour
+    """Questions that fit into a message, with their answers; each is counted in the robot's row."""
+    questions = usage.questions_per_hour
     memory_mb = max(question.memory_mb for question in QUESTIONS.values())
     return {
-        "questions and answers": {"message": _QUESTION_MESSAGES * asked, "rule": asked, "action": asked},
-        "answer": {
-            # Counted in the robot's row.
-            "write": asked,
-            "read": asked * _QUESTION_READS,
-            **_function(
-                usage, asked, memory_mb=memory_mb, billed_ms=_QUESTION_MS, logged=asked * _ANSWER_LINE
-            ),
-        },
+        "message": _QUESTION_MESSAGES * questions,
+        **dict.fromkeys(("rule", "action", "write"), questions),
+        "read": questions * _QUESTION_READS,
+        **_function(usage, questions, memory_mb, _QUESTION_MS, questions * _ANSWER_LINE),
     }
 
 
@@ -278,9 +239,9 @@ def _ping(usage: Usage) -> Table:
     """Ping and pong on each path; two of the three paths pass a rule, and one passes a function."""
     clock, pings = usage.clock_pings_per_s * _HOUR_S, usage.ping_hz * _HOUR_S
     return {
-        "clock pings and pongs": {"message": 2 * clock, "rule": clock, "action": clock},
-        "pings and pongs": {"message": 6 * pings, "rule": 2 * pings, "action": 2 * pings},
-        "echo": _function(usage, pings, memory_mb=256, billed_ms=5.0, logged=pings * _PONG_LINE),
+        "message": 2 * clock + 6 * pings,
+        **dict.fromkeys(("rule", "action"), clock + 2 * pings),
+        **_function(usage, pings, 256, 5.0, pings * _PONG_LINE),
     }
 
 
@@ -303,22 +264,20 @@ def recorded(usage: Usage) -> Recorded:
     return Recorded(
         table=batches * (item + _ITEM_OVERHEAD) + own * (OWN_ITEM_BYTES + _ITEM_OVERHEAD),
         reads=(batches * item + own * OWN_ITEM_BYTES) / READ,
-        moved=archived if is_moved else 0.0,
-        small=own_archived + (0.0 if is_moved else archived),
+        moved=archived * is_moved,
+        small=own_archived + archived * (not is_moved),
     )
 
 
 def _archive(usage: Usage) -> Table:
     """What docs/reference/archive.md tells, kept for ``archive_days``. Deleting objects is free."""
+    if not usage.archive_days:
+        return {}
     hour, days = recorded(usage), usage.archive_days
     standard, rarer = min(days, STANDARD_DAYS) / MONTH_DAYS, max(0, days - STANDARD_DAYS) / MONTH_DAYS
-    return {
-        **_archiving(usage, hour),
-        "kept": {
-            "s3_standard": (hour.moved * standard + hour.small * (standard + rarer)) / 1e9,
-            "s3_instant": hour.moved * rarer / 1e9,
-        },
-    }
+    in_standard = hour.moved * standard + hour.small * (standard + rarer)
+    kept = {"s3_standard": in_standard / 1e9, "s3_instant": hour.moved * rarer / 1e9}
+    return {**_archiving(usage, hour), **kept}
 
 
 def _archiving(usage: Usage, hour: Recorded) -> Table:
@@ -330,24 +289,18 @@ def _archiving(usage: Usage, hour: Recorded) -> Table:
     calls = written + searches + runs
     computing_s = _RUN_S * written + _PLAN_S * (searches + runs)
     computing_s += _ARCHIVED_SAMPLE_S * _HOUR_S * usage.samples_per_s
-    ms, logged = 1000 * computing_s / calls, _ARCHIVE_LINE * calls
     sought = min(_SOUGHT_DAYS, usage.retention_days * _SOUGHT_SHARE)
     return {
-        # DynamoDB bills a count as a read.
-        "items read, and counted before they expire": {"read": 2 * hour.reads},
-        "notes and rows": {
-            "read": streams * (_ARCHIVE_ROW_READS + sought),
-            "write": streams * _ARCHIVE_WRITES,
-        },
-        "scheduled": {"schedule": runs},
-        "tasks": {"queue_request": _TASK_REQUESTS * (written + searches)},
-        "archive": _function(usage, calls, memory_mb=ARCHIVE_MB, billed_ms=ms, logged=logged),
+        # Items are read, and counted before they expire: DynamoDB bills a count as a read.
+        "read": 2 * hour.reads + streams * (_ARCHIVE_ROW_READS + sought),
+        "write": streams * _ARCHIVE_WRITES,
+        "schedule": runs,
+        "queue_request": _TASK_REQUESTS * (written + searches),
         # An hour's object is written and read once; the day's is written, and moved if it is not too small.
-        "objects": {
-            "s3_put": streams * (1 + days),
-            "s3_get": streams * (4 + days),
-            "s3_move": usage.streams * days * bool(hour.moved),
-        },
+        "s3_put": streams * (1 + days),
+        "s3_get": streams * (4 + days),
+        "s3_move": usage.streams * days * bool(hour.moved),
+        **_function(usage, calls, ARCHIVE_MB, 1000 * computing_s / calls, _ARCHIVE_LINE * calls),
     }
 
 
@@ -358,50 +311,44 @@ def drive_billed_s(cpu_s: float) -> float:
 
 def drive_items(usage: Usage, drives: float, billed_s: float) -> list[LineItem]:
     """The line items of ``drives`` in a robot-hour, each of ``billed_s`` seconds."""
-    return list(_priced("analysis", _drives(usage, drives, billed_s), PRICES))
+    return _priced({"analysis": _drives(usage, drives, billed_s)}, PRICES)
 
 
 def _drives(usage: Usage, drives: float, billed_s: float) -> Table:
     # The functions read strongly consistent; the stream that tells of motion is read to find the drives.
-    reads = _HOUR_S * sizes_of(usage.rate_hz, usage.batch_s).telemetry_item / READ
+    streams_read = usage.batches_per_s + _PLANNED_DAYS * usage.stream_batches_per_s
     return {
-        "computing": {"compute_arm": drives * billed_s * ANALYSIS_MB / 1024},
-        "invoked": {"invocation": drives},
-        "a state for each drive": {"transition": drives},
-        "express workflows": {"express_request": drives},
-        "their duration": {"express_duration": drives * billed_s * _WORKFLOW_MB / 1024},
-        "samples read": {"read": usage.batches_per_s * reads},
-        "samples read to find the drives": {"read": _PLANNED_DAYS * usage.stream_batches_per_s * reads},
-        "results written": {"write": drives * _DRIVE_WRITES},
-        "results written, PUT": {"s3_put": drives * DRIVE_OBJECTS},
-        "results read, GET": {"s3_get": drives},
+        "compute_arm": drives * billed_s * ANALYSIS_MB / 1024,
+        **dict.fromkeys(("invocation", "transition", "express_request", "s3_get"), drives),
+        "express_duration": drives * billed_s * _WORKFLOW_MB / 1024,
+        "read": streams_read * _HOUR_S * sizes_of(usage.rate_hz, usage.batch_s).telemetry_item / READ,
+        "write": drives * _DRIVE_WRITES,
+        "s3_put": drives * DRIVE_OBJECTS,
     }
 
 
 def _analysis(usage: Usage) -> Table:
     """Drives that are analysed in the next night."""
+    if not usage.drive_minutes:
+        return {}
     drives = 60 / usage.drive_minutes
     cpu_s = _ANALYSED_SAMPLE_S * usage.samples_per_s * 60 * usage.drive_minutes
     # A night of a robot, and its share of the run.
     nights = 1 / usage.hours_per_day
     runs = nights / usage.robots
     calls = nights + _CALLS * runs
-    planning = _function(
-        usage,
-        calls,
-        memory_mb=ANALYSIS_MB,
-        billed_ms=1000 * _DRIVE_S,
-        logged=_ANALYSIS_LINE * (drives + calls)
-        + (drives * len(PLATFORM_LINES) if usage.function_logs == "all" else 0),
-    )
-    kept = _RESULT_BYTES * _HOUR_S * usage.samples_per_s / 1e9 * _RESULT_MONTHS
-    return {
-        **_drives(usage, drives, drive_billed_s(cpu_s)),
-        "planning and comparing": {**planning, "read": nights * _COMPARED_ROWS, "s3_put": nights},
-        "states of the run, and of each robot": {"transition": nights + _STATES * runs},
-        "results kept": {"s3_standard": kept},
-        "scheduled": {"schedule": runs},
+    logged = _ANALYSIS_LINE * (drives + calls)
+    logged += drives * len(PLATFORM_LINES) * (usage.function_logs == "all")
+    night = {
+        **_function(usage, calls, ANALYSIS_MB, 1000 * _DRIVE_S, logged),
+        "read": nights * _COMPARED_ROWS,
+        "s3_put": nights,
+        "transition": nights + _STATES * runs,
+        "s3_standard": _RESULT_BYTES * _HOUR_S * usage.samples_per_s / 1e9 * _RESULT_MONTHS,
+        "schedule": runs,
     }
+    of_drives = _drives(usage, drives, drive_billed_s(cpu_s))
+    return {name: night.get(name, 0.0) + of_drives.get(name, 0.0) for name in night | of_drives}
 
 
 # The lanes of a bill.
@@ -413,8 +360,8 @@ CAPABILITIES: dict[str, Callable[[Usage], Table]] = {
     "commands": _commands,
     "ping": _ping,
     "questions": _questions,
-    "archive": lambda usage: _archive(usage) if usage.archive_days else {},
-    "analysis": lambda usage: _analysis(usage) if usage.drive_minutes else {},
+    "archive": _archive,
+    "analysis": _analysis,
 }
 
 
@@ -434,7 +381,7 @@ def _shards(writes_per_s: float) -> int:
     return max(1, ceil(writes_per_s / _PARTITION_WRITES))
 
 
-def _live_lines_per_s(usage: Usage) -> float:
+def live_lines_per_s(usage: Usage) -> float:
     """Log lines a second of the whole fleet: each environment of Lambda 1 gathers its metrics."""
     messages = usage.robots * usage.live_per_s if usage.live_transport == PUBNUB else 0.0
     environments = max(1, ceil(messages * usage.live_ms / 1000))
@@ -448,7 +395,6 @@ class LineItem(NamedTuple):
     """One line of a bill: ``units`` per robot-hour at the price named ``price`` in `PRICES`."""
 
     lane: str
-    what: str
     price: str
     units: float
     # Dollars per unit; None means the built-in list price.
@@ -459,21 +405,27 @@ class LineItem(NamedTuple):
         return PRICES[self.price].service
 
     @property
+    def what(self) -> str:
+        return PRICES[self.price].unit
+
+    @property
     def dollars(self) -> float:
         """Dollars per robot-hour."""
         return self.units * (PRICES[self.price].each if self.each is None else self.each)
 
 
-def _priced(lane: str, table: Table, prices: Mapping[str, Price]) -> Iterator[LineItem]:
-    for what, by_price in table.items():
-        for price, count in by_price.items():
-            yield LineItem(lane, what, price, count, prices[price].each)
+def _priced(lanes: Mapping[str, Table], prices: Mapping[str, Price]) -> list[LineItem]:
+    return [
+        LineItem(lane, price, count, prices[price].each)
+        for lane, table in lanes.items()
+        for price, count in table.items()
+    ]
 
 
 def bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[LineItem]:
     """AWS' line items for a robot-hour; PubNub's are in `pubnub_bill`."""
     usage.check()
-    return [item for lane, of in CAPABILITIES.items() for item in _priced(lane, of(usage), prices)]
+    return _priced({lane: table(usage) for lane, table in CAPABILITIES.items()}, prices)
 
 
 def total(items: Iterable[LineItem]) -> float:
@@ -494,30 +446,28 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Line
     The layout has no pings, no metrics of the agent, and no alarms.
     """
     usage = replace(usage, function_logs="all", recoverable=False).check()
-    sizes = sizes_of(usage.rate_hz, usage.batch_s)
-    samples = usage.samples_per_s * _HOUR_S
-    per_s = usage.robots * usage.samples_per_s
+    samples, per_s = usage.samples_per_s * _HOUR_S, usage.robots * usage.samples_per_s
     polls = max(_THESIS_POLLS_PER_S * _shards(per_s), per_s / _THESIS_RECORDS_A_CALL)
     calls = min(per_s, polls) * _HOUR_S / usage.robots
 
-    def function(calls: float, billed_ms: float) -> dict[str, float]:
-        return _function(usage, calls, memory_mb=128, billed_ms=billed_ms, logged=0.0, compute="compute_x86")
+    def function(calls: float, billed_ms: float) -> Table:
+        table = _function(usage, calls, 128, billed_ms, 0.0)
+        table["compute_x86"] = table.pop("compute_arm")
+        return table
 
-    lanes: dict[str, Table] = {
-        "connection": {"minutes": {"connection": 60}, "CONNECT": {"message": usage.connects_per_hour}},
+    lanes = {
+        "connection": {"connection": 60, "message": usage.connects_per_hour},
         "record": {
-            "messages": {"message": samples * units(sizes.sample, METER)},
-            "rule to the table": {"rule": samples, "action": samples},
-            "both tables written": {"write": 2 * samples * units(sizes.sample_item, WRITE)},
-            "both tables kept": _kept(usage, 2 * samples, sizes.sample_item),
-            "Lambda 2": function(calls, usage.summarize_ms),
+            "message": samples * units(SAMPLE_BYTES, METER),
+            **dict.fromkeys(("rule", "action"), samples),
+            # Of both tables.
+            "write": 2 * samples * units(SAMPLE_ITEM_BYTES, WRITE),
+            **_kept(usage, (2 * samples, SAMPLE_ITEM_BYTES)),
+            **function(calls, usage.summarize_ms),
         },
-        "live": {
-            "rule to Lambda 1": {"rule": samples, "action": samples},
-            "Lambda 1": function(samples, usage.live_ms),
-        },
+        "live": {**dict.fromkeys(("rule", "action"), samples), **function(samples, usage.live_ms)},
     }
-    return [item for lane, table in lanes.items() for item in _priced(lane, table, prices)]
+    return _priced(lanes, prices)
 
 
 def pubnub_bill(
@@ -526,13 +476,9 @@ def pubnub_bill(
     """PubNub's line items for a robot-hour on its plan by transactions."""
     usage.check()
     by_pubnub = usage.live_per_s if usage.live_transport == PUBNUB else 0.0
-    size = sizes_of(usage.rate_hz, usage.batch_s).update
-    messages = (usage.samples_per_s if thesis else by_pubnub) * _HOUR_S * units(size, PUBNUB_UNIT)
-    table: Table = {
-        "published": {"pubnub_publish": messages},
-        "received by viewers": {"pubnub_receive": messages * usage.viewers},
-    }
-    return list(_priced("live", table, prices))
+    messages = (usage.samples_per_s if thesis else by_pubnub) * _HOUR_S * units(UPDATE_BYTES, PUBNUB_UNIT)
+    table = {"pubnub_publish": messages, "pubnub_receive": messages * usage.viewers}
+    return _priced({"live": table}, prices)
 
 
 def pubnub_mau_dollars_per_month(usage: Usage) -> float | None:
@@ -540,8 +486,7 @@ def pubnub_mau_dollars_per_month(usage: Usage) -> float | None:
     plans."""
     if usage.live_transport != PUBNUB:
         return 0.0
-    users = usage.viewers + 1
-    return next((dollars for most, dollars in PUBNUB_MAU_PLANS if users <= most), None)
+    return next((dollars for most, dollars in PUBNUB_MAU_PLANS if usage.viewers + 1 <= most), None)
 
 
 class Place(NamedTuple):
@@ -559,7 +504,7 @@ def robot_year(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Place
     table, _, moved, small = (hours * each for each in hour)
     archived = moved + small
     each = {name: price.each for name, price in prices.items()}
-    making = hours * total(_priced("archive", _archiving(usage, hour), prices))
+    making = hours * total(_priced({"archive": _archiving(usage, hour)}, prices))
     later = moved * each["s3_instant"] + small * each["s3_standard"]
     first = f"in the archive, a month of the first {STANDARD_DAYS} days"
     again = f"read as a whole after {STANDARD_DAYS} days, each time"
@@ -591,8 +536,7 @@ ROBOT_SEARCHES = 4
 
 
 def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> dict[str, float]:
-    """Dollars by purpose: metrics, alarms, dashboards, queue polls, and if set Device Defender's audit and
-    the account's own key.
+    """Dollars by purpose: metrics, alarms, dashboards, queue polls, and if set the account's own key.
 
     Costs below a cent are left out. Parameter Store's standard tier, SNS' mails, the budget and reading a
     table's stream are free; the files of code and page are a few megabytes.
@@ -613,8 +557,6 @@ def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRI
         "metrics requested by the live page": ("metric_request", requested),
         "polling the queues": ("queue_request", _QUEUES * _POLLERS * MONTH_HOURS * 3600 / _POLL_S),
     }
-    if usage.device_defender:
-        table["audit of the robots"] = ("audit", usage.robots)
     if usage.customer_key:
         table["key"] = ("key", 1)
         table["requests to the key, by the queue"] = ("key_request", _KEYS_AN_HOUR * MONTH_HOURS)

@@ -4,30 +4,29 @@ compared with AWS' default quotas, to find the one that is used up first. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 from iort_contract.cloud import PUBNUB
 from iort_station.cost import model
-from iort_station.cost.model import (
-    SUBSCRIPTIONS,
-    WRITE,
-    LineItem,
-    bill,
-    deployment_dollars_per_month,
-    dollars_per_month,
-    pubnub_bill,
-    sizes_of,
-    thesis_bill,
-    total,
-    units,
-)
+from iort_station.cost.model import LineItem, bill, dollars_per_month, pubnub_bill, thesis_bill, total
 from iort_station.cost.prices import AS_OF, LISTED, PRICES, QUOTAS, REGION, Listed, Price, Quota
 from iort_station.cost.usage import Usage, variations
 
 # The agent waits at least this long before it reconnects; a test compares it with the agent.
 SHORTEST_RECONNECT_S = 1.0
+_RESERVED = "Lambda 1: concurrency reserved by this deployment"
+# Quotas of one robot, which has its own connection and partition keys.
+_ONE_ROBOTS = frozenset(
+    {
+        "IoT Core: publishes of one connection",
+        "IoT Core: connects of one client id",
+        "DynamoDB: writes to one partition",
+    }
+)
+# The table of a robot-hour has no rows below this; the totals include them.
+_LEAST_DOLLARS = 0.00005
 
 
 class Need(NamedTuple):
@@ -44,90 +43,49 @@ class Need(NamedTuple):
         return self.needed / self.quota.value
 
 
-class Scale(NamedTuple):
-    """The estimate for a fleet: needs in the order in which the quotas are used up, and dollars per month."""
-
-    robots: int
-    needs: list[Need]
-    aws_dollars_per_month: float
-    pubnub_dollars_per_month: float
-    pubnub_publishes_per_s: float
-
-    @property
-    def breaks_first(self) -> Need:
-        """The need of the quota that the fewest robots use up."""
-        return self.needs[0]
-
-
-def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
-    """The estimate for a fleet whose robots all drive at once."""
-    one = _per_robot(usage)
+def needs(usage: Usage) -> list[Need]:
+    """What a fleet whose robots all drive at once needs of the quotas, in the order in which they are used
+    up."""
+    of_one = _per_robot(usage)
     quotas = dict(QUOTAS)
     if usage.live_concurrency:
-        page = "live_concurrency, a parameter of the deployment"
-        quotas[_RESERVED] = Quota(usage.live_concurrency, "executions", adjustable=True, page=page)
-    needs = [
-        Need(
-            name,
-            one[name] * (1 if name in _ONE_ROBOTS else usage.robots),
-            quota,
-            None if name in _ONE_ROBOTS or not one[name] else quota.value / one[name],
-        )
-        for name, quota in quotas.items()
-    ]
-    needs.sort(key=lambda need: need.robots_at_quota or float("inf"))
-    return Scale(
-        usage.robots,
-        needs,
-        dollars_per_month(bill(usage, prices), usage),
-        total(pubnub_bill(usage, prices)) * usage.robot_hours_per_month,
-        usage.live_hz * usage.robots if usage.live_transport == PUBNUB else 0.0,
-    )
-
-
-_RESERVED = "Lambda 1: concurrency reserved by this deployment"
-# Quotas of one robot, which has its own connection and partition keys.
-_ONE_ROBOTS = frozenset(
-    {
-        "IoT Core: publishes of one connection",
-        "IoT Core: connects of one client id",
-        "DynamoDB: writes to one partition",
-    }
-)
+        quotas[_RESERVED] = Quota(usage.live_concurrency, "executions")
+    rows = []
+    for name, quota in quotas.items():
+        grows = name not in _ONE_ROBOTS
+        at = quota.value / of_one[name] if grows and of_one[name] else None
+        rows.append(Need(name, of_one[name] * (usage.robots if grows else 1), quota, at))
+    return sorted(rows, key=lambda need: need.robots_at_quota or float("inf"))
 
 
 def _per_robot(usage: Usage) -> dict[str, float]:
-    sizes = sizes_of(usage.rate_hz, usage.batch_s)
-    batches = usage.batches_per_s + usage.own_batches_per_s
-    publishes = batches + usage.live_hz + 3 * usage.ping_hz + usage.clock_pings_per_s
-    telemetry = usage.batches_per_s * units(sizes.telemetry_item, WRITE) + usage.own_batches_per_s
-    summary = usage.batches_per_s * units(sizes.summary_item, WRITE) + usage.own_batches_per_s
-    # The stream's shards limit Lambda 2, so only Lambda 1 and the pings count.
-    by_pubnub = usage.live_hz if usage.live_transport == PUBNUB else 0.0
-    busy = by_pubnub * usage.live_ms / 1000 + usage.ping_hz * 0.005
-    # Two more rules evaluate each message that passes the broker.
-    passing = usage.live_at_broker_per_s if usage.live_transport == PUBNUB else usage.live_hz
-    live_rules = by_pubnub + 2 * passing
+    sizes = model.sizes_of(usage.rate_hz, usage.batch_s)
+    item_writes, second_writes = (
+        model.units(size, model.WRITE) for size in (sizes.telemetry_item, sizes.summary_item)
+    )
+    batches, own, clock = usage.batches_per_s, usage.own_batches_per_s, usage.clock_pings_per_s
+    publishes = batches + own + usage.live_hz + 3 * usage.ping_hz + clock
+    # Two more rules evaluate each live message that passes the broker. The stream's shards limit Lambda 2, so
+    # only Lambda 1 and the pings count.
+    is_pubnub = usage.live_transport == PUBNUB
+    by_pubnub = usage.live_hz * is_pubnub
+    live_rules = by_pubnub + 2 * (usage.live_at_broker_per_s if is_pubnub else usage.live_hz)
+    live_s = by_pubnub * usage.live_ms / 1000
     return {
-        _RESERVED: by_pubnub * usage.live_ms / 1000,
+        _RESERVED: live_s,
         "IoT Core: connections": 1,
         "IoT Core: connects in a minute after an outage": 1,
         "IoT Core: connects of one client id": 1 / SHORTEST_RECONNECT_S,
-        "IoT Core: subscriptions": SUBSCRIPTIONS,
+        "IoT Core: subscriptions": model.SUBSCRIPTIONS,
         # Basic Ingest passes the same gateway.
         "IoT Core: publishes in": publishes,
-        "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz + usage.clock_pings_per_s,
+        "IoT Core: rule evaluations": batches + own + live_rules + 2 * usage.ping_hz + clock,
         "IoT Core: publishes of one connection": publishes,
-        "DynamoDB: writes to table telemetry": telemetry,
-        "DynamoDB: writes to table summary": summary,
-        "DynamoDB: writes to one partition": usage.stream_batches_per_s * units(sizes.telemetry_item, WRITE),
-        "Lambda: concurrent executions": busy,
+        "DynamoDB: writes to table telemetry": batches * item_writes + own,
+        "DynamoDB: writes to table summary": batches * second_writes + own,
+        "DynamoDB: writes to one partition": usage.stream_batches_per_s * item_writes,
+        "Lambda: concurrent executions": live_s + usage.ping_hz * 0.005,
     }
-
-
-# The table of a robot-hour has no rows below this; the totals include them.
-_LEAST_DOLLARS = 0.00005
-_NOT_IN_THE_THESIS = frozenset({"archive", "analysis"})
 
 
 class Rows(NamedTuple):
@@ -141,59 +99,61 @@ def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars per robot-hour by service and lane, in the thesis' layout and in ours; ours also for an hour in
     which nobody looks."""
     alone = replace(usage, watched_hours=0.0)
-    ours, thesis, idle = (
-        bill(usage, prices),
-        thesis_bill(usage, prices),
-        bill(alone, prices),
-    )
-    columns = thesis, ours, idle
+    columns = thesis_bill(usage, prices), bill(usage, prices), bill(alone, prices)
     body: list[tuple[str, ...]] = []
-    for service in sorted({item.service for items in columns for item in items}):
-        lanes = dict.fromkeys(item.lane for items in columns for item in items if item.service == service)
-        body.extend(
-            (f"{service}, {lane}", *(_shown(items, service, lane) for items in columns), "")
-            for lane in lanes
-            if max(_sum(items, service, lane) for items in columns) >= _LEAST_DOLLARS
-        )
-    for what, left_out in (
-        ("total AWS", lambda _: False),
-        ("total AWS without log lines", lambda item: item.price == "logs"),
-        ("total AWS without archive and analysis", lambda item: item.lane in _NOT_IN_THE_THESIS),
+    # By service; its lanes as the bills have them.
+    kinds = dict.fromkeys((item.service, item.lane) for items in columns for item in items)
+    for service, lane in sorted(kinds, key=lambda kind: kind[0]):
+        sums = [
+            total(item for item in items if (item.service, item.lane) == (service, lane)) for items in columns
+        ]
+        if max(sums) >= _LEAST_DOLLARS:
+            shown = (dollars(value) if value >= _LEAST_DOLLARS else "" for value in sums)
+            body.append((f"{service}, {lane}", *shown, ""))
+    for what, counts in (
+        ("total AWS", lambda _: True),
+        ("total AWS without log lines", lambda item: item.price != "logs"),
+        ("total AWS without archive and analysis", lambda item: item.lane not in {"archive", "analysis"}),
     ):
-        sums = [sum(item.dollars for item in items if not left_out(item)) for items in columns]
-        body.append((what, *map(_dollars, sums), _ratio((sums[0], sums[1]))))
+        body.append(_compared(what, [total(filter(counts, items)) for items in columns]))
     pubnub = [
-        total(pubnub_bill(usage, prices, thesis=True)),
-        *(total(pubnub_bill(one, prices)) for one in (usage, alone)),
+        total(items)
+        for items in (
+            pubnub_bill(usage, prices, thesis=True),
+            pubnub_bill(usage, prices),
+            pubnub_bill(alone, prices),
+        )
     ]
-    body.append(("PubNub, plan by transactions", *map(_dollars, pubnub), _ratio((pubnub[0], pubnub[1]))))
-    head = ("dollars a robot-hour", "a message a sample", "iort", "nobody looks", "ratio")
-    return Rows(head, body)
+    body.append(_compared("PubNub, plan by transactions", pubnub))
+    return Rows(("dollars a robot-hour", "a message a sample", "iort", "nobody looks", "ratio"), body)
+
+
+def _compared(what: str, sums: Sequence[float]) -> tuple[str, ...]:
+    return what, *map(dollars, sums), f"1/{sums[0] / sums[1]:.1f}" if sums[1] else ""
 
 
 def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars per month for the fleet, and for the deployment itself."""
-    aws = dollars_per_month(bill(usage, prices), usage)
-    thesis = dollars_per_month(thesis_bill(usage, prices), usage)
-    transactions = dollars_per_month(pubnub_bill(usage, prices), usage)
+
+    def driving(items: list[LineItem]) -> str:
+        return f"{dollars_per_month(items, usage):,.2f}"
+
     users = model.pubnub_mau_dollars_per_month(usage)
+    fixed = model.deployment_dollars_per_month(usage, prices)
     body: list[tuple[str, ...]] = [
-        ("AWS, the driving", f"{aws:,.2f}"),
-        *(
-            (f"AWS, {name}", f"{dollars:,.2f}")
-            for name, dollars in deployment_dollars_per_month(usage, prices).items()
-        ),
-        ("AWS, the same driving a message a sample", f"{thesis:,.2f}"),
-        ("PubNub, plan by transactions", f"{transactions:,.2f}"),
+        ("AWS, the driving", driving(bill(usage, prices))),
+        *((f"AWS, {name}", f"{value:,.2f}") for name, value in fixed.items()),
+        ("AWS, the same driving a message a sample", driving(thesis_bill(usage, prices))),
+        ("PubNub, plan by transactions", driving(pubnub_bill(usage, prices))),
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
     ]
-    return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
+    return Rows((f"dollars a month, {robots(usage.robots)}", ""), body)
 
 
 def robot_year(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """What a robot records in a year, in DynamoDB beside the archive."""
     body: list[tuple[str, ...]] = [
-        (place.what, f"{place.size_bytes / 1e9:.2f}", _dollars(place.dollars))
+        (place.what, f"{place.size_bytes / 1e9:.2f}", dollars(place.dollars))
         for place in model.robot_year(usage, prices)
     ]
     return Rows((f"a robot-year, {usage.hours_per_day:g} h a day", "GB", "dollars"), body)
@@ -205,8 +165,7 @@ def differences(listed: Listed) -> Rows:
         (f"{name}: {PRICES[name].per:,.0f} x {PRICES[name].unit}", f"{ours:g}", f"{aws:g}")
         for name, (ours, aws) in listed.changed().items()
     ]
-    same = len(listed.each) - len(body)
-    body.append((f"as built in: {same} of {len(LISTED)}", "", ""))
+    body.append((f"as built in: {len(listed.each) - len(body)} of {len(LISTED)}", "", ""))
     return Rows(("dollars", f"{AS_OF}, {REGION}", f"{listed.read_on}, {listed.region}"), body)
 
 
@@ -214,29 +173,24 @@ def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars per robot-hour with one setting changed at a time, compared with the thesis' layout."""
     body: list[tuple[str, ...]] = []
     for name, other in variations(usage):
-        ours, thesis, pubnub = (total(made(other, prices)) for made in (bill, thesis_bill, pubnub_bill))
-        body.append((name, _dollars(ours), f"1/{thesis / ours:.1f}", _dollars(pubnub)))
+        ours, thesis, pubnub = (total(of(other, prices)) for of in (bill, thesis_bill, pubnub_bill))
+        body.append((name, dollars(ours), f"1/{thesis / ours:.1f}", dollars(pubnub)))
     return Rows(("dollars a robot-hour", "AWS", "of a message a sample", "PubNub by transactions"), body)
 
 
-def quotas(scale: Scale) -> Rows:
+def quotas(usage: Usage) -> Rows:
     """The fleet's needs of each default quota; the quota that is used up first is on top."""
     body: list[tuple[str, ...]] = []
-    for need in scale.needs:
+    for need in needs(usage):
         at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
-        fixed = "" if need.quota.adjustable else ", fixed"
-        quota = f"{need.quota.value:,.0f} {need.quota.unit}{fixed}"
+        quota = f"{need.quota.value:,.0f} {need.quota.unit}{'' if need.quota.adjustable else ', fixed'}"
         body.append((need.name, f"{need.needed:,.1f}", quota, times(need.times), at))
-    return Rows(
-        (
-            f"{scale.robots:,} robot{'s' * (scale.robots > 1)}",
-            "needed",
-            "quota",
-            "times",
-            "robots at the quota",
-        ),
-        body,
-    )
+    return Rows((robots(usage.robots), "needed", "quota", "times", "robots at the quota"), body)
+
+
+def robots(number: int) -> str:
+    """The number, with its noun."""
+    return f"{number:,} robot{'s' * (number != 1)}"
 
 
 def times(value: float) -> str:
@@ -246,18 +200,6 @@ def times(value: float) -> str:
     return f"{value:.2g}" if value >= 0.001 else "< 0.001"
 
 
-def _sum(items: list[LineItem], service: str, lane: str) -> float:
-    return sum(item.dollars for item in items if (item.service, item.lane) == (service, lane))
-
-
-def _shown(items: list[LineItem], service: str, lane: str) -> str:
-    dollars = _sum(items, service, lane)
-    return _dollars(dollars) if dollars >= _LEAST_DOLLARS else ""
-
-
-def _dollars(dollars: float) -> str:
-    return f"{dollars:.4f}" if dollars < 1 else f"{dollars:,.2f}"
-
-
-def _ratio(both: tuple[float, float]) -> str:
-    return f"1/{both[0] / both[1]:.1f}" if both[1] else ""
+def dollars(value: float) -> str:
+    """Dollars with their cents, or with four digits below one."""
+    return f"{value:.4f}" if value < 1 else f"{value:,.2f}"

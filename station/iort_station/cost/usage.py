@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -33,24 +33,16 @@ CLOCK_PING_S = 30.0
 class Usage:
     """How a fleet is driven. The defaults are the agent's and the stacks' own.
 
-    Of a robot: it has ``streams`` of ``rate_hz`` samples a second each, sends ``live_hz`` live messages and
-    ``ping_hz`` pings per path a second, gets ``command_hz`` commands a second and asks the cloud
-    ``questions_per_hour``. A batch spans ``batch_s``.
-    The agent sends its metrics ``agent_every_s``.
+    A robot has ``streams`` of ``rate_hz`` samples a second each, in batches of ``batch_s``. Somebody looks at
+    it for ``watched_hours`` of its hours a day; at other times it sends a live message of each stream every
+    `LIVE_BROKER_EVERY_S`. None is for ``live.when: always``. Each of ``viewers`` watches the whole fleet in
+    those hours. The archive's items are counted for ``archive_days``, 0 for none; every night drives of
+    ``drive_minutes`` are analysed, 0 for none. Only AWS knows the billed milliseconds ``live_ms`` and
+    ``summarize_ms``: they are assumptions.
 
-    Of a deployment: items are kept ``retention_days``, and are ``recoverable`` to a point in time in stage
-    prod. The archive's are counted for ``archive_days``, 0 for none. Every night drives of ``drive_minutes``
-    are analysed, 0 for none. Each of ``alarms`` watches a metric; the alarms by Metrics Insights analyse
-    ``insights_metrics`` together. ``dashboards`` has the number of metrics on each; ``robot_metrics`` adds to
-    the last. They are open on the live page for ``dashboard_hours`` a month. ``function_logs`` "all" adds
-    Lambda's own log lines.
-
-    Somebody looks at a robot for ``watched_hours`` of its hours a day; at other times it sends a live message
-    of each stream every `LIVE_BROKER_EVERY_S`. None is for ``live.when: always``. Live messages reach their
-    viewers by ``live_transport``, AWS IoT or PubNub.
-
-    Only AWS knows the billed milliseconds; ``live_ms``, ``summarize_ms`` and ``summarize_batch_ms`` (for each
-    batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet in those hours.
+    Of a deployment: alarms by Metrics Insights analyse ``insights_metrics`` together. ``dashboards`` has the
+    number of metrics on each; ``robot_metrics`` adds to the last. ``function_logs`` "all" adds Lambda's own
+    log lines.
     """
 
     robots: int = 1
@@ -75,7 +67,6 @@ class Usage:
     live_concurrency: int = 0
     summarize_memory_mb: int = 512
     summarize_ms: float = 20.0
-    summarize_batch_ms: float = 5.0
     function_logs: str = "own"
     alarms: int = 41
     insights_metrics: int = 63
@@ -84,7 +75,6 @@ class Usage:
     robot_metrics: bool = False
     recoverable: bool = False
     customer_key: bool = False
-    device_defender: bool = False
 
     def check(self) -> Usage:
         """Return itself; raises `UsageError` for an impossible value."""
@@ -165,28 +155,30 @@ class Usage:
 
 def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
     """The usage with one setting changed at a time."""
-    yield "as configured", usage
-    for share, name in ((0.0, "nobody looks"), (0.1, "somebody looks a tenth of the time")):
-        yield name, replace(usage, watched_hours=share * usage.hours_per_day)
-    yield "live messages by PubNub", replace(usage, live_transport=PUBNUB)
-    for live_hz in (5.0, 2.0, 1.0, 0.0):
-        if live_hz != usage.live_hz:
-            name = f"live lane at {live_hz:g} Hz" if live_hz else "no live lane"
-            yield name, replace(usage, live_hz=live_hz)
-    for batch_s in (0.2, 0.0):
-        name = f"batches of {batch_s:g} s" if batch_s else "one sample a batch"
-        yield name, replace(usage, batch_s=batch_s)
-    yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
-    yield "commands at 10 Hz", replace(usage, command_hz=10.0)
-    yield "a question to the cloud every minute", replace(usage, questions_per_hour=60.0)
-    yield "reconnecting every minute", replace(usage, connects_per_hour=60.0)
-    yield "with Lambda's own log lines", replace(usage, function_logs="all")
-    yield "kept for 30 days", replace(usage, retention_days=30)
-    yield "without an archive", replace(usage, archive_days=0)
-    yield "kept for ten years in the archive", replace(usage, archive_days=3653)
-    yield "without the nightly analysis", replace(usage, drive_minutes=0.0)
-    yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)
-    yield "a thousand robots", replace(usage, robots=1000)
+    rates = {f"live lane at {hz:g} Hz": {"live_hz": hz} for hz in (5.0, 2.0, 1.0) if hz != usage.live_hz}
+    changes: dict[str, dict[str, Any]] = {
+        "as configured": {},
+        "nobody looks": {"watched_hours": 0.0},
+        "somebody looks a tenth of the time": {"watched_hours": 0.1 * usage.hours_per_day},
+        "live messages by PubNub": {"live_transport": PUBNUB},
+        **rates,
+        "no live lane": {"live_hz": 0.0},
+        "batches of 0.2 s": {"batch_s": 0.2},
+        "one sample a batch": {"batch_s": 0.0},
+        "round trips measured at 1 Hz": {"ping_hz": 1.0},
+        "commands at 10 Hz": {"command_hz": 10.0},
+        "a question to the cloud every minute": {"questions_per_hour": 60.0},
+        "reconnecting every minute": {"connects_per_hour": 60.0},
+        "with Lambda's own log lines": {"function_logs": "all"},
+        "kept for 30 days": {"retention_days": 30},
+        "without an archive": {"archive_days": 0},
+        "kept for ten years in the archive": {"archive_days": 3653},
+        "without the nightly analysis": {"drive_minutes": 0.0},
+        "tables recoverable to a point in time (`prod`)": {"recoverable": True},
+        "a thousand robots": {"robots": 1000},
+    }
+    for name, changed in changes.items():
+        yield name, replace(usage, **changed)
 
 
 # --- from a robot's car.yaml; `iort-agent check` judges the whole file
@@ -202,89 +194,43 @@ def as_configured(usage: Usage, file: Path) -> Usage:
 
     The file does not tell the rates of ROS topics and recordings; these stay as in ``usage``.
     """
-    car = _Section(file, "", _content(file))
-    rates = [rate for source in car.items("sources") for rate in _rates_hz(source)]
-    live, metrics = car.section("live"), car.section("metrics")
-    live_hz = live.number("rate_hz", usage.live_hz)
-    when = live.choice("when", (WATCHED, ALWAYS), WATCHED)
-    transport = live.choice("transport", TRANSPORTS, usage.live_transport)
-    return replace(
-        usage,
-        # The limit applies to each stream, which sends at most what its source delivers.
-        live_hz=sum(min(live_hz, rate_hz or math.inf) for rate_hz in rates) if live.enabled() else 0.0,
-        batch_s=car.section("record").number("batch_s", usage.batch_s),
-        watched_hours=None if when == ALWAYS else usage.watched_hours,
-        live_transport=transport if when == ALWAYS else usage.live_transport,
-        ping_hz=car.section("ping").number("rate_hz", usage.ping_hz),
-        agent_every_s=metrics.number("every_s", usage.agent_every_s) if metrics.enabled() else 0.0,
-        streams=len(rates),
-        rate_hz=mean(rate_hz or usage.rate_hz for rate_hz in rates),
-    )
-
-
-def _rates_hz(source: _Section) -> list[float | None]:
-    """The rate of each stream of a source; None if the file does not tell it."""
-    kind = source.values.get("type")
-    if kind in _OWN_RATE_HZ:
-        rate_hz = source.number("rate_hz", _OWN_RATE_HZ[kind])
-        poses_hz = source.section("pose").number("rate_hz", _POSE_RATE_HZ) if kind == "sim" else 0.0
-        return [rate_hz, min(rate_hz, poses_hz)] if poses_hz else [rate_hz]
-    topics = source.section("topics").values.values()
-    names = {str(topic.get("stream") if isinstance(topic, dict) else topic) for topic in topics}
-    return [None] * max(1, len(names))
-
-
-class _Section:
-    """A mapping in the file; errors name the file and the key."""
-
-    def __init__(self, file: Path, name: str, values: Any) -> None:
-        self._file, self._name = file, name
-        self.values: Mapping[Any, Any] = values or {}
-        if not isinstance(self.values, Mapping):
-            raise self._error("", "a mapping", values)
-
-    def section(self, key: str) -> _Section:
-        return _Section(self._file, self._path(key), self.values.get(key))
-
-    def items(self, key: str) -> list[_Section]:
-        found = self.values.get(key)
-        if not isinstance(found, list) or not found:
-            raise self._error(key, "a list of at least one item", found)
-        return [_Section(self._file, self._path(f"{key}[{i}]"), item) for i, item in enumerate(found)]
-
-    def number(self, key: str, default: float) -> float:
-        found = self.values.get(key, default)
-        if isinstance(found, bool) or not isinstance(found, (int, float)) or not 0 <= found < math.inf:
-            raise self._error(key, "a number of at least 0", found)
-        return float(found)
-
-    def choice(self, key: str, allowed: Sequence[str], default: str) -> str:
-        found = self.values.get(key, default)
-        if found not in allowed:
-            raise self._error(key, f"one of {', '.join(allowed)}", found)
-        return str(found)
-
-    def enabled(self) -> bool:
-        found = self.values.get("enabled", True)
-        if not isinstance(found, bool):
-            raise self._error("enabled", "true or false", found)
-        return found
-
-    def _path(self, key: str) -> str:
-        return f"{self._name}.{key}".strip(".")
-
-    def _error(self, key: str, allowed: str, found: Any) -> StationError:
-        path = self._path(key)
-        return StationError(f"{self._file}: {path}{': ' * bool(path)}must be {allowed}, got {found!r}")
-
-
-def _content(file: Path) -> Any:
     try:
-        return yaml.safe_load(file.read_text())
+        car = yaml.safe_load(file.read_text())
+        rates = [rate for source in car["sources"] for rate in _rates_hz(source)]
+        live, metrics = ({"enabled": True, **(car.get(name) or {})} for name in ("live", "metrics"))
+        live_hz = float(live.get("rate_hz", usage.live_hz))
+        always = live.get("when", WATCHED) == ALWAYS
+        return replace(
+            usage,
+            # The limit applies to each stream, which sends at most what its source delivers.
+            live_hz=live["enabled"] * sum(min(live_hz, rate_hz or math.inf) for rate_hz in rates),
+            batch_s=float((car.get("record") or {}).get("batch_s", usage.batch_s)),
+            watched_hours=None if always else usage.watched_hours,
+            live_transport=live.get("transport", usage.live_transport) if always else usage.live_transport,
+            ping_hz=float((car.get("ping") or {}).get("rate_hz", usage.ping_hz)),
+            agent_every_s=metrics["enabled"] * float(metrics.get("every_s", usage.agent_every_s)),
+            streams=len(rates),
+            rate_hz=mean(rate_hz or usage.rate_hz for rate_hz in rates),
+        ).check()
     except (OSError, UnicodeDecodeError) as error:
         raise StationError(f"{file} cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        raise StationError(f"{file} is not YAML: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError, yaml.YAMLError, UsageError) as error:
+        raise StationError(
+            f"{file} must be as `iort-agent check` accepts it, got {type(error).__name__}: {error}"
+        ) from error
+
+
+def _rates_hz(source: Mapping[str, Any]) -> list[float | None]:
+    """The rate of each stream of a source; None if the file does not tell it."""
+    kind = source.get("type", "")
+    if kind not in _OWN_RATE_HZ:
+        topics = (source.get("topics") or {}).values()
+        names = {str(topic.get("stream") if isinstance(topic, dict) else topic) for topic in topics}
+        return [None] * max(1, len(names))
+    rate_hz = float(source.get("rate_hz", _OWN_RATE_HZ[kind]))
+    poses = source.get("pose") or {}
+    poses_hz = float(poses.get("rate_hz", _POSE_RATE_HZ)) if kind == "sim" else 0.0
+    return [rate_hz, min(rate_hz, poses_hz)] if poses_hz else [rate_hz]
 
 
 # --- from the deployment
@@ -298,59 +244,51 @@ def as_deployed(usage: Usage, cloud: Cloud) -> Usage:
 
     Alarms and dashboards are the whole account's, like CloudWatch's free allowances.
     """
-    deployed = {**_functions(cloud), **watching(cloud), **_tables(cloud)}
-    return replace(usage, live_transport=transport(cloud), **deployed)
-
-
-def _functions(cloud: Cloud) -> dict[str, Any]:
-    client = cloud.client("lambda")
+    functions, dynamodb = cloud.client("lambda"), cloud.client("dynamodb")
     names = [cloud.output("processing", f"{name}Function") for name in ("Live", "Summarize")]
-    live, summarize = (client.get_function_configuration(FunctionName=name) for name in names)
-    reserved = client.get_function_concurrency(FunctionName=names[0])
-    level = live.get("LoggingConfig", {}).get("SystemLogLevel")
-    return {
-        "live_memory_mb": live["MemorySize"],
-        "summarize_memory_mb": summarize["MemorySize"],
-        "function_logs": "own" if level == "WARN" else "all",
-        "live_concurrency": reserved.get("ReservedConcurrentExecutions", 0),
-    }
+    live, summarize = (functions.get_function_configuration(FunctionName=name) for name in names)
+    reserved = functions.get_function_concurrency(FunctionName=names[0])
+    table = cloud.output("storage", "TelemetryTable")
+    encryption = dynamodb.describe_table(TableName=table)["Table"].get("SSEDescription", {})
+    backups = dynamodb.describe_continuous_backups(TableName=table)["ContinuousBackupsDescription"]
+    recovery = backups.get("PointInTimeRecoveryDescription", {})
+    return replace(
+        usage,
+        live_transport=transport(cloud),
+        live_memory_mb=live["MemorySize"],
+        summarize_memory_mb=summarize["MemorySize"],
+        function_logs="own" if live.get("LoggingConfig", {}).get("SystemLogLevel") == "WARN" else "all",
+        live_concurrency=reserved.get("ReservedConcurrentExecutions", 0),
+        customer_key=encryption.get("SSEType") == "KMS",
+        recoverable=recovery.get("PointInTimeRecoveryStatus") == "ENABLED",
+        **watching(cloud),
+    )
 
 
 def watching(cloud: Cloud) -> dict[str, Any]:
-    """The alarms and dashboards."""
+    """The alarms and dashboards, as AWS bills them."""
     client = cloud.client("cloudwatch")
     pages = client.get_paginator("describe_alarms").paginate()
     alarms = [alarm for page in pages for alarm in page.get("MetricAlarms", [])]
-    matches = (
+    expressions = (
         [_INSIGHTS.match(query.get("Expression", "")) for query in alarm.get("Metrics", [])]
         for alarm in alarms
     )
-    queries = [query for query in (next(filter(None, found), None) for found in matches) if query]
+    insights = [match for matches in expressions if (match := next(filter(None, matches), None))]
+    lists = client.get_paginator("list_metrics")
+    analysed = sum(
+        len(page["Metrics"])
+        for query in insights
+        for page in lists.paginate(
+            Namespace=query["namespace"], MetricName=query["metric"], RecentlyActive="PT3H"
+        )
+    )
     # The robots' dashboard comes last, where `dashboard_metrics` counts what its searches find.
     names = sorted(cloudwatch.dashboards(cloud), key=lambda name: name == f"{cloud.namespace}-robots")
     counted = [cloudwatch.count(cloudwatch.body_of(cloud, name)) for name in names]
     return {
-        "alarms": len(alarms) - len(queries),
-        "insights_metrics": sum(_metrics(client, query) for query in queries),
-        "dashboards": tuple(one.metrics for one in counted),
+        "alarms": len(alarms) - len(insights),
+        "insights_metrics": analysed,
+        "dashboards": tuple(dashboard.metrics for dashboard in counted),
         "robot_metrics": bool(counted and counted[-1].searches),
-    }
-
-
-def _metrics(client: Any, query: re.Match[str]) -> int:
-    """The number of metrics that a query analyses."""
-    pages = client.get_paginator("list_metrics").paginate(
-        Namespace=query["namespace"], MetricName=query["metric"], RecentlyActive="PT3H"
-    )
-    return sum(len(page["Metrics"]) for page in pages)
-
-
-def _tables(cloud: Cloud) -> dict[str, Any]:
-    table, dynamodb = cloud.output("storage", "TelemetryTable"), cloud.client("dynamodb")
-    encryption = dynamodb.describe_table(TableName=table)["Table"].get("SSEDescription", {})
-    backups = dynamodb.describe_continuous_backups(TableName=table)["ContinuousBackupsDescription"]
-    recovery = backups.get("PointInTimeRecoveryDescription", {})
-    return {
-        "customer_key": encryption.get("SSEType") == "KMS",
-        "recoverable": recovery.get("PointInTimeRecoveryStatus") == "ENABLED",
     }

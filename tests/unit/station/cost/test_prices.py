@@ -27,7 +27,6 @@ USAGES = {
     "rule": "EUW1-RulesTriggered",
     "action": "EUW1-ActionsExecuted",
     "shadow": "EUW1-DeviceShadow",
-    "audit": "EUW1-Audit-Devices",
     "key": "eu-west-1-KMS-Keys",
     "key_request": "eu-west-1-KMS-Requests",
     "dashboard": "DashboardsUsageHour",
@@ -158,7 +157,6 @@ def test_a_changed_price_is_reported_and_used():
     changed, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
     more = sum(item.units for item in before if item.price == "rule") * 0.15e-6
     assert model.total(changed) == pytest.approx(model.total(before) + more)
-    assert "2026-11-22" in listed.prices()["rule"].seen
 
 
 def test_the_price_list_applies_to_an_idle_deployment():
@@ -213,8 +211,11 @@ def test_a_missing_price_keeps_its_built_in_value_with_the_reason(instead, why):
 
 @pytest.mark.parametrize("code", ["NotFoundException", "InvalidParameterException"])
 def test_a_missing_service_keeps_its_built_in_prices(code):
-    listed = read(Pricing(as_built_in().values(), IoTDeviceDefender=code), REGION, TODAY)
-    assert listed.kept == {"audit": "IoTDeviceDefender has no .*Audit.* in eu-west-1"}
+    listed = read(Pricing(as_built_in().values(), awskms=code), REGION, TODAY)
+    assert listed.kept == {
+        "key": "awskms has no KMS-Keys in eu-west-1",
+        "key_request": "awskms has no KMS-Requests in eu-west-1",
+    }
 
 
 def test_a_denied_request_names_the_required_action():
@@ -232,7 +233,7 @@ def test_a_price_list_is_kept_with_its_date(tmp_path):
     assert path == tmp_path / "cache" / "iort" / "prices.json"
     assert kept_at({"HOME": "/home/car"}).parts[-3:] == (".cache", "iort", "prices.json")
     assert load(path) is None
-    listed = Listed("2026-11-22", REGION, {"rule": 0.3e-6}, {"audit": "not found"})
+    listed = Listed("2026-11-22", REGION, {"rule": 0.3e-6}, {"key": "not found"})
     keep(listed, path)
     assert load(path) == listed
     assert json.loads(path.read_text()).keys() == {"read_on", "region", "each", "kept"}
@@ -264,12 +265,10 @@ def run(*given, **environment):
 
 def test_later_calls_use_the_kept_price_list_and_name_its_date(tmp_path):
     environment = {"XDG_CACHE_HOME": str(tmp_path)}
-    listed = Listed("2026-11-22", "eu-north-1", {"rule": 0.3e-6}, {"audit": "not found"})
+    listed = Listed("2026-11-22", "eu-north-1", {"rule": 0.3e-6}, {"key": "not found"})
     keep(listed, kept_at(environment))
     said = " ".join(run(**environment).output.split())
-    assert (
-        "AWS' price list as read on 2026-11-22, eu-north-1; built-in prices of 2025-06-01 for audit;" in said
-    )
+    assert "AWS' price list as read on 2026-11-22, eu-north-1; built-in prices of 2025-06-01 for key;" in said
     told = json.loads(run("--json", **environment).output)
     assert (told["prices_as_of"], told["region"]) == ("2026-11-22", "eu-north-1")
     assert told["prices_changed"] == {"rule": [0.15, pytest.approx(0.3)]}

@@ -12,6 +12,7 @@ from iort_agent.config import Config, load_config
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.sources.sim import SimConfig
+from iort_contract.messages.shadow import ALWAYS
 from iort_station.cli.main import app
 from iort_station.cost.model import deployment_dollars_per_month
 from iort_station.cost.usage import _OWN_RATE_HZ, Usage, as_configured, watching
@@ -33,6 +34,7 @@ FILES = (
     "sources: [{type: vesc, port: /dev/vesc}, {type: bag, path: drive.bag, stream: tool}]\n",
     f"{SIM}live: {{rate_hz: 2}}\nrecord: {{batch_s: 0.5}}\nping: {{rate_hz: 1}}\nmetrics: {{every_s: 60}}\n",
     f"{ROS}live: {{enabled: false}}\nmetrics: {{enabled: false}}\n",
+    f"{SIM}live: {{when: always, transport: pubnub}}\n",
 )
 
 
@@ -65,6 +67,8 @@ def in_the_agent(config: Config) -> dict[str, object]:
         "batch_s": config.record.batch_s,
         "ping_hz": config.ping.rate_hz,
         "agent_every_s": config.metrics.every_s * config.metrics.enabled,
+        "watched_hours": None if config.live.when == ALWAYS else Usage().watched_hours,
+        "live_transport": config.live.transport if config.live.when == ALWAYS else Usage().live_transport,
     }
 
 
@@ -105,16 +109,17 @@ def test_the_command_reads_a_file_without_the_robots_certificate(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ("", "car.yaml: sources: must be a list of at least one item, got None"),
-        (f"{SIM}live: 5\n", "live: must be a mapping, got 5"),
-        (f"{SIM}live: {{rate_hz: fast}}\n", "live.rate_hz: must be a number of at least 0, got 'fast'"),
-        (f"{SIM}metrics: {{enabled: 1}}\n", "metrics.enabled: must be true or false, got 1"),
-        ("sources: [{type: sim, rate_hz: -1}]", "sources[0].rate_hz: must be a number of at least 0, got -1"),
-        ("sources: [", "is not YAML"),
+        ("", "'sources'"),
+        ("sources: []\n", "requires at least one"),
+        (f"{SIM}live: 5\n", "'int' object is not a mapping"),
+        (f"{SIM}live: {{rate_hz: fast}}\n", "'fast'"),
+        (f"{SIM}live: {{when: always, transport: post}}\n", "live_transport must be one of pubnub, iot"),
+        ("sources: [{type: sim, rate_hz: -1}]", "rate_hz must be at least 0, got -1"),
+        ("sources: [", "ParserError"),
     ],
 )
-def test_an_invalid_file_is_named_with_its_key(car, settings, said):
-    with pytest.raises(StationError) as error:
+def test_an_invalid_file_is_named_with_the_reason(car, settings, said):
+    with pytest.raises(StationError, match=r"car\.yaml must be as `iort-agent check` accepts it") as error:
         as_configured(Usage(), car(settings))
     assert said in str(error.value)
 
