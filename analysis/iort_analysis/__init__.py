@@ -7,5 +7,9 @@ class AnalysisError(Exception):
     """The root of the package's exceptions."""
 
 
+class NoResultError(AnalysisError):
+    """A drive that does not tell a parameter; the text is the reason."""
+
+
 class ArchiveError(AnalysisError):
     """An object of the archive that is missing or damaged; the text says which."""

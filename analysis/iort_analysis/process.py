@@ -6,7 +6,7 @@ A new miner is a file in `mining` and a line of `MINERS`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -17,7 +17,7 @@ from iort_analysis.drives.cleaning import MANY_WILD, wild_share
 from iort_analysis.drives.drive import Drive, moving, vescs_of
 from iort_analysis.mining import anomalies, battery, drivetrain, laps, motor, thermal
 from iort_analysis.mining.gain import with_gain
-from iort_analysis.results import DriveResult, Event, Mined
+from iort_analysis.results import DriveResult, Event, Mined, merge
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.messages.analysis import DriveKey, Estimate
@@ -59,19 +59,6 @@ def analyse(
         repairs[repair.kind] += repair.samples
     samples = sum(len(block.times_us) for block in drive.raw.values())
     return DriveResult(key, drive.end_us, samples, dict(repairs), mined, drive.vesc or "")
-
-
-def merge(parts: Iterable[Mined]) -> Mined:
-    """What all miners found, as one. A name that one of them has found is not missing."""
-    parts = list(parts)
-    estimates = {name: estimate for part in parts for name, estimate in part.estimates.items()}
-    missing = {name: reason for part in parts for name, reason in part.missing.items()}
-    return Mined(
-        estimates=estimates,
-        missing={name: reason for name, reason in missing.items() if name not in estimates},
-        events=sorted((event for part in parts for event in part.events), key=lambda event: event.start_us),
-        tables={name: table for part in parts for name, table in part.tables.items()},
-    )
 
 
 def _mined(name: str, miner: Miner, drive: Drive) -> Mined:

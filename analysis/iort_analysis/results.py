@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import DriveKey, Estimate, decode_estimate, encode_estimate
 
-# The package's exceptions.
-
-
 # A table of results, such as the laps of a drive: columns of equal length, whose names end with their units.
 Table: TypeAlias = Mapping[str, NDArray[Any]]
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 class Event(NamedTuple):
@@ -43,6 +44,43 @@ class Mined:
     missing: Mapping[str, str] = field(default_factory=dict)
     events: Sequence[Event] = ()
     tables: Mapping[str, Table] = field(default_factory=dict)
+
+
+def miner(*names: str) -> Callable[[Callable[_P, Mined]], Callable[_P, Mined]]:
+    """A miner of these parameters: if it raises `NoResultError`, all of them are missing for that reason."""
+
+    def frame(mine: Callable[_P, Mined]) -> Callable[_P, Mined]:
+        @wraps(mine)
+        def framed(*args: _P.args, **more: _P.kwargs) -> Mined:
+            try:
+                return mine(*args, **more)
+            except NoResultError as error:
+                return Mined(missing=dict.fromkeys(names, str(error)))
+
+        return framed
+
+    return frame
+
+
+def attempt(function: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T | str:
+    """What a function returns; or the reason why it does not, for a miner that goes on without."""
+    try:
+        return function(*args, **more)
+    except NoResultError as error:
+        return str(error)
+
+
+def merge(parts: Iterable[Mined]) -> Mined:
+    """What several miners found, as one. A name that one of them has found is not missing."""
+    parts = list(parts)
+    estimates = {name: estimate for part in parts for name, estimate in part.estimates.items()}
+    missing = {name: reason for part in parts for name, reason in part.missing.items()}
+    return Mined(
+        estimates=estimates,
+        missing={name: reason for name, reason in missing.items() if name not in estimates},
+        events=sorted((event for part in parts for event in part.events), key=lambda event: event.start_us),
+        tables={name: table for part in parts for name, table in part.tables.items()},
+    )
 
 
 @dataclass(frozen=True)

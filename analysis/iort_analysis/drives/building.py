@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from iort_analysis.drives.cleaning import ANGLES, clean, numeric, pause_us
 from iort_analysis.drives.drive import Drive, Motion, Repair, motion_among, pose_of, vesc_of, with_position
 from iort_analysis.samples.blocks import EMPTY, Block, Column, ordered
+from iort_analysis.statistics.signals import summed
 from iort_contract.catalog.derived import Vehicle, calculable
 from iort_contract.messages.analysis import DriveKey
 
@@ -74,7 +75,8 @@ def with_derived(samples: Block, vesc: str, vehicle: Vehicle | None) -> Block:
     speed = made.get("speed_mps")
     if speed is not None and len(speed) > 1:
         made["acceleration_mps2"] = _slope(samples, speed)
-        made["distance_m"] = _sum(samples, np.abs(speed))
+        seconds = (samples.times_us - samples.times_us[0]) / 1e6
+        made["distance_m"] = summed(seconds, np.abs(speed), pause_us(samples.times_us) / 1e6)
     return Block(samples.times_us, {**samples.columns, **{prefix + name: c for name, c in made.items()}})
 
 
@@ -89,15 +91,6 @@ def _slope(samples: Block, values: Column) -> Column:
     made: Column = (values[ahead] - values[behind]) / np.maximum(took, 1e-9)
     # Across a pause there is no slope.
     made[took * 1e6 > pause_us(samples.times_us) + 2 * half * usual * 1e6] = np.nan
-    return made
-
-
-def _sum(samples: Block, rates: Column) -> Column:
-    """The integral over time, which counts nothing across a pause."""
-    steps = np.diff(samples.times_us)
-    steps = np.where(steps > pause_us(samples.times_us), 0, steps) / 1e6
-    known = np.nan_to_num(rates)
-    made: Column = np.append(0.0, np.cumsum((known[1:] + known[:-1]) / 2 * steps))
     return made
 
 

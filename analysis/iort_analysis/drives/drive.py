@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.samples.blocks import Block, Column
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.streams import CATALOG
@@ -69,6 +70,20 @@ class Drive:
         """A field of a stream on the one clock; None if it is not there, or has no value."""
         column = self.samples.columns.get(f"{stream}.{name}")
         return None if column is None or bool(np.isnan(column).all()) else column
+
+    def motor(self, *names: str, reason: str = "") -> list[Column]:
+        """Fields of the motor controller; raises `NoResultError` with the reason if one is not there."""
+        columns = [self.of(self.vesc, name) for name in names]
+        if any(column is None for column in columns):
+            raise NoResultError(reason or f"needs {' and '.join(names)}")
+        return [column for column in columns if column is not None]
+
+    def mps(self, erpm: Column) -> Column:
+        """The car's speed by its motor's, if the vehicle is known."""
+        if self.vehicle is None:
+            raise NoResultError("needs the car's parameters")
+        speed: Column = (erpm - self.vehicle.speed_to_erpm_offset) / self.vehicle.speed_to_erpm_gain
+        return speed
 
 
 # Which fields tell that a car moves, and which streams are a motor controller's or a position's.

@@ -1,4 +1,4 @@
-"""A robot that records and never moves: it stood, or its speed is not what the analysis takes it for."""
+"""Anomalies: sensors that fail, and faults that show in how a drive's fields go together."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from iort_analysis.drives.drive import FROZEN, Drive, Repair, motion_among, motion_of
 from iort_analysis.mining.changes import mine_dropouts, mine_underway
 from iort_analysis.mining.relations import mine_balance, mine_drift, mine_slip, mine_warming, readings
-from iort_analysis.results import Event, Mined
+from iort_analysis.results import Event, Mined, attempt, merge
 from iort_analysis.samples.blocks import Block
 from iort_analysis.statistics.distributions import sides
+from iort_analysis.statistics.signals import runs
 from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS
 from iort_contract.messages.analysis import Estimate
+
+# A robot that records and never moves: it stood, or its speed is not what the analysis takes it for.
 
 _MOTIONLESS = "never_moved"
 # A shorter recording may have ended before the car could move.
@@ -33,13 +36,10 @@ def mine_motionless(drive: Drive) -> Mined:
     start_us, end_us = int(block.times_us[0]), int(block.times_us[-1])
     if end_us - start_us < _LEAST_US:
         return Mined()
-    lasted_s, most, name = (
-        (end_us - start_us) / 1e6,
-        np.nanmax(np.abs(speed)),
-        f"{motion.stream}.{motion.field}",
-    )
+    most = np.nanmax(np.abs(speed))
     text = (
-        f"the robot recorded {lasted_s:,.0f} s and never moved: {name} was {most:.3g} {motion.unit} at most, "
+        f"the robot recorded {(end_us - start_us) / 1e6:,.0f} s and never moved: "
+        f"{motion.stream}.{motion.field} was {most:.3g} {motion.unit} at most, "
         f"and above {motion.least:g} it moves"
     )
     return Mined(events=[Event(_MOTIONLESS, start_us, end_us, motion.stream, (motion.field,), text)])
@@ -59,8 +59,8 @@ def mine_faults(drive: Drive) -> Mined:
     codes = np.nan_to_num(column)
     events = []
     for code in np.unique(codes[codes != 0]).tolist():
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], codes == code, [False]]).astype(np.int8)))
-        starts, ends = block.times_us[edges[::2]], block.times_us[edges[1::2] - 1]
+        first, behind = runs(codes == code)
+        starts, ends = block.times_us[first], block.times_us[behind - 1]
         longest = int(np.argmax(ends - starts))
         count = float(len(starts))
         text = f"fault {code:.0f}, {FAULTS.get(int(code), 'unknown')}: reported {_times(len(starts))}"
@@ -195,28 +195,20 @@ def _repeated(stream: str, block: Block) -> NDArray[np.float64]:
     moves = motion.moves(columns)
     if moves is not None:
         same &= moves[1:]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     lost = np.zeros(len(same))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in zip(*runs(same), strict=True):
         if end - start >= _REPEATED:
             lost[start] = end - start
     return lost
 
 
-# Anomalies: sensors that fail, and faults that show in how a drive's fields go together.
-
-
 def mine(drive: Drive) -> Mined:
     """All anomalies of a drive."""
-    parts = [mine_motionless(drive), mine_faults(drive), mine_frozen(drive), mine_gaps(drive)]
-    samples = readings(drive)
+    parts = [test(drive) for test in (mine_motionless, mine_faults, mine_frozen, mine_gaps)]
+    samples = attempt(readings, drive)
     if isinstance(samples, str):
         parts.append(Mined(missing={"anomalies": samples}))
     else:
         parts += [mine_balance(samples), mine_drift(samples)]
         parts += [test(drive, samples) for test in (mine_warming, mine_slip, mine_dropouts, mine_underway)]
-    return Mined(
-        estimates={name: estimate for part in parts for name, estimate in part.estimates.items()},
-        missing={name: reason for part in parts for name, reason in part.missing.items()},
-        events=[event for part in parts for event in part.events],
-    )
+    return merge(parts)

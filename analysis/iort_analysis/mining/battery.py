@@ -14,12 +14,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.drive import Drive
-from iort_analysis.results import Mined, Table
+from iort_analysis.results import Mined, Table, miner
 from iort_analysis.statistics.fitting import Fit, Prior, fit
-from iort_analysis.statistics.signals import averaged, binned, bridged, lagged, resolution, smooth_basis
+from iort_analysis.statistics.signals import (
+    Array,
+    averaged,
+    binned,
+    bridged,
+    lagged,
+    resolution,
+    smooth_basis,
+)
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
 from iort_contract.messages.analysis import Estimate
 
@@ -105,8 +113,6 @@ def _by_voltage(open_v: Estimate, cells: float) -> tuple[float, float]:
     return low, high
 
 
-Array = NDArray[np.float64]
-
 _CURRENT = "current_input"
 _FIELDS = (VOLTAGE_FIELD, _CURRENT)
 _STEP_S = 0.2
@@ -151,11 +157,10 @@ class Battery(NamedTuple):
         return np.concatenate([weights, np.zeros(len(self.fit.coefficients) - len(weights))])
 
 
+@miner(*_NAMES)
 def mine(drive: Drive) -> Mined:
     """The battery's resistances, its open voltage against the charge drawn, and what is left in it."""
     battery = fit_battery(drive)
-    if isinstance(battery, str):
-        return Mined(missing=dict.fromkeys(_NAMES, battery))
     resistances = len(battery.open_columns[0])
     slow = np.zeros(len(battery.fit.coefficients))
     slow[resistances + 1 :] = 1
@@ -176,16 +181,16 @@ def mine(drive: Drive) -> Mined:
     return Mined({**estimates, **left}, missing, tables={"battery": _curve(battery)})
 
 
-def fit_battery(drive: Drive) -> Battery | str:
-    """Fit the circuit to a drive; or the reason why that cannot be done."""
-    voltage_v, current_a = (drive.of(drive.vesc, name) for name in _FIELDS)
-    if voltage_v is None or current_a is None:
-        return f"needs {' and '.join(_FIELDS)}"
+def fit_battery(drive: Drive) -> Battery:
+    """Fit the circuit to a drive; raises `NoResultError`."""
+    voltage_v, current_a = drive.motor(*_FIELDS)
     seconds = drive.seconds
     if seconds[-1] < _LEAST_S:
-        return f"needs at least {_LEAST_S:g} s, got {seconds[-1]:.0f} s"
+        raise NoResultError(f"needs at least {_LEAST_S:g} s, got {seconds[-1]:.0f} s")
     if np.nanstd(current_a) < _LEAST_A:
-        return f"{_CURRENT} hardly changes, so that nothing tells the resistance from the open voltage"
+        raise NoResultError(
+            f"{_CURRENT} hardly changes, so that nothing tells the resistance from the open voltage"
+        )
     steps_a = bridged(binned(seconds, current_a, _STEP_S))
     ends_s = (np.arange(len(steps_a)) + 1) * _STEP_S
     charge_ah = np.interp(seconds, ends_s, np.cumsum(steps_a) * _STEP_S / 3600)
@@ -196,7 +201,7 @@ def fit_battery(drive: Drive) -> Battery | str:
     at = open_columns.shape[1]
     fitted = _with_slow(design[rows], voltage_v[rows], at, resolution(voltage_v))
     if fitted is None:
-        return "the drive's currents do not tell the resistance from the open voltage"
+        raise NoResultError("the drive's currents do not tell the resistance from the open voltage")
     # Voltage and current that are not of the same moment make the resistance small; their means do not.
     *slow, means_v = averaged(seconds, [*design.T, voltage_v], _MEAN_S)
     slower = _with_slow(np.column_stack(slow), means_v, at, 0.0)

@@ -15,15 +15,14 @@ from iort_analysis.mining.relations import (
     MOTOR,
     SPEED,
     VOLTAGE,
-    Array,
     Readings,
     balance,
     voltage_residuals,
 )
-from iort_analysis.results import Event, Mined
+from iort_analysis.results import Event, Mined, attempt
 from iort_analysis.statistics.distributions import sides
 from iort_analysis.statistics.fitting import fit
-from iort_analysis.statistics.signals import binned, bridged, smooth_basis
+from iort_analysis.statistics.signals import Array, binned, bridged, runs, smooth_basis
 from iort_contract.messages.analysis import Estimate
 
 _LEAST = 30
@@ -99,8 +98,8 @@ _LEAST_DUTY = 0.2
 def mine_underway(drive: Drive, samples: Readings) -> Mined:
     """An event for each model that no longer fits from some time on."""
     events = []
-    fitted = balance(samples)
-    if fitted is not None:
+    fitted = attempt(balance, samples)
+    if not isinstance(fitted, str):
         forces, at_s, took_s = fitted
         found = _change(at_s, forces.residuals / took_s, "A")
         # Less friction than before is a warm bearing, and no finding.
@@ -132,16 +131,8 @@ def _event(drive: Drive, kind: str, fields: tuple[str, ...], found: tuple[Change
     size = f"{value:.2g} {unit} ({low:.2g} to {high:.2g})"
     since = f"from {since_s:.0f} s after the start on "
     start_us = int(drive.samples.times_us[0]) + round(since_s * 1e6)
-    return Event(
-        kind,
-        start_us,
-        drive.end_us,
-        drive.vesc or "",
-        fields,
-        since + text.format(size=size),
-        change.effect,
-        change.p,
-    )
+    said, vesc = since + text.format(size=size), drive.vesc or ""
+    return Event(kind, start_us, drive.end_us, vesc, fields, said, change.effect, change.p)
 
 
 # A battery's cell that drops out: the voltage falls below what the load explains, and comes back.
@@ -184,26 +175,13 @@ def mine_dropouts(drive: Drive, samples: Readings) -> Mined:
         f"the battery's voltage fell {times} below what the load explains, by {effect.value:.2g} V "
         f"({low:.2g} V to {high:.2g} V) for {lasted_s:.1f} s, and came back"
     )
-    return Mined(
-        events=[
-            Event(
-                KIND,
-                start_us - _SHOWN_US,
-                end_us + _SHOWN_US,
-                drive.vesc or "",
-                (VOLTAGE, BATTERY),
-                text,
-                effect,
-            )
-        ]
-    )
+    shown_us = start_us - _SHOWN_US, end_us + _SHOWN_US
+    return Mined(events=[Event(KIND, *shown_us, drive.vesc or "", (VOLTAGE, BATTERY), text, effect)])
 
 
 def _falls(off: Array, least_v: float) -> tuple[Array, Steps, Steps]:
     """The depth of each fall, its first step and the one after its last."""
-    below = np.concatenate([[False], off < -least_v, [False]])
-    edges = np.flatnonzero(below[1:] != below[:-1])
-    starts, ends = edges[::2].astype(np.int64), edges[1::2].astype(np.int64)
+    starts, ends = runs(off < -least_v)
     long = ends - starts >= _LEAST_STEPS
     starts, ends = starts[long], ends[long]
     depths = np.array([-float(np.nanmedian(off[a:b])) for a, b in zip(starts, ends, strict=True)])

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.gain import fit_gain
 from iort_analysis.mining.motor import RAD_S_PER_ERPM, Motor, fit_motor
-from iort_analysis.results import Mined
+from iort_analysis.results import Mined, attempt, merge, miner
 from iort_analysis.statistics.fitting import Fit, Part, fit, propagated
+from iort_analysis.statistics.signals import Array, summed
 from iort_contract.catalog.car import KNOWN
 from iort_contract.messages.analysis import Estimate
-
-Array = NDArray[np.float64]
 
 _WINDOW_S = 0.5
 # Slower, friction is not constant, and a stand hides forces.
@@ -59,21 +59,23 @@ _RATIOS = ("acceleration_per_a_mps2", "friction_per_mass_mps2")
 
 def mine(drive: Drive) -> Mined:
     """The gain, the mass that the motor moves, and what holds the car back."""
-    gain, motor = fit_gain(drive), fit_motor(drive)
-    estimates, missing = {}, {}
+    gain, motor = attempt(fit_gain, drive), attempt(fit_motor, drive)
     if isinstance(gain, str):
-        missing[_GAIN] = gain
+        found = Mined(missing={_GAIN: gain})
         registered = None if drive.vehicle is None else drive.vehicle.speed_to_erpm_gain
     else:
-        estimates[_GAIN] = gain.of(0, "erpm per m/s")
+        found = Mined({_GAIN: gain.of(0, "erpm per m/s")})
         registered = float(gain.coefficients[0])
+    return merge([found, _mine_forces(drive, gain, motor, registered)])
+
+
+@miner(*_FORCES, *_RATIOS)
+def _mine_forces(drive: Drive, gain: Fit | str, motor: Motor | str, registered: float | None) -> Mined:
+    """What holds the car back, by the ``registered`` gain or the drive's own."""
     if registered is None:
         default = f", also if it is {drive.known[_GAIN]:g}, the default" if _GAIN in drive.known else ""
-        reason = f"needs the gain: {missing[_GAIN]}; or register the car's own{default}: iort robots set"
-        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), reason)})
+        raise NoResultError(f"needs the gain: {gain}; or register the car's own{default}: iort robots set")
     motion = _fit_motion(drive, registered)
-    if isinstance(motion, str):
-        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), motion)})
     found = (
         Mined(_ratios(drive, motion, registered), dict.fromkeys(_FORCES, motor))
         if isinstance(motor, str)
@@ -81,8 +83,8 @@ def mine(drive: Drive) -> Mined:
     )
     forces = {**found.estimates, "drivetrain_efficiency": _efficiency(motion)}
     if impossible := _impossible(forces, drive.known.get("mass_kg")):
-        return Mined(estimates, {**missing, **dict.fromkeys((*_FORCES, *_RATIOS), impossible)})
-    return Mined({**estimates, **found.estimates}, {**missing, **found.missing})
+        raise NoResultError(impossible)
+    return found
 
 
 def _impossible(forces: Mapping[str, Estimate], known_kg: float | None) -> str:
@@ -130,21 +132,15 @@ def _ratios(drive: Drive, motion: Fit, gain: float) -> dict[str, Estimate]:
 
 def _mean_square(drive: Drive, gain: float) -> float:
     """The mean square of the speed over the way, in m2/s2."""
-    speed = drive.of(drive.vesc, "speed")
-    if speed is None:
-        return 0.0
-    speed = np.abs(speed / gain)
+    speed = np.abs(drive.motor("speed")[0] / gain)
     return float(np.nansum(speed**3) / max(float(np.nansum(speed)), 1e-12))
 
 
-def _fit_motion(drive: Drive, gain: float) -> Fit | str:
+def _fit_motion(drive: Drive, gain: float) -> Fit:
     """Coefficients: driving and braking acceleration an ampere, friction, drag and brake for each kg."""
-    speed = drive.of(drive.vesc, "speed")
-    current = drive.of(drive.vesc, "current_motor")
-    if speed is None or current is None:
-        return "needs the motor's speed and current_motor"
+    speed, current = drive.motor("speed", "current_motor", reason="needs the motor's speed and current_motor")
     if np.nanstd(current) < _LEAST_A:
-        return "the motor's current hardly changes"
+        raise NoResultError("the motor's current hardly changes")
     offset = 0.0 if drive.vehicle is None else drive.vehicle.speed_to_erpm_offset
     speed = (speed - offset) / gain
     seconds, way = drive.seconds, np.sign(speed)
@@ -176,7 +172,7 @@ def _fit_motion(drive: Drive, gain: float) -> Fit | str:
         wanted = wanted - (_TURNING - 1) * c[_SLIPS] / c[0] * c[_DRAG] * np.diff(speed[edges] ** 3)
         found = fit(columns, wanted)
     if found is None or min(found.coefficients[:2]) <= 0:
-        return "the drive's accelerations do not tell mass from friction"
+        raise NoResultError("the drive's accelerations do not tell mass from friction")
     return found
 
 
@@ -265,6 +261,4 @@ def _windows(drive: Drive, usable: NDArray[np.bool_]) -> tuple[NDArray[np.int64]
 
 
 def _integrals(seconds: Array, rate: Array, edges: NDArray[np.int64]) -> Array:
-    rate = np.nan_to_num(rate)
-    total = np.append(0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(seconds)))
-    return np.asarray(np.diff(total[edges]), dtype=np.float64)
+    return np.asarray(np.diff(summed(seconds, rate)[edges]), dtype=np.float64)

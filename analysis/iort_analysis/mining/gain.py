@@ -15,15 +15,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.building import with_derived
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.paths import path_of
+from iort_analysis.results import attempt
 from iort_analysis.statistics.distributions import sides
 from iort_analysis.statistics.fitting import Fit, fit
+from iort_analysis.statistics.signals import Array
 from iort_contract.catalog.derived import Vehicle
-
-Array = NDArray[np.float64]
 
 # Windows in which motor and car are compared, and the distance that both need at least.
 _WINDOW_S, _LEAST_M, _LEAST_DRIVE_M = 1.0, 0.3, 20.0
@@ -37,12 +38,10 @@ _ENTERED = 0.03
 _CUT = 0.01
 
 
-def fit_gain(drive: Drive) -> Fit | str:
-    """The fit whose only coefficient is the gain in erpm per m/s, over the drive; or the reason for none."""
-    speed = drive.of(drive.vesc, "speed")
-    if speed is None:
-        return "needs the motor's speed"
-    ways: list[Callable[[], Fit | str | None]] = [
+def fit_gain(drive: Drive) -> Fit:
+    """The fit whose only coefficient is the gain in erpm per m/s, over the drive; raises `NoResultError`."""
+    (speed,) = drive.motor("speed", reason="needs the motor's speed")
+    ways: list[Callable[[], Fit | None]] = [
         lambda: _by_pose(drive, speed),
         lambda: _by_speed(drive, speed, _OVER_GROUND, 0.0),
         lambda: _by_positions(drive, speed),
@@ -50,26 +49,27 @@ def fit_gain(drive: Drive) -> Fit | str:
     ]
     reasons = []
     for way in ways:
-        found = way()
+        found = attempt(way)
         if isinstance(found, Fit):
             return found
         if found is not None:
             reasons.append(found)
-    if reasons:
-        return reasons[0]
-    return "needs a second source of speed, such as a stream with the car's pose or positions"
+    none = "needs a second source of speed, such as a stream with the car's pose or positions"
+    raise NoResultError(reasons[0] if reasons else none)
 
 
 def with_gain(drive: Drive) -> Drive:
     """The drive; one of a car whose gain nobody has registered with the gain that the drive itself tells."""
-    found = None if drive.vehicle is not None else fit_gain(drive)
-    if not isinstance(found, Fit) or drive.vesc is None:
+    if drive.vehicle is not None or drive.vesc is None:
         return drive
-    vehicle = Vehicle(float(found.coefficients[0]))
+    try:
+        vehicle = Vehicle(float(fit_gain(drive).coefficients[0]))
+    except NoResultError:
+        return drive
     return replace(drive, vehicle=vehicle, samples=with_derived(drive.samples, drive.vesc, vehicle))
 
 
-def _by_speed(drive: Drive, speed: Array, names: tuple[str, ...], error: float) -> Fit | str | None:
+def _by_speed(drive: Drive, speed: Array, names: tuple[str, ...], error: float) -> Fit | None:
     """By the first of these fields of a speed, whose gain has an ``error`` of its own; None without one."""
     columns = drive.samples.columns
     for ending in names:
@@ -79,7 +79,7 @@ def _by_speed(drive: Drive, speed: Array, names: tuple[str, ...], error: float) 
     return None
 
 
-def _compared(drive: Drive, speed: Array, mps: Array, error: float) -> Fit | str:
+def _compared(drive: Drive, speed: Array, mps: Array, error: float) -> Fit:
     times_us = drive.samples.times_us
     grid_us = np.arange(times_us[0], times_us[-1], round(_WINDOW_S * 1e6))
     turned, way_m = (_integral(drive, values, grid_us) for values in (speed, mps))
@@ -87,31 +87,29 @@ def _compared(drive: Drive, speed: Array, mps: Array, error: float) -> Fit | str
     return _of_way(turned, way_m, error)
 
 
-def _by_positions(drive: Drive, speed: Array) -> Fit | str | None:
+def _by_positions(drive: Drive, speed: Array) -> Fit | None:
     """By the distance between positions that have no heading; None without them."""
-    path = (
-        None if drive.pose is not None and "heading" in drive.streams[drive.pose].columns else path_of(drive)
-    )
-    if path is None or isinstance(path, str):
+    path = attempt(path_of, drive)
+    if isinstance(path, str) or (drive.pose and "heading" in drive.streams[drive.pose].columns):
         return None
     times_us = path.start_us + np.round(path.seconds * 1e6).astype(np.int64)
     return _of_way(_integral(drive, np.abs(speed), times_us), np.diff(path.passed_m), _CUT)
 
 
-def _of_way(turned: Array, way_m: Array, error: float) -> Fit | str:
+def _of_way(turned: Array, way_m: Array, error: float) -> Fit:
     """The gain by the motor's way in erpm seconds and the car's in metres, with an ``error`` as a share."""
     if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
-        return f"needs {_LEAST_DRIVE_M:g} m of driving with a second source of speed"
+        raise NoResultError(f"needs {_LEAST_DRIVE_M:g} m of driving with a second source of speed")
     found = fit([turned], way_m)
     if found is None or not found.coefficients[0]:
-        return "the drive is too short for the gain"
+        raise NoResultError("the drive is too short for the gain")
     gain = 1 / found.coefficients
     entered = (error / sides() * gain) ** 2
     covariance, given = (of * gain**4 + entered for of in (found.covariance, found.given))
     return found._replace(coefficients=gain, covariance=covariance, given=given, moved=found.moved * gain**2)
 
 
-def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
+def _by_pose(drive: Drive, speed: Array) -> Fit | None:
     """By the way along the heading of a pose; None without one."""
     if drive.pose is None:
         return None
@@ -121,7 +119,7 @@ def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
     known = np.isfinite(pose.columns["x"] + pose.columns["y"] + pose.columns["heading"])
     times_us = pose.times_us[known]
     if len(times_us) < 2:
-        return f"the stream {drive.pose} has no positions"
+        raise NoResultError(f"the stream {drive.pose} has no positions")
     steps_m = _steps(*(pose.columns[name][known] for name in ("x", "y", "heading")))
     steps_m[np.diff(times_us) > pause_us(times_us)] = np.nan
     window = (times_us[:-1] - times_us[0]) // round(_WINDOW_S * 1e6)
@@ -129,7 +127,7 @@ def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
     way_m, took_s = np.add.reduceat(steps_m, starts), np.add.reduceat(np.diff(times_us), starts) / 1e6
     way_m[(np.abs(way_m) < _LEAST_M) | (took_s < _WINDOW_S / 2)] = np.nan
     if float(np.nansum(np.abs(way_m))) < _LEAST_DRIVE_M:
-        return f"needs {_LEAST_DRIVE_M:g} m of driving with a pose"
+        raise NoResultError(f"needs {_LEAST_DRIVE_M:g} m of driving with a pose")
     # The motor's way in erpm seconds: what the gain turns metres into. It has next to no noise, and the
     # positions have: the way is fitted to the motor's, so that the noise makes nothing smaller.
     turned, cubes = (
@@ -145,9 +143,11 @@ def _by_pose(drive: Drive, speed: Array) -> Fit | str | None:
         shared=True,
     )
     if found is None or not found.coefficients[0]:
-        return "the drive is too short for the gain"
+        raise NoResultError("the drive is too short for the gain")
     if found.sigma < _SAME_M:
-        return f"the positions of {drive.pose} are calculated from the motor's speed, so they say nothing new"
+        raise NoResultError(
+            f"the positions of {drive.pose} are calculated from the motor's speed, so they say nothing new"
+        )
     gain = 1 / found.coefficients[:1]
     covariance, given = (of[:1, :1] * gain**4 for of in (found.covariance, found.given))
     return found._replace(

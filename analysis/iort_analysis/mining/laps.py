@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis import AnalysisError
+from iort_analysis import AnalysisError, NoResultError
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.paths import Crossings, Floats, Gate, Path, find_gate, path_of
+from iort_analysis.mining.paths import Crossings, Gate, Path, find_gate, path_of
 from iort_analysis.mining.patterns import find_pattern, odometer
-from iort_analysis.results import Mined, Table
+from iort_analysis.results import Mined, Table, attempt
 from iort_analysis.statistics.distributions import mean_of, sides
+from iort_analysis.statistics.signals import Array
 from iort_contract.catalog.analysis import LAPS_TABLE, PARAMETERS, PLACES_TABLE
 from iort_contract.messages.analysis import Estimate
 
@@ -31,20 +32,20 @@ class Places(NamedTuple):
     """The same places in each lap: their distances in the reference lap, and for every lap (a row) the time
     since its start."""
 
-    place_m: Floats
-    since_s: Floats
+    place_m: Array
+    since_s: Array
 
     @property
-    def speed_mps(self) -> Floats:
+    def speed_mps(self) -> Array:
         """The speed around each place, along the reference lap's line."""
         places = np.arange(len(self.place_m))
         before, after = np.maximum(places - _AROUND, 0), np.minimum(places + _AROUND, places[-1])
         seconds = np.maximum(self.since_s[:, after] - self.since_s[:, before], 1e-6)
-        speed: Floats = (self.place_m[after] - self.place_m[before]) / seconds
+        speed: Array = (self.place_m[after] - self.place_m[before]) / seconds
         return speed
 
 
-def by_position(path: Path, starts_m: Floats, ends_m: Floats, reference: int) -> Places:
+def by_position(path: Path, starts_m: Array, ends_m: Array, reference: int) -> Places:
     """When each lap passed the lines across the reference lap's way."""
     shares = np.linspace(0, 1, PLACES + 1)
     begin, end = starts_m[reference], ends_m[reference]
@@ -63,7 +64,7 @@ def by_position(path: Path, starts_m: Floats, ends_m: Floats, reference: int) ->
     return Places((end - begin) * shares, seconds - seconds[:, :1])
 
 
-def _direction(values: Floats) -> Floats:
+def _direction(values: Array) -> Array:
     """The difference of the places two before and two after, on a closed line."""
     closed = values[:-1]
     around = np.roll(closed, -2) - np.roll(closed, 2)
@@ -94,24 +95,27 @@ class Laps:
     gate: Gate | None
     jitter_s: float
     start_us: NDArray[np.int64]
-    time_s: Floats
-    distance_m: Floats
-    energy_wh: Floats
+    time_s: Array
+    distance_m: Array
+    energy_wh: Array
     complete: NDArray[np.bool_]
     places: Places
 
 
-def find_laps(drive: Drive) -> Laps | str:
-    """The laps of a drive; a text says why there are none."""
-    path = path_of(drive)
+def find_laps(drive: Drive) -> Laps:
+    """The laps of a drive; raises `NoResultError`."""
+    path = attempt(path_of, drive)
     if isinstance(path, str):
-        return _by_pattern(drive, path)
+        try:
+            return _by_pattern(drive)
+        except NoResultError as error:
+            raise NoResultError(f"{path}, and {error}") from error
     crossed = find_gate(path)
     if crossed is None:
-        return "the car never came back to a place in the same direction"
+        raise NoResultError("the car never came back to a place in the same direction")
     if crossed.complete.sum() < _LEAST_LAPS or crossed.confidence < _LEAST_CONFIDENCE:
         back, laps = len(crossed.complete), int(crossed.complete.sum())
-        return f"the car came back to a place {back} times, {laps} of them by the same way"
+        raise NoResultError(f"the car came back to a place {back} times, {laps} of them by the same way")
     return _by_gate(drive, path, crossed)
 
 
@@ -137,16 +141,12 @@ def _by_gate(drive: Drive, path: Path, crossed: Crossings) -> Laps:
     )
 
 
-def _by_pattern(drive: Drive, why: str) -> Laps | str:
+def _by_pattern(drive: Drive) -> Laps:
     way = odometer(drive)
-    if way is None:
-        return f"{why}, and none has a motor's speed"
     found = find_pattern(drive, way)
-    if isinstance(found, str):
-        return f"{why}, and {found}"
     complete = found.alike >= _LEAST_CONFIDENCE
     if complete.sum() < _LEAST_LAPS:
-        return f"{why}, and the drive repeats itself only {int(complete.sum())} times"
+        raise NoResultError(f"the drive repeats itself only {int(complete.sum())} times")
     starts, ends = found.passed[:-1], found.passed[1:]
     passed = starts[:, None] + (ends - starts)[:, None] * np.linspace(0, 1, PLACES + 1)
     moving = np.append(True, np.diff(way.passed) > 0)
@@ -166,7 +166,7 @@ def _by_pattern(drive: Drive, why: str) -> Laps | str:
     )
 
 
-def _energy_wh(drive: Drive, bounds: Floats) -> Floats:
+def _energy_wh(drive: Drive, bounds: Array) -> Array:
     """The energy out of the battery between bounds, which are seconds of the drive."""
     volts, amps = drive.of(drive.vesc, "voltage_input"), drive.of(drive.vesc, "current_input")
     if volts is None or amps is None:
@@ -180,25 +180,25 @@ def _energy_wh(drive: Drive, bounds: Floats) -> Floats:
     return np.where(covered >= _LEAST_COVERED, energy, np.nan)
 
 
-def _summed(seconds: Floats, bounds: Floats) -> Callable[[Floats], Floats]:
+def _summed(seconds: Array, bounds: Array) -> Callable[[Array], Array]:
     """What sums steps between samples over each lap."""
 
-    def between(steps: Floats) -> Floats:
+    def between(steps: Array) -> Array:
         total = np.concatenate([[0.0], np.cumsum(steps)])
         return np.diff(np.interp(bounds, seconds, total))
 
     return between
 
 
-def speed_mps(drive: Drive, laps: Laps) -> Floats:
+def speed_mps(drive: Drive, laps: Laps) -> Array:
     """The speed at the places of each lap: by the motor, or without the car's parameters by the positions."""
-    erpm, vehicle = drive.of(drive.vesc, "speed"), drive.vehicle
-    if erpm is None or vehicle is None:
+    erpm = drive.of(drive.vesc, "speed")
+    if erpm is None or drive.vehicle is None:
         return laps.places.speed_mps
     known = np.flatnonzero(np.isfinite(erpm))
-    speed = np.abs((erpm[known] - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain)
+    speed = np.abs(drive.mps(erpm[known]))
     starts = (laps.start_us - drive.samples.times_us[0]) / 1e6
-    found: Floats = np.interp(starts[:, None] + laps.places.since_s, drive.seconds[known], speed)
+    found: Array = np.interp(starts[:, None] + laps.places.since_s, drive.seconds[known], speed)
     return found
 
 
@@ -216,7 +216,7 @@ _NAMES = ("lap_best_s", "lap_mean_s", "lap_distance_m", "lap_energy_wh", "lap_en
 
 def mine(drive: Drive) -> Mined:
     """The laps of a drive."""
-    found = find_laps(drive)
+    found = attempt(find_laps, drive)
     if isinstance(found, str):
         return Mined(missing=dict.fromkeys(_NAMES, f"no laps: {found}"))
     estimates, speed = dict(_estimates(found)), speed_mps(drive, found)
@@ -262,11 +262,11 @@ def _estimates(laps: Laps) -> Iterator[tuple[str, Estimate]]:
             yield name, Estimate(*mean_of(known), PARAMETERS[name].unit)
 
 
-def _per_km(laps: Laps) -> Floats:
+def _per_km(laps: Laps) -> Array:
     return laps.energy_wh / laps.distance_m * 1000
 
 
-def _laps_table(laps: Laps, speed: Floats) -> Table:
+def _laps_table(laps: Laps, speed: Array) -> Table:
     n = len(laps.time_s)
     return {
         "lap": np.arange(1, n + 1),
@@ -284,7 +284,7 @@ def _laps_table(laps: Laps, speed: Floats) -> Table:
     }
 
 
-def _places_table(laps: Laps, speed: Floats) -> Table:
+def _places_table(laps: Laps, speed: Array) -> Table:
     """When each lap passed each place: the difference of two laps is their delta-time."""
     n, places = laps.places.since_s.shape
     return {

@@ -17,20 +17,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.drive import Drive
-from iort_analysis.results import Mined
+from iort_analysis.results import Mined, attempt, miner
 from iort_analysis.statistics.fitting import Fit, Prior, fit, propagated
-from iort_analysis.statistics.signals import averaged, binned, bridged, lagged
+from iort_analysis.statistics.signals import Array, averaged, binned, bridged, lagged
 from iort_contract.catalog.vesc import VOLTAGE_FIELD
 from iort_contract.messages.analysis import Estimate
-
-Array = NDArray[np.float64]
 
 RAD_S_PER_ERPM = 2 * math.pi / 60
 # Copper's resistance grows by this share a kelvin; the resistance is given at this temperature.
@@ -89,9 +88,9 @@ class Motor(NamedTuple):
 
 def mine(drive: Drive) -> Mined:
     """The motor's resistance, flux linkage and inductance."""
-    motor = fit_motor(drive)
+    motor = attempt(fit_motor, drive)
     if isinstance(motor, str):
-        return Mined(_ratios(drive), dict.fromkeys(_NAMES, motor))
+        return replace(_mine_ratios(drive), missing=dict.fromkeys(_NAMES, motor))
     estimates = {"motor_flux_linkage_wb": motor.flux_linkage}
     missing = {}
     name = "motor_resistance_25_ohm" if motor.at_reference else "motor_resistance_ohm"
@@ -119,33 +118,31 @@ def mine(drive: Drive) -> Mined:
 
 # Three miners need it of the same drive.
 @lru_cache(maxsize=1)
-def fit_motor(drive: Drive) -> Motor | str:
-    """Fit the motor's equations to a drive; or the reason why that cannot be done."""
-    speed, vq, iq = (drive.of(drive.vesc, name) for name in ("speed", "avg_vq", "avg_iq"))
-    if speed is None:
-        return "needs the motor's speed"
-    if reason := _hardly_moves(drive, speed):
-        return reason
+def fit_motor(drive: Drive) -> Motor:
+    """Fit the motor's equations to a drive; raises `NoResultError`."""
+    (speed,) = drive.motor("speed", reason="needs the motor's speed")
+    vq, iq = (drive.of(drive.vesc, name) for name in ("avg_vq", "avg_iq"))
+    _check_moves(drive, speed)
     rows = slice(None, None, -(-len(speed) // _MOST_ROWS))
     if vq is not None and iq is not None and np.nanstd(vq) and np.nanstd(iq):
         return _from_axes(drive, speed[rows], vq[rows], iq[rows], rows)
     return _from_duty(drive, speed[rows], rows)
 
 
-def _hardly_moves(drive: Drive, speed: Array) -> str:
-    """Why the drive has too little motion to tell anything of the motor; empty if it has enough."""
+def _check_moves(drive: Drive, speed: Array) -> None:
+    """Raise `NoResultError` if the drive has too little motion to tell anything of the motor."""
     moves_s = float(np.mean(np.abs(speed) > _LEAST_ERPM)) * float(drive.seconds[-1])
-    if moves_s >= _LEAST_S:
-        return ""
-    return f"needs {_LEAST_S:g} s of motion faster than {_LEAST_ERPM:g} erpm, got {moves_s:.0f} s"
+    if moves_s < _LEAST_S:
+        raise NoResultError(
+            f"needs {_LEAST_S:g} s of motion faster than {_LEAST_ERPM:g} erpm, got {moves_s:.0f} s"
+        )
 
 
-def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) -> Motor | str:
+def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) -> Motor:
     # A motor that stands under current shows its resistance best.
     usable = (np.abs(speed) > _LEAST_ERPM) | (np.abs(iq) > np.nanmax(np.abs(iq)) / 2)
     omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
-    if np.nanstd(iq) < _LEAST_A:
-        return "the motor's current hardly changes"
+    _check_changes(iq)
     vd = drive.of(drive.vesc, "avg_vd")
     # The length of the voltage is right even where the controller's angle is late.
     volts = vq if vd is None else np.copysign(np.hypot(vd[rows], vq), vq)
@@ -153,12 +150,14 @@ def _from_axes(drive: Drive, speed: Array, vq: Array, iq: Array, rows: slice) ->
     duty, voltage = drive.of(drive.vesc, "duty_cycle"), drive.of(drive.vesc, VOLTAGE_FIELD)
     if duty is not None and voltage is not None:
         same.append(duty[rows] * voltage[rows] / math.sqrt(3))
-    found = _with_winding(
-        drive, [omega, iq], [volts, *same], rows, *([] if vd is None else [_square(omega, iq, volts)])
-    )
-    if found is None:
-        return "the drive's speeds and currents do not tell resistance from flux linkage"
+    squares = [] if vd is None else [_square(omega, iq, volts)]
+    found = _with_winding(drive, [omega, iq], [volts, *same], rows, *squares)
     return Motor(*found, _inductance(drive, omega, iq, rows))
+
+
+def _check_changes(current: Array) -> None:
+    if np.nanstd(current) < _LEAST_A:
+        raise NoResultError("the motor's current hardly changes")
 
 
 def _inductance(drive: Drive, omega: Array, iq: Array, rows: slice) -> Estimate | None:
@@ -169,25 +168,19 @@ def _inductance(drive: Drive, omega: Array, iq: Array, rows: slice) -> Estimate 
     return inductance if inductance is not None and inductance.low > 0 else None
 
 
-def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor | str:
-    names = ("duty_cycle", VOLTAGE_FIELD, "current_motor", "current_input")
-    duty, voltage, current, battery = (drive.of(drive.vesc, name) for name in names)
-    if duty is None or voltage is None or current is None:
-        return "needs avg_vq and avg_iq, or duty_cycle, voltage_input and current_motor"
-    duty, voltage, current = duty[rows], voltage[rows], current[rows]
-    if np.nanstd(current) < _LEAST_A:
-        return "the motor's current hardly changes"
-    if battery is None:
-        return "needs current_input: without it the control mode, and so the scale, is not known"
+def _from_duty(drive: Drive, speed: Array, rows: slice) -> Motor:
+    needs = "needs avg_vq and avg_iq, or duty_cycle, voltage_input and current_motor"
+    names = ("duty_cycle", VOLTAGE_FIELD, "current_motor")
+    duty, voltage, current = (column[rows] for column in drive.motor(*names, reason=needs))
+    _check_changes(current)
+    needs = "needs current_input: without it the control mode, and so the scale, is not known"
+    battery = drive.motor("current_input", reason=needs)[0][rows]
     usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
-    if reason := _not_field_oriented(np.where(usable, duty * current, np.nan), battery[rows]):
-        return reason
+    _check_field_oriented(np.where(usable, duty * current, np.nan), battery)
     omega = np.where(usable, speed, np.nan) * RAD_S_PER_ERPM
     volts = duty * voltage / math.sqrt(3)
-    found = _with_winding(drive, [omega, current], [volts], rows, _square(omega, current, volts))
-    if found is None:
-        return "the drive's speeds and currents do not tell resistance from flux linkage"
-    return Motor(*found, None)
+    squares = _square(omega, current, volts)
+    return Motor(*_with_winding(drive, [omega, current], [volts], rows, squares), None)
 
 
 def _square(omega: Array, current: Array, volts: Array) -> Array:
@@ -196,24 +189,21 @@ def _square(omega: Array, current: Array, volts: Array) -> Array:
     return np.asarray((omega * current) ** 2 / (2 * known), dtype=np.float64)
 
 
-def _ratios(drive: Drive) -> dict[str, Estimate]:
+@miner()
+def _mine_ratios(drive: Drive) -> Mined:
     """What is left where the voltages' scale is not known: the shares of speed and current in them."""
     names = ("speed", "duty_cycle", VOLTAGE_FIELD, "current_motor", "current_input")
-    speed, duty, voltage, current, battery = (drive.of(drive.vesc, name) for name in names)
-    if speed is None or duty is None or voltage is None or current is None or battery is None:
-        return {}
-    if _hardly_moves(drive, speed):
-        return {}
+    speed, duty, voltage, current, battery = drive.motor(*names)
+    _check_moves(drive, speed)
     usable = (np.abs(speed) > _LEAST_ERPM) & (np.abs(duty) < _MOST_DUTY)
-    if not _follows(np.where(usable, duty * current, np.nan), battery):
-        return {}
     krpm, volts = np.where(usable, speed / 1000, np.nan), duty * voltage
-    found = fit([krpm, current], volts)
+    follows = _follows(np.where(usable, duty * current, np.nan), battery)
+    found = fit([krpm, current], volts) if follows else None
     if found is None:
-        return {}
+        return Mined()
     tried = [fit([krpm, current, beyond], volts) for beyond in _beyond(krpm, current)]
     found = found.beside([one for one in tried if one is not None], (0, 1))
-    return {"motor_volts_per_krpm": found.of(0, "V/krpm"), "motor_volts_per_a": found.of(1, "V/A")}
+    return Mined({"motor_volts_per_krpm": found.of(0, "V/krpm"), "motor_volts_per_a": found.of(1, "V/A")})
 
 
 def _follows(modulated: Array, battery: Array) -> bool:
@@ -224,34 +214,35 @@ def _follows(modulated: Array, battery: Array) -> bool:
     return float(np.corrcoef(modulated[known], battery[known])[0, 1]) > _LEAST_CORRELATION
 
 
-def _not_field_oriented(modulated: Array, battery: Array) -> str:
-    """Why the scale of the voltages is not known; empty if it is."""
+def _check_field_oriented(modulated: Array, battery: Array) -> None:
+    """Raise `NoResultError` if the scale of the voltages is not known."""
     if not _follows(modulated, battery):
-        return (
+        raise NoResultError(
             "current_input does not follow duty_cycle times current_motor, as the firmware calculates it:"
             " the driver's currents are other ones"
         )
     mode = fit([modulated, np.ones(len(modulated))], battery)
     ratio = math.nan if mode is None else float(mode.coefficients[0])
-    if abs(ratio - _FOC) <= (_SIX_STEP - _FOC) / 2:
-        return ""
-    return (
-        f"current_input is {ratio:.2f} of duty_cycle times current_motor, field-oriented control gives"
-        f" {_FOC:.2f}: only sums of phases are known"
-    )
+    # NaN is not field-oriented either.
+    if not abs(ratio - _FOC) <= (_SIX_STEP - _FOC) / 2:
+        raise NoResultError(
+            f"current_input is {ratio:.2f} of duty_cycle times current_motor, field-oriented control gives"
+            f" {_FOC:.2f}: only sums of phases are known"
+        )
 
 
 def _with_winding(
     drive: Drive, columns: list[Array], volts: Sequence[Array], rows: slice, *more: Array
-) -> tuple[Fit, bool] | None:
+) -> tuple[Fit, bool]:
     """The fit, whose resistance grows with the motor's temperature where that is known; and if so.
 
     The first of ``volts`` is fitted; the others are the same voltage as other fields tell it.
     """
     omega, current = columns
+    unknown = "the drive's speeds and currents do not tell resistance from flux linkage"
     rough = fit([*columns, *more], volts[0])
     if rough is None:
-        return None
+        raise NoResultError(unknown)
     flux, size = (abs(float(one)) for one in rough.coefficients[:2])
     seconds = drive.seconds[rows]
     # The speed may be older or newer than the voltage by part of the time between samples.
@@ -276,7 +267,7 @@ def _with_winding(
     wanted, *same = means[first + len(beyond) :]
     found = fit(equations, wanted, priors=priors)
     if found is None:
-        return None
+        raise NoResultError(unknown)
     tried = [fit([*equations, *beyond], wanted, priors=priors) for beyond in (*zip(others), others)]
     tried += [fit(equations, other, priors=priors) for other in same]
     return found.beside([one for one in tried if one is not None], (0, 1)), warms

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
 from iort_analysis.samples.positions import accuracy_m, fixes, local_metres, position_fields
+from iort_analysis.statistics.signals import Array
 
-Floats = NDArray[np.float64]
 _LEAST_POSITIONS = 30
 # Positions closer together than this many times their noise would add the noise to the distance.
 _APART_NOISES = 20
@@ -44,40 +45,40 @@ class Path:
     """
 
     start_us: int
-    seconds: Floats
-    x_m: Floats
-    y_m: Floats
+    seconds: Array
+    x_m: Array
+    y_m: Array
     noise_m: float
     extent_m: float
 
     @cached_property
-    def passed_m(self) -> Floats:
+    def passed_m(self) -> Array:
         """The distance from the first position."""
         steps = np.hypot(np.diff(self.x_m), np.diff(self.y_m))
         return np.concatenate([[0.0], np.cumsum(steps)])
 
-    def seconds_at(self, passed_m: Floats) -> Floats:
+    def seconds_at(self, passed_m: Array) -> Array:
         """The times at distances along the way."""
         return np.interp(passed_m, self.passed_m, self.seconds)
 
-    def position_at(self, passed_m: Floats) -> tuple[Floats, Floats]:
+    def position_at(self, passed_m: Array) -> tuple[Array, Array]:
         """The positions at distances along the way."""
         return np.interp(passed_m, self.passed_m, self.x_m), np.interp(passed_m, self.passed_m, self.y_m)
 
 
-def path_of(drive: Drive) -> Path | str:
-    """The way of a drive by its stream of positions; a text says why there is none."""
+def path_of(drive: Drive) -> Path:
+    """The way of a drive by its stream of positions; raises `NoResultError`."""
     placed = {name: fields for name, b in drive.streams.items() if (fields := position_fields(b.columns))}
     stream = drive.pose if drive.pose in placed else min(placed, default=None)
     if stream is None:
-        return "no stream has a position"
+        raise NoResultError("no stream has a position")
     block, fields = drive.streams[stream], placed[stream]
     accuracy = accuracy_m(block.columns, fields)
     if fields.degrees:
         latitude, longitude = fixes(block.columns, fields)
         known = np.flatnonzero(~np.isnan(latitude))
         if not len(known):
-            return f"no position in {stream} has a fix"
+            raise NoResultError(f"no position in {stream} has a fix")
         x, y = local_metres(latitude, longitude, (float(latitude[known[0]]), float(longitude[known[0]])))
     else:
         x, y = (block.columns[name].astype(np.float64) for name in fields.names)
@@ -86,20 +87,20 @@ def path_of(drive: Drive) -> Path | str:
         with np.errstate(invalid="ignore"):
             there &= ~(accuracy > _WORST_M)
         if not there.any():
-            return f"{stream} is right to {_WORST_M:g} m at no time"
+            raise NoResultError(f"{stream} is right to {_WORST_M:g} m at no time")
     known = np.flatnonzero(there)
     times = block.times_us[known]
     later = np.append(True, times[1:] > times[:-1])[: len(known)]
     known, times = known[later], times[later]
     if len(known) < _LEAST_POSITIONS:
-        return f"{stream} has {len(known)} positions, at least {_LEAST_POSITIONS} are needed"
+        raise NoResultError(f"{stream} has {len(known)} positions, at least {_LEAST_POSITIONS} are needed")
     x, y = x[known], y[known]
     errors_m = None if accuracy is None else accuracy[known]
     error_m = 0.0 if errors_m is None else float(np.nan_to_num(np.nanmedian(errors_m)))
     reach_m = _reach_m(drive, times)
     plausible = _plausible(x, y, reach_m, max(_SLACK_M, _ERRORS * error_m))
     if plausible.mean() < _LEAST_PLAUSIBLE:
-        return (
+        raise NoResultError(
             f"{1 - plausible.mean():.0%} of the positions of {stream} are further apart than the car can "
             "move: they jump, or the gain is not the car's"
         )
@@ -109,24 +110,28 @@ def path_of(drive: Drive) -> Path | str:
     extent_m = float(np.hypot(*spans))
     kept = _apart(x, y, max(_APART_NOISES * noise_m, extent_m / 500))
     if len(kept) < _LEAST_POSITIONS:
-        return "the car hardly moved"
+        raise NoResultError("the car hardly moved")
     if extent_m < _LEAST_EXTENT * error_m:
-        return f"the positions of {stream} are within {extent_m:.3g} m, and right to {error_m:.3g} m"
+        raise NoResultError(
+            f"the positions of {stream} are within {extent_m:.3g} m, and right to {error_m:.3g} m"
+        )
     noise_m = max(noise_m, error_m)
     path = Path(int(times[0]), (times[kept] - times[0]) / 1e6, x[kept], y[kept], noise_m, extent_m)
     if path.passed_m[-1] > reach_m[-1] + extent_m:
         way_m = path.passed_m[-1]
-        return f"the positions of {stream} move {way_m:.0f} m, and the motor {reach_m[-1]:.0f} m at most"
+        raise NoResultError(
+            f"the positions of {stream} move {way_m:.0f} m, and the motor {reach_m[-1]:.0f} m at most"
+        )
     return path
 
 
-def _reach_m(drive: Drive, times: NDArray[np.int64]) -> Floats:
+def _reach_m(drive: Drive, times: NDArray[np.int64]) -> Array:
     """How far the car can have moved since the first of some times, by the motor's speed."""
     seconds = (times - times[0]) / 1e6
     speed = drive.of(drive.vesc, "speed")
     if drive.vehicle is None or speed is None:
         return np.asarray(_FASTEST_MPS * seconds, dtype=np.float64)
-    mps = np.abs((speed - drive.vehicle.speed_to_erpm_offset) / drive.vehicle.speed_to_erpm_gain)
+    mps = np.abs(drive.mps(speed))
     mps = np.where(np.isfinite(mps), _SLIDES * mps, _FASTEST_MPS)
     samples_us = drive.samples.times_us
     took = np.diff(samples_us) / 1e6
@@ -139,7 +144,7 @@ def _reach_m(drive: Drive, times: NDArray[np.int64]) -> Floats:
     return np.asarray(reached - reached[0], dtype=np.float64)
 
 
-def _plausible(x: Floats, y: Floats, reach_m: Floats, slack_m: float) -> NDArray[np.bool_]:
+def _plausible(x: Array, y: Array, reach_m: Array, slack_m: float) -> NDArray[np.bool_]:
     """Which positions the car can have had: those of the longest stretch without a jump, and of each stretch
     before and after it to which the car can have moved meanwhile."""
     away = np.hypot(np.diff(x), np.diff(y)) > np.diff(reach_m) + slack_m
@@ -159,12 +164,12 @@ def _plausible(x: Floats, y: Floats, reach_m: Floats, slack_m: float) -> NDArray
     return found
 
 
-def _noise(values: Floats) -> float:
+def _noise(values: Array) -> float:
     """The noise of positions that are sampled faster than the car changes its acceleration."""
     return float(np.median(np.abs(np.diff(values, 3)))) * _MAD / _THIRD_DIFFERENCE
 
 
-def _apart(x: Floats, y: Floats, least_m: float) -> NDArray[np.intp]:
+def _apart(x: Array, y: Array, least_m: float) -> NDArray[np.intp]:
     """The indexes of positions that are at least so far from the one kept before."""
     kept, least2 = [0], least_m**2
     at_x, at_y = x[0], y[0]
@@ -202,7 +207,7 @@ class Crossings(NamedTuple):
     two crossings are laps of one track."""
 
     gate: Gate
-    passed_m: Floats
+    passed_m: Array
     complete: NDArray[np.bool_]
 
     @property
@@ -238,7 +243,7 @@ def find_gate(path: Path) -> Crossings | None:
     return None if best is None else best[1]
 
 
-def crossings(path: Path, gate: Gate) -> Floats:
+def crossings(path: Path, gate: Gate) -> Array:
     """The distances along the way at which it crosses a gate in its direction."""
     cos, sin = math.cos(gate.heading_rad), math.sin(gate.heading_rad)
     x, y = path.x_m - gate.x_m, path.y_m - gate.y_m
@@ -273,7 +278,7 @@ def _places(path: Path) -> list[Gate]:
     return gates
 
 
-def _laps(path: Path, passed: Floats, most_aside_m: float) -> NDArray[np.bool_]:
+def _laps(path: Path, passed: Array, most_aside_m: float) -> NDArray[np.bool_]:
     """Which ways between crossings have the usual length, and the usual shape."""
     lengths = np.diff(passed)
     usual = float(np.median(lengths))
@@ -288,7 +293,7 @@ def _laps(path: Path, passed: Floats, most_aside_m: float) -> NDArray[np.bool_]:
     return alike & near
 
 
-def _speed_mps(path: Path, passed: Floats) -> float:
+def _speed_mps(path: Path, passed: Array) -> float:
     """The median speed around the crossings."""
     around = path.passed_m[-1] / len(path.passed_m)
     seconds = path.seconds_at(passed + around) - path.seconds_at(passed - around)

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.drive import Drive
-from iort_analysis.mining.paths import Floats
+from iort_analysis.statistics.signals import Array, summed
 
 # Fields of any stream that tell the car's turns.
 _TURNS = ("steering_angle", "angular_velocity.z", "angular.z", "gyro_z", "data")
@@ -32,9 +33,9 @@ class Pattern(NamedTuple):
     bound's time.
     """
 
-    passed: Floats
-    seconds: Floats
-    alike: Floats
+    passed: Array
+    seconds: Array
+    alike: Array
     correlation: float
     jitter_s: float
 
@@ -42,55 +43,49 @@ class Pattern(NamedTuple):
 class Odometer(NamedTuple):
     """The way of a drive by the motor's speed, in metres or, without the car's parameters, in turns."""
 
-    seconds: Floats
-    passed: Floats
+    seconds: Array
+    passed: Array
 
 
-def odometer(drive: Drive) -> Odometer | None:
-    """The distance by the motor's speed; None without a speed."""
-    erpm = drive.of(drive.vesc, "speed")
-    if erpm is None or len(erpm) < 2:
-        return None
-    vehicle = drive.vehicle
-    gain, offset = (
-        (60.0, 0.0) if vehicle is None else (vehicle.speed_to_erpm_gain, vehicle.speed_to_erpm_offset)
-    )
-    speed = np.abs(np.nan_to_num((erpm.astype(np.float64) - offset) / gain))
+def odometer(drive: Drive) -> Odometer:
+    """The distance by the motor's speed; raises `NoResultError` without a speed."""
+    (erpm,) = drive.motor("speed", reason="none has a motor's speed")
+    speed = np.abs(erpm / 60 if drive.vehicle is None else drive.mps(erpm))
     seconds = drive.seconds
-    elapsed = np.diff(seconds)
-    steps = np.where(elapsed <= _LONGEST_GAP_S, elapsed, 0.0) * (speed[1:] + speed[:-1]) / 2
-    return Odometer(seconds, np.concatenate([[0.0], np.cumsum(steps)]))
+    return Odometer(seconds, summed(seconds, speed, _LONGEST_GAP_S))
 
 
-def find_pattern(drive: Drive, way: Odometer) -> Pattern | str:
-    """The laps of a drive that repeats itself; a text says why there are none."""
+def find_pattern(drive: Drive, way: Odometer) -> Pattern:
+    """The laps of a drive that repeats itself; raises `NoResultError`."""
     signals = _signals(drive)
     moving = np.append(True, np.diff(way.passed) > 0)
     if not signals or moving.sum() < 10 * _LEAST_LAPS:
-        return "the car hardly moved"
+        raise NoResultError("the car hardly moved")
     n = min(_MOST_STEPS, int(moving.sum()))
     grid = np.linspace(0.0, way.passed[-1], n)
     resampled = [np.interp(grid, way.passed[moving], signal[moving]) for signal in signals]
     waves = np.array([(w - w.mean()) / w.std() for w in resampled if w.std() > 0])
     if not len(waves):
-        return "neither speed nor current changes"
+        raise NoResultError("neither speed nor current changes")
     mean_speed = way.passed[-1] / max(float(np.diff(way.seconds)[moving[1:]].sum()), 1e-6)
     shortest = max(10, round(_SHORTEST_LAP_S * mean_speed / (grid[1] - grid[0])))
     lag, correlation = _period(waves, shortest, n // _LEAST_LAPS)
     if lag == 0:
-        return "the drive is too short for three laps"
+        raise NoResultError("the drive is too short for three laps")
     if correlation < _LEAST_CORRELATION:
-        return f"the drive does not repeat itself: its correlation with itself is {correlation:.2f} at most"
+        raise NoResultError(
+            f"the drive does not repeat itself: its correlation with itself is {correlation:.2f} at most"
+        )
     bounds, alike = _bounds(waves, lag)
     if len(alike) < _LEAST_LAPS - 1:
-        return "the drive is too short for three laps"
+        raise NoResultError("the drive is too short for three laps")
     passed = np.interp(bounds, np.arange(n), grid)
     seconds = np.interp(passed, way.passed[moving], way.seconds[moving])
     jitter_s = float(np.std(np.diff(passed)) / np.sqrt(2) / mean_speed)
     return Pattern(passed, seconds, alike, correlation, jitter_s)
 
 
-def _signals(drive: Drive) -> list[Floats]:
+def _signals(drive: Drive) -> list[Array]:
     named = [drive.of(drive.vesc, name) for name in _MOTION]
     turns = [
         column for name, column in drive.samples.columns.items() if name.partition(".")[2].endswith(_TURNS)
@@ -99,12 +94,12 @@ def _signals(drive: Drive) -> list[Floats]:
     return [_filled(column.astype(np.float64)) for column in known]
 
 
-def _filled(column: Floats) -> Floats:
+def _filled(column: Array) -> Array:
     finite = np.isfinite(column)
     return np.interp(np.arange(len(column)), np.flatnonzero(finite), column[finite])
 
 
-def _period(waves: Floats, shortest: int, longest: int) -> tuple[int, float]:
+def _period(waves: Array, shortest: int, longest: int) -> tuple[int, float]:
     """The first lag at which the drive is most like itself, and the correlation there; 0 without one."""
     n = waves.shape[1]
     if longest <= shortest + 2:
@@ -125,7 +120,7 @@ def _period(waves: Floats, shortest: int, longest: int) -> tuple[int, float]:
     return int(first + shortest), float(inner[first])
 
 
-def _bounds(waves: Floats, lag: int) -> tuple[Floats, Floats]:
+def _bounds(waves: Array, lag: int) -> tuple[Array, Array]:
     """The bounds of the laps on the grid, and each lap's correlation with the mean one.
 
     A lap begins where the mean lap is fastest. Each bound is where the drive around it is most like the mean
@@ -149,7 +144,7 @@ def _bounds(waves: Floats, lag: int) -> tuple[Floats, Floats]:
     return np.array(places, dtype=np.float64), np.array(alike)
 
 
-def _likeness(waves: Floats, mean: Floats, bounds: tuple[int, int]) -> float:
+def _likeness(waves: Array, mean: Array, bounds: tuple[int, int]) -> float:
     """The correlation of a lap with the mean lap."""
     grid = np.arange(waves.shape[1])
     at = np.linspace(*bounds, mean.shape[1], endpoint=False)
@@ -157,7 +152,7 @@ def _likeness(waves: Floats, mean: Floats, bounds: tuple[int, int]) -> float:
     return float(np.mean([np.corrcoef(usual, np.interp(at, grid, wave))[0, 1] for usual, wave in pairs]))
 
 
-def _follow(waves: Floats, wanted: Floats, begin: int, lag: int, slack: int) -> list[int]:
+def _follow(waves: Array, wanted: Array, begin: int, lag: int, slack: int) -> list[int]:
     """The place of each lap's start: near one lap after the last one, where the drive is most like it."""
     n, half = waves.shape[1], lag // 2
     energy = float((wanted**2).sum())

@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
-from iort_analysis.results import Mined
+from iort_analysis.results import Mined, miner
 from iort_analysis.statistics.distributions import mean_of, sides
 from iort_analysis.statistics.fitting import Fit, fit
-from iort_analysis.statistics.signals import binned, bridged, lagged
+from iort_analysis.statistics.signals import Array, binned, bridged, lagged, summed
 from iort_contract.catalog.vesc import TEMPERATURES
 from iort_contract.messages.analysis import Estimate
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SPEED, MOTOR, BATTERY, DUTY, VOLTAGE = (
@@ -48,23 +48,20 @@ class Readings(NamedTuple):
 
     def summed(self, values: Array) -> Array:
         """The integral over time up to each sample."""
-        steps = np.diff(self.seconds)
-        known = np.nan_to_num(values)
-        return np.append(0.0, np.cumsum((known[1:] + known[:-1]) / 2 * steps))
+        return summed(self.seconds, values)
 
 
-def readings(drive: Drive) -> Readings | str:
-    """The readings, or the reason why a drive has none."""
+def readings(drive: Drive) -> Readings:
+    """The readings of a drive; raises `NoResultError` if it has none."""
     seconds = drive.seconds
     if not len(seconds) or seconds[-1] < LEAST_S:
-        return f"the drive must last {LEAST_S:g} s, got {seconds[-1] if len(seconds) else 0:.0f} s"
-    found = {name: drive.of(drive.vesc, name) for name in (SPEED, MOTOR, DUTY, VOLTAGE, BATTERY)}
-    if absent := [name for name, column in found.items() if column is None]:
-        return f"the drive has no {' and no '.join(absent)}"
-    speed, motor_a, duty, voltage_v, battery_a = (
-        np.asarray(column, dtype=np.float64) for column in found.values()
-    )
-    return Readings(seconds, speed / KRPM, motor_a, duty, voltage_v, battery_a)
+        raise NoResultError(
+            f"the drive must last {LEAST_S:g} s, got {seconds[-1] if len(seconds) else 0:.0f} s"
+        )
+    names = (SPEED, MOTOR, DUTY, VOLTAGE, BATTERY)
+    absent = [name for name in names if drive.of(drive.vesc, name) is None]
+    speed, *others = drive.motor(*names, reason=f"the drive has no {' and no '.join(absent)}")
+    return Readings(seconds, speed / KRPM, *others)
 
 
 # The balance of forces: what current the car needs to accelerate, to roll, and to pull against its brake.
@@ -86,22 +83,16 @@ _SMOOTHED = 5
 _LEAST_ROWS = 200
 
 
+@miner(INERTIA, ROLLING, BRAKE)
 def mine_balance(samples: Readings) -> Mined:
     """The inertia, the rolling resistance and the brake's drag, as currents."""
-    fitted = balance(samples)
-    if fitted is None:
-        reason = "the motor must drive the car for a minute at several speeds and accelerations"
-        return Mined(missing=dict.fromkeys((INERTIA, ROLLING, BRAKE), reason))
-    found, _, _ = fitted
-    inertia = found.of(0, "A s/krpm")
-    return Mined(
-        estimates={INERTIA: inertia, ROLLING: found.of(1, "A"), BRAKE: found.of(3, "A")},
-    )
+    found, _, _ = balance(samples)
+    return Mined({INERTIA: found.of(0, "A s/krpm"), ROLLING: found.of(1, "A"), BRAKE: found.of(3, "A")})
 
 
-def balance(samples: Readings) -> tuple[Fit, Array, float] | None:
+def balance(samples: Readings) -> tuple[Fit, Array, float]:
     """The fit of the current with inertia, rolling, drag and brake; the times of its rows, and the time that
-    each of them spans, in seconds."""
+    each of them spans, in seconds. Raises `NoResultError`."""
     t, speed, amps = samples.seconds, np.abs(samples.krpm), samples.motor_a * np.sign(samples.krpm)
     brakes = amps < -_BRAKES_A
     last = np.maximum.accumulate(np.where(brakes, t, -np.inf))
@@ -120,21 +111,15 @@ def balance(samples: Readings) -> tuple[Fit, Array, float] | None:
 
     wanted = over(samples.summed(amps))
     wanted[over(samples.summed(other.astype(float))) > 1e-6] = np.nan
-    if np.isfinite(wanted).sum() < _LEAST_ROWS:
-        return None
+    enough = np.isfinite(wanted).sum() >= _LEAST_ROWS
     took = np.full(len(wanted), _OVER * _BALANCE_STEP_S)
     middle = np.interp(grid[:-_OVER] + took / 2, t, np.nan_to_num(speed))
-    fitted = fit(
-        [
-            over(smoothed(speed)),
-            took,
-            over(samples.summed(speed**2)),
-            over(samples.summed(held)),
-            middle * over(smoothed(amps)),
-        ],
-        wanted,
-    )
-    return None if fitted is None else (fitted, grid[:-_OVER] + took / 2, _OVER * _BALANCE_STEP_S)
+    drag, brake = over(samples.summed(speed**2)), over(samples.summed(held))
+    columns = [over(smoothed(speed)), took, drag, brake, middle * over(smoothed(amps))]
+    fitted = fit(columns, wanted) if enough else None
+    if fitted is None:
+        raise NoResultError("the motor must drive the car for a minute at several speeds and accelerations")
+    return fitted, grid[:-_OVER] + took / 2, _OVER * _BALANCE_STEP_S
 
 
 # Sensors that drift, against what the other fields say.
@@ -152,20 +137,18 @@ _DRIFT_STEP_S, _DRIFT_LEAST_S = 0.2, 180.0
 _MOST_KNOTS, _KNOT_S = 8, 60.0
 
 
+@miner(VOLTAGE_DRIFT, CURRENT_DRIFT)
 def mine_drift(samples: Readings) -> Mined:
     """The drifts that the drive's fields allow."""
     if samples.seconds[-1] < _DRIFT_LEAST_S:
-        reason = f"the drive must last {_DRIFT_LEAST_S:g} s"
-        return Mined(missing=dict.fromkeys((VOLTAGE_DRIFT, CURRENT_DRIFT), reason))
+        raise NoResultError(f"the drive must last {_DRIFT_LEAST_S:g} s")
     steady = _steady(samples)
     fits = {VOLTAGE_DRIFT: _voltage(samples, steady), CURRENT_DRIFT: _current(samples, steady)}
-    estimates = {name: found for name, found in fits.items() if found is not None}
-    missing = {
-        name: "the drive must have several speeds and currents all along"
-        for name in fits
-        if name not in estimates
-    }
-    return Mined(estimates=estimates, missing=missing)
+    reason = "the drive must have several speeds and currents all along"
+    return Mined(
+        {name: found for name, found in fits.items() if found is not None},
+        {name: reason for name, found in fits.items() if found is None},
+    )
 
 
 def voltage_residuals(samples: Readings) -> Array | None:
@@ -235,30 +218,27 @@ _LAGS_S = tuple(float(lag) for lag in np.geomspace(20, 2000, 14))
 _ROUNDS = 4
 
 
+@miner(TEMPERATURE_DRIFT, LAG)
 def mine_warming(drive: Drive, samples: Readings) -> Mined:
     """The drift of the controller's temperature over the drive."""
     column = next((c for name in TEMPERATURES if (c := drive.of(drive.vesc, name)) is not None), None)
     if column is None:
-        return _no_warming("the drive has no temperature of the controller")
+        raise NoResultError("the drive has no temperature of the controller")
     if samples.seconds[-1] < _WARMING_LEAST_S:
-        return _no_warming(f"the drive must last {_WARMING_LEAST_S:g} s")
+        raise NoResultError(f"the drive must last {_WARMING_LEAST_S:g} s")
     degc = binned(samples.seconds, np.asarray(column, dtype=np.float64), _WARMING_STEP_S)
     heat = bridged(binned(samples.seconds, samples.motor_a**2, _WARMING_STEP_S))
-    found = _best(degc, heat)
-    if found is None:
-        return _no_warming("the temperature says too little")
-    fitted, lag_s = found
+    fitted, lag_s = _best(degc, heat)
     # The last coefficient is what the logarithm of the lag is still off.
     value, low, high = (lag_s * float(np.exp(off)) for off in fitted.of(4, "1")[:3])
-    lag = Estimate(value, low, high, "s")
-    return Mined(estimates={TEMPERATURE_DRIFT: fitted.of(3, "K"), LAG: lag})
+    return Mined({TEMPERATURE_DRIFT: fitted.of(3, "K"), LAG: Estimate(value, low, high, "s")})
 
 
-def _best(degc: Array, heat: Array) -> tuple[Fit, float] | None:
+def _best(degc: Array, heat: Array) -> tuple[Fit, float]:
     """The fit with the best lag, whose uncertainty is in the others' covariance; and the lag in seconds."""
     fits = [(lag, found) for lag in _LAGS_S if (found := fit(_columns(heat, lag)[:4], degc)) is not None]
     if not fits:
-        return None
+        raise NoResultError("the temperature says too little")
     lag, found = min(fits, key=lambda one: float(np.nansum(np.abs(one[1].residuals))))
     for _ in range(_ROUNDS):
         columns = _columns(heat, lag)
@@ -268,14 +248,10 @@ def _best(degc: Array, heat: Array) -> tuple[Fit, float] | None:
         tangent = sum((size * (other - column) / 0.02 for column, other, size in parts), np.zeros(len(degc)))
         joint = fit([*columns, tangent], degc)
         if joint is None:
-            return None
+            raise NoResultError("the temperature says too little")
         found, fitted_at = joint, lag
         lag *= float(np.exp(np.clip(joint.coefficients[4], -0.3, 0.3)))
     return found, fitted_at
-
-
-def _no_warming(reason: str) -> Mined:
-    return Mined(missing={TEMPERATURE_DRIFT: reason, LAG: reason})
 
 
 def _columns(heat: Array, lag_s: float) -> list[Array]:
@@ -308,20 +284,21 @@ class _Ways(NamedTuple):
     amps: Array
 
 
+@miner(SLIP)
 def mine_slip(drive: Drive, samples: Readings) -> Mined:
     """How much further the wheels turn with much torque than without."""
     pose = None if drive.pose in {None, drive.vesc} else drive.streams[drive.pose or ""]
     if pose is None or len(pose.times_us) < _LEAST:
-        return _no_slip("the drive has no second source of speed, such as a pose")
+        raise NoResultError("the drive has no second source of speed, such as a pose")
     ways = _ways(
         (pose.times_us - drive.samples.times_us[0]) / 1e6, pose.columns["x"], pose.columns["y"], samples
     )
     if len(ways.turns) < _LEAST:
-        return _no_slip("the car hardly moves")
+        raise NoResultError("the car hardly moves")
     high = float(np.quantile(ways.amps, _HIGH))
     idle, pulls = np.abs(ways.amps) < _IDLE * high, ways.amps > _TORQUE * high
     if idle.sum() < _LEAST / 2 or pulls.sum() < _LEAST_PULLS:
-        return _no_slip("the car hardly drives with and without torque")
+        raise NoResultError("the car hardly drives with and without torque")
     parts = np.array_split(np.flatnonzero(idle), _PARTS)
     gains = np.array([float(ways.turns[part].sum() / ways.moved_m[part].sum()) for part in parts])
     gain, low, high = mean_of(gains)
@@ -340,15 +317,11 @@ def _ways(seconds: Array, x_m: Array, y_m: Array, samples: Readings) -> _Ways:
     def over(values: Array) -> Array:
         return np.asarray(np.diff(values[::step]))
 
-    def summed(values: Array) -> Array:
+    def total(values: Array) -> Array:
         return over(np.interp(seconds, samples.seconds, samples.summed(values)))
 
-    turns, took = summed(samples.krpm), over(seconds)
-    gaps = summed(np.isnan(samples.krpm * samples.motor_a).astype(np.float64))
+    turns, took = total(samples.krpm), over(seconds)
+    gaps = total(np.isnan(samples.krpm * samples.motor_a).astype(np.float64))
     moved_m = np.hypot(over(x_m), over(y_m))
     known = np.isfinite(moved_m) & (took < 2 * _OVER_S) & (gaps == 0) & (turns > MOVING_KRPM * took)
-    return _Ways(turns[known], moved_m[known], (summed(samples.motor_a) / took)[known])
-
-
-def _no_slip(reason: str) -> Mined:
-    return Mined(missing={SLIP: reason})
+    return _Ways(turns[known], moved_m[known], (total(samples.motor_a) / took)[known])

@@ -16,16 +16,14 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from iort_analysis import NoResultError
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.motor import COPPER_PER_K, REFERENCE_DEGC, fit_motor
-from iort_analysis.results import Mined
+from iort_analysis.results import Mined, attempt, miner
 from iort_analysis.statistics.fitting import Fit, Part, Prior, fit, propagated
-from iort_analysis.statistics.signals import binned, bridged, lagged
+from iort_analysis.statistics.signals import Array, binned, bridged, lagged
 from iort_contract.messages.analysis import Estimate
-
-Array = NDArray[np.float64]
 
 _STEP_S, _MEAN, _LEAST_S = 0.25, 8, 180.0
 _LEAST_A2 = 1.0
@@ -128,24 +126,25 @@ class Body(NamedTuple):
         return weights
 
 
+@miner(*(f"{name}_{what}" for name in LIMITS_DEGC for what in _WHAT))
 def mine(drive: Drive) -> Mined:
     """How motor and controller warm up, and where that ends."""
-    current, speed = drive.of(drive.vesc, "current_motor"), drive.of(drive.vesc, "speed")
+    needs = f"needs current_motor, speed and {_LEAST_S:g} s"
+    current, speed = drive.motor("current_motor", "speed", reason=needs)
     seconds = drive.seconds
-    if current is None or speed is None or seconds[-1] < _LEAST_S:
-        reason = f"needs current_motor, speed and {_LEAST_S:g} s"
-        return Mined(missing={f"{name}_{what}": reason for name in LIMITS_DEGC for what in _WHAT})
+    if seconds[-1] < _LEAST_S:
+        raise NoResultError(needs)
     squares = bridged(binned(seconds, current**2, _STEP_S))
     wind = bridged(binned(seconds, np.abs(speed), _STEP_S))
     motor = _binned(drive, "temp_motor")
     controller = next((c for name in _CONTROLLERS if (c := _binned(drive, name)) is not None), None)
     load = _Load(squares, wind - wind.mean(), motor)
     found = {
-        "motor": _fit_body(load, motor, controller),
+        "motor": attempt(_fit_body, load, motor, controller),
         # The MOSFETs are no copper.
-        "controller": _fit_body(load._replace(copper=None), controller, motor),
+        "controller": attempt(_fit_body, load._replace(copper=None), controller, motor),
     }
-    resistance = fit_motor(drive)
+    resistance = attempt(fit_motor, drive)
     if not isinstance(resistance, str) and resistance.unknown_ohm:
         resistance = resistance.unknown_ohm
     estimates: dict[str, Estimate] = {}
@@ -179,12 +178,13 @@ def _finals(bodies: dict[str, Body | str]) -> dict[str, Estimate]:
     return finals
 
 
-def _fit_body(load: _Load, degc: Array | None, other: Array | None) -> Body | str:
-    """Fit one body with the best time constant, whose uncertainty is in the covariance; or the reason."""
+def _fit_body(load: _Load, degc: Array | None, other: Array | None) -> Body:
+    """Fit one body with the best time constant, whose uncertainty is in the covariance; raises
+    `NoResultError`."""
     if degc is None:
-        return "the drive has no such temperature"
+        raise NoResultError("the drive has no such temperature")
     if float(np.std(load.squares)) < _LEAST_A2:
-        return "the motor's current hardly changes"
+        raise NoResultError("the motor's current hardly changes")
     known, heat, wind = bridged(degc), load.heat, load.wind
     means = _means(degc)
     share, other_degc = _SHARE, math.nan
@@ -201,13 +201,13 @@ def _fit_body(load: _Load, degc: Array | None, other: Array | None) -> Body | st
     tried = ((time_s, fit(_columns(inputs, time_s), means, priors={3: share})) for time_s in _TIMES_S)
     fits = [(time_s, found) for time_s, found in tried if found is not None]
     if not fits:
-        return "the temperature says too little"
+        raise NoResultError("the temperature says too little")
     time_s, found = min(fits, key=lambda one: float(np.nansum(np.minimum(one[1].residuals ** 2, 1.0))))
     for _ in range(_ROUNDS):
         columns = _columns(inputs, time_s)
         joint = fit([*columns, _tangent(inputs, time_s, found.coefficients)], means, priors={3: share})
         if joint is None:
-            return "the temperature does not bend enough to tell the time constant"
+            raise NoResultError("the temperature does not bend enough to tell the time constant")
         found, fitted_s = joint, time_s
         time_s *= float(np.exp(np.clip(joint.coefficients[-1], -0.3, 0.3)))
     return Body(load, found, fitted_s, known, other_degc)

@@ -8,10 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.statistics.signals import quantum
+from iort_analysis.statistics.signals import Array, quantum
 from iort_contract.messages.analysis import INTERVAL
-
-Array = NDArray[np.float64]
 
 # Abramowitz and Stegun, 26.2.17: an error below 7.5e-8.
 _P = 0.2316419

@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.statistics.distributions import between, quantile, sides
-from iort_analysis.statistics.signals import quantum
+from iort_analysis.statistics.signals import Array, quantum
 from iort_contract.messages.analysis import Estimate
-
-Array = NDArray[np.float64]
 
 BLOCKS = 20
 # Tukey's biweight: 95 % as good as least squares for normal errors, and blind to errors above 4.685 sigma.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,18 @@ Array = NDArray[np.float64]
 _FADES = 8
 # Decimal places that a sensor's values may have, and how many values show at once that they have more.
 _MOST_PLACES, _FIRST = 6, 64
+
+
+def runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first place of each run that is true, and the place behind its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]
+
+
+def summed(seconds: Array, values: Array, longest_s: float = math.inf) -> Array:
+    """The integral over time up to each sample. Unknown values, and those of a longer gap, count nothing."""
+    known, steps = np.nan_to_num(values), np.diff(seconds)
+    return np.append(0.0, np.cumsum((known[1:] + known[:-1]) / 2 * np.where(steps > longest_s, 0, steps)))
 
 
 def binned(times_s: Array, values: Array, width_s: float) -> Array:

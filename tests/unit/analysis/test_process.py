@@ -131,7 +131,6 @@ def test_the_rides_motor_is_told_as_far_as_a_log_with_twelve_samples_a_second_ca
     drive = _drive(recordings.ride(recording(recordings.RIDE).parent))
     mined, fitted = motor.mine(drive), motor.fit_motor(drive)
 
-    assert not isinstance(fitted, str)
     # A textbook's fit gives 0.16 ohm, five times what the motor shows as it stands under current.
     low, high = recordings.standing_ohm(drive)
     assert fitted.resistance.low < low < high < fitted.resistance.high

@@ -13,6 +13,7 @@ from iort_analysis import AnalysisError
 from iort_analysis.mining import laps
 from iort_analysis.mining.laps import Laps, compare, find_laps
 from iort_analysis.mining.paths import path_of
+from iort_analysis.results import attempt
 from iort_analysis.samples.blocks import Block
 from tests.unit.analysis.drives import START_US, Driven, crossed_s, driven, sampled
 
@@ -148,7 +149,7 @@ def test_a_drive_without_laps_says_so(seed):
 def test_a_drive_without_position_and_motor_says_what_it_lacks():
     drive = ride().drive
     bare = replace(drive, pose=None, vesc=None, streams={})
-    assert find_laps(bare) == "no stream has a position, and none has a motor's speed"
+    assert attempt(find_laps, bare) == "no stream has a position, and none has a motor's speed"
 
 
 def test_a_lap_elsewhere_is_not_complete():
@@ -210,9 +211,9 @@ def test_positions_that_wander_while_the_car_stands_are_no_way():
     )
     unsure = np.full(1500, 2.0)
 
-    moved = path_of(with_receiver(times, received(place), samples=slow))
-    wide = path_of(with_receiver(times, received(place, gnss_hAcc=unsure), vehicle=None))
-    never = path_of(with_receiver(times, received(place, gnss_hAcc=20 * unsure)))
+    moved = attempt(path_of, with_receiver(times, received(place), samples=slow))
+    wide = attempt(path_of, with_receiver(times, received(place, gnss_hAcc=unsure), vehicle=None))
+    never = attempt(path_of, with_receiver(times, received(place, gnss_hAcc=20 * unsure)))
 
     assert "the positions of gps move 150 m, and the motor " in str(moved)
     assert "the positions of gps are within 8.48 m, and right to 2 m" in str(wide)
