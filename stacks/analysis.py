@@ -58,26 +58,20 @@ class Analysis(PlatformStack):
             self._nightly()
 
     def _plan(self) -> lambda_.Function:
-        plan = self._computing("Plan", self._reading(), _PLAN_S)
-        self._may_read(plan)
+        plan = self._reading("Plan", _PLAN_S)
         self._storage.robots.grant(plan, "dynamodb:Scan")
         self._storage.findings.grant(plan, "dynamodb:Query")
         allow(plan, ["s3:PutObject"], self._objects(PLANS_PREFIX))
         return plan
 
     def _analyse(self) -> lambda_.Function:
-        analyse = self._computing("Analyse", self._reading(), _ANALYSE_S)
-        self._may_read(analyse)
+        analyse = self._reading("Analyse", _ANALYSE_S)
         self._storage.findings.grant(analyse, "dynamodb:PutItem")
         allow(analyse, ["s3:PutObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
         return analyse
 
     def _evaluate(self) -> lambda_.Function:
-        environment = EvaluateEnvironment(
-            namespace=self.settings.namespace,
-            findings_table=self._storage.findings.table_name,
-            files_bucket=self._storage.files.bucket_name,
-        )
+        environment = self._storage.environment(EvaluateEnvironment)
         evaluate = self._computing("Evaluate", environment, _EVALUATE_S)
         self._storage.findings.grant(evaluate, "dynamodb:Query")
         allow(evaluate, ["s3:GetObject"], self._objects(ANALYSIS_PREFIX))
@@ -87,13 +81,7 @@ class Analysis(PlatformStack):
         return evaluate
 
     def _present(self) -> lambda_.Function:
-        environment = PresentEnvironment(
-            namespace=self.settings.namespace,
-            findings_table=self._storage.findings.table_name,
-            files_bucket=self._storage.files.bucket_name,
-            alarm_topic=self._alarms.topic_arn,
-            page_url=self.settings.page_url,
-        )
+        environment = self._storage.environment(PresentEnvironment, alarm_topic=self._alarms.topic_arn)
         present = function(self, "Present", environment, timeout_s=_EVALUATE_S)
         self._storage.findings.grant(present, "dynamodb:Query", "dynamodb:PutItem", "dynamodb:DeleteItem")
         allow(present, ["s3:GetObject"], self._objects(PLANS_PREFIX))
@@ -115,21 +103,14 @@ class Analysis(PlatformStack):
             arrays=True,
         )
 
-    def _reading(self) -> PlanEnvironment:
-        return PlanEnvironment(
-            namespace=self.settings.namespace,
-            telemetry_table=self._storage.telemetry.table_name,
-            archive_table=self._storage.archive.table_name,
-            robots_table=self._storage.robots.table_name,
-            findings_table=self._storage.findings.table_name,
-            files_bucket=self._storage.files.bucket_name,
-        )
-
-    def _may_read(self, function_: lambda_.Function) -> None:
-        self._storage.telemetry.grant(function_, "dynamodb:Query")
-        self._storage.archive.grant(function_, "dynamodb:Query")
-        allow(function_, ["s3:GetObject"], self._objects(ARCHIVE_PREFIX))
-        self._storage.robots.grant(function_, "dynamodb:GetItem")
+    def _reading(self, name: str, timeout_s: int) -> lambda_.Function:
+        """One that also reads what robots recorded."""
+        reading = self._computing(name, self._storage.environment(PlanEnvironment), timeout_s)
+        self._storage.telemetry.grant(reading, "dynamodb:Query")
+        self._storage.archive.grant(reading, "dynamodb:Query")
+        allow(reading, ["s3:GetObject"], self._objects(ARCHIVE_PREFIX))
+        self._storage.robots.grant(reading, "dynamodb:GetItem")
+        return reading
 
     def _objects(self, prefix: str) -> str:
         return str(self._storage.files.arn_for_objects(f"{prefix}*"))

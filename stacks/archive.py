@@ -27,15 +27,7 @@ class Archive(PlatformStack):
         archive = function(
             self,
             "Archive",
-            ArchiveEnvironment(
-                namespace=settings.namespace,
-                telemetry_table=storage.telemetry.table_name,
-                archive_table=storage.archive.table_name,
-                robots_table=storage.robots.table_name,
-                files_bucket=storage.files.bucket_name,
-                archive_queue=tasks.queue_url,
-                retention_s=settings.retention_s,
-            ),
+            storage.environment(ArchiveEnvironment, archive_queue=tasks.queue_url),
             memory_mb=_MEMORY_MB,
             timeout_s=_TIMEOUT_S,
             scratch_mb=_SCRATCH_MB,

@@ -214,7 +214,7 @@ class Fleet(PlatformStack):
     def __init__(self, app: App, settings: Settings, *, storage: Storage, quarantine: Quarantine) -> None:
         super().__init__(app, "fleet", settings, storage.encryption)
         namespace = settings.namespace
-        self._environment = RegistryEnvironment(namespace, storage.robots.table_name)
+        self._environment = storage.environment(RegistryEnvironment)
         admit = self._admit(storage)
         self.presence = self._presence(storage, quarantine)
         name = fleet_name(namespace)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from aws_cdk import App, Duration, Stack
 from aws_cdk import aws_budgets as budgets
@@ -30,6 +31,8 @@ from stacks import metrics
 from stacks.parts import PlatformStack
 from stacks.settings import Settings
 
+_R = TypeVar("_R", bound=Construct)
+
 
 @dataclass(frozen=True)
 class Watched:
@@ -45,25 +48,17 @@ class Watched:
     @classmethod
     def of(cls, stacks: Iterable[Stack]) -> Watched:
         """All resources of the stacks, in order."""
-        functions: dict[str, lambda_.Function] = {}
-        tables: dict[str, dynamodb.Table] = {}
-        queues: dict[str, sqs.Queue] = {}
-        readers: dict[str, lambda_.Function] = {}
-        machines: dict[str, stepfunctions.StateMachine] = {}
-        for stack in stacks:
-            for construct in stack.node.find_all():
-                if isinstance(construct, lambda_.Function):
-                    functions[construct.node.id] = construct
-                elif isinstance(construct, dynamodb.Table):
-                    tables[construct.node.id] = construct
-                elif isinstance(construct, sqs.Queue):
-                    queues[construct.node.id] = construct
-                elif isinstance(construct, stepfunctions.StateMachine):
-                    machines[type(stack).__name__] = construct
-                elif isinstance(construct, lambda_.EventSourceMapping):
-                    reader = construct.node.scope
-                    if isinstance(reader, lambda_.Function):
-                        readers[reader.node.id] = reader
+        made = [construct for stack in stacks for construct in stack.node.find_all()]
+
+        def named(kind: type[_R]) -> dict[str, _R]:
+            return {one.node.id: one for one in made if isinstance(one, kind)}
+
+        mappings = (one.node.scope for one in made if isinstance(one, lambda_.EventSourceMapping))
+        readers = {one.node.id: one for one in mappings if isinstance(one, lambda_.Function)}
+        machines = {
+            type(Stack.of(one)).__name__: one for one in made if isinstance(one, stepfunctions.StateMachine)
+        }
+        functions, tables, queues = named(lambda_.Function), named(dynamodb.Table), named(sqs.Queue)
         return cls(functions, tables, queues, readers, machines)
 
 

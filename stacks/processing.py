@@ -4,6 +4,7 @@ own role and log."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
@@ -17,6 +18,7 @@ from iort_contract.archive import DUE_MS, FIRST_DUE_MS, HOUR
 from iort_contract.catalog.environments import (
     AlertEnvironment,
     AnswerEnvironment,
+    E,
     EchoEnvironment,
     Environment,
     LaterEnvironment,
@@ -82,7 +84,7 @@ class Processing(PlatformStack):
                 self.called[rule.action.function] = self._plain(rule.action.function)
 
     def _plain(self, name: str) -> lambda_.Function:
-        made = function(self, name.capitalize(), Environment(self.settings.namespace))
+        made = function(self, name.capitalize(), self._environment(Environment))
         invoked_by_rule(made, self._rejected)
         return made
 
@@ -97,12 +99,7 @@ class Processing(PlatformStack):
         live = function(
             self,
             "Live",
-            LiveEnvironment(
-                namespace=self.settings.namespace,
-                pubnub_parameter=name,
-                live_fields=self.settings.live_fields,
-                rejected_queue=self._rejected.queue_url,
-            ),
+            self._environment(LiveEnvironment, pubnub_parameter=name),
             layers=[layer],
             reserved_concurrency=self.settings.reserved_for_live,
         )
@@ -114,8 +111,8 @@ class Processing(PlatformStack):
         return live
 
     def _summarize(self, put_off: sqs.Queue) -> None:
-        environment = SummarizeEnvironment(
-            **vars(self._summarizing_environment()),
+        environment = self._environment(
+            SummarizeEnvironment,
             put_off_queue=put_off.queue_url,
             record_bytes_a_day=self.settings.record_gb_a_day * 10**9,
         )
@@ -150,7 +147,7 @@ class Processing(PlatformStack):
     def _later(self, put_off: sqs.Queue) -> None:
         # On the embedded cloud all functions share this machine's cores.
         alone = 1 if self.settings.embedded else 0
-        later = self._summarizing("Later", self._summarizing_environment(), reserved_concurrency=alone)
+        later = self._summarizing("Later", self._environment(LaterEnvironment), reserved_concurrency=alone)
         self._storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
         put_off.grant_consume_messages(later)
@@ -164,16 +161,11 @@ class Processing(PlatformStack):
             max_concurrency=LEAST_OF_A_QUEUE,
         )
 
-    def _summarizing_environment(self) -> LaterEnvironment:
-        return LaterEnvironment(
-            namespace=self.settings.namespace,
-            telemetry_table=self._storage.telemetry.table_name,
-            summary_table=self._storage.summary.table_name,
-            robots_table=self._storage.robots.table_name,
-            archive_table=self._storage.archive.table_name if self.settings.archive else "",
-            rejected_queue=self._rejected.queue_url,
-            robot_metrics=self.settings.robot_metrics,
-        )
+    def _environment(self, kind: type[E], **more: Any) -> E:
+        given = {"rejected_queue": self._rejected.queue_url, **more}
+        if not self.settings.archive:
+            given["archive_table"] = ""
+        return self._storage.environment(kind, **given)
 
     def _summarizing(
         self, name: str, environment: LaterEnvironment, *keeps: str, reserved_concurrency: int = 0
@@ -196,12 +188,7 @@ class Processing(PlatformStack):
         return made
 
     def _query(self) -> None:
-        environment = QueryEnvironment(
-            namespace=self.settings.namespace,
-            telemetry_table=self._storage.telemetry.table_name,
-            robots_table=self._storage.robots.table_name,
-            files_bucket=self._storage.files.bucket_name,
-        )
+        environment = self._environment(QueryEnvironment)
         # AWS gives a whole core at 1769 MB, and this function only decodes. The timeout is below the caller's
         # connection timeout; a longer query continues in another invocation.
         query = function(self, "Query", environment, memory_mb=1769, timeout_s=18)
@@ -231,12 +218,7 @@ class Processing(PlatformStack):
         alert = function(
             self,
             "Alert",
-            AlertEnvironment(
-                namespace=self.settings.namespace,
-                robots_table=self._storage.robots.table_name,
-                alarm_topic=self.alarms.topic_arn,
-                low_voltage_v=self.settings.low_voltage_v,
-            ),
+            self._environment(AlertEnvironment, alarm_topic=self.alarms.topic_arn),
         )
         self._storage.may_keep(alert, f"{ALERT_PREFIX}*")
         allow(alert, ["sns:Publish"], self.alarms.topic_arn)
@@ -245,25 +227,15 @@ class Processing(PlatformStack):
         return alert
 
     def _echo(self) -> lambda_.Function:
-        environment = EchoEnvironment(self.settings.namespace, self._rejected.queue_url)
-        echo = function(self, "Echo", environment)
+        echo = function(self, "Echo", self._environment(EchoEnvironment))
         invoked_by_rule(echo, self._rejected)
         allow(echo, ["iot:Publish"], self._answers(PONG, LAMBDA))
         return echo
 
     def _upload(self) -> lambda_.Function:
         files = self._storage.files
-        upload = function(
-            self,
-            "Upload",
-            UploadEnvironment(
-                namespace=self.settings.namespace,
-                files_bucket=files.bucket_name,
-                robots_table=self._storage.robots.table_name,
-                rejected_queue=self._rejected.queue_url,
-                upload_bytes_a_day=self.settings.upload_gb_a_day * 10**9,
-            ),
-        )
+        a_day = self.settings.upload_gb_a_day * 10**9
+        upload = function(self, "Upload", self._environment(UploadEnvironment, upload_bytes_a_day=a_day))
         # The robot asks again if no answer comes.
         invoked_by_rule(upload, self._rejected)
         # It can sign only for its own rights. It may neither read a file nor delete one.
@@ -279,13 +251,7 @@ class Processing(PlatformStack):
         answer = function(
             self,
             "Answer",
-            AnswerEnvironment(
-                namespace=self.settings.namespace,
-                robots_table=storage.robots.table_name,
-                findings_table=storage.findings.table_name,
-                files_bucket=storage.files.bucket_name,
-                rejected_queue=self._rejected.queue_url,
-            ),
+            self._environment(AnswerEnvironment),
             memory_mb=max(question.memory_mb for question in questions),
             timeout_s=max(question.timeout_s for question in questions),
             layers=arrays(self),

@@ -29,11 +29,7 @@ class Quarantine(PlatformStack):
         self.function = function(
             self,
             "Quarantine",
-            QuarantineEnvironment(
-                namespace=settings.namespace,
-                quarantine_table=storage.quarantine.table_name,
-                retention_s=settings.retention_s,
-            ),
+            storage.environment(QuarantineEnvironment),
             timeout_s=_TIMEOUT_S,
         )
         storage.quarantine.grant(self.function, "dynamodb:UpdateItem")

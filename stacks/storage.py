@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import Any
+
 from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 
 from iort_contract.archive import ARCHIVE_PREFIX, HOUR
+from iort_contract.catalog.environments import E
 from iort_contract.cloud import PLANS_PREFIX, RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, FINDING, ROBOT, SECOND, TOPIC
@@ -82,6 +86,18 @@ class Storage(PlatformStack):
         )
         CfnOutput(self, output or f"{name}Table", value=table.table_name)
         return table
+
+    def environment(self, kind: type[E], **more: Any) -> E:
+        """A function's variables by their names: of ``more``, a table, the bucket, or a setting."""
+        tables = ("telemetry", "summary", "robots", "archive", "quarantine", "findings")
+        own = {f"{name}_table": getattr(self, name).table_name for name in tables}
+        known = {**own, "files_bucket": self.files.bucket_name, **more}
+        return kind(
+            **{
+                one.name: known[one.name] if one.name in known else getattr(self.settings, one.name)
+                for one in fields(kind)
+            }
+        )
 
     def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:
         """Let a role change only these attributes of a robot's row: a name's admission and its vehicle are in
