@@ -10,8 +10,6 @@ them.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -24,26 +22,31 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import plots
+from bench.load.counting import process, summarized_ends
 from bench.load.generator import Load
 from bench.report import Report, Section
 from bench.sections import Declared, Option, numbers, yes
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
-from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
+from iort_contract.tables import BATCH, RECEIVED_MS
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import summary_table, topic_of
 from iort_station.fleet import robots
 from iort_station.operations import audit
-from iort_station.operations.audit import headers
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
-from testkit import ROOT, machine
+from testkit import machine
 from testkit.command import Table
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError
 
 # Summaries that are later are late.
 BEHIND_S = 10.0
+# After so long without a change no more summaries come.
+_CATCH_UP_S = 120.0
+# The processes that a deployment consists of here.
+OURS = ("emulator", "Lambda workers")
+# Seconds that each fleet of the section on scale drives; a large one makes as many batches in less time.
+FLEETS = {1: 10, 10: 10, 100: 10, 500: 4}
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,10 @@ class Fleet:
     batches_sent: int
     batches_stored: int
     batches_lost: int
-    samples_sent: int
     samples_summarized: int
     topics_out_of_order: int
     resent: int
     lost_sessions: int
-    generator_late_ms_max: float
     delay_ms: Spread
     ack_ms: Spread
     summary_behind_s: Spread
@@ -83,9 +84,9 @@ class Fleet:
         return round(self.cpu_s / max(1, self.batches_sent) * 1000, 2)
 
     @property
-    def keeps_up(self) -> bool:
-        """Whether nothing is lost, and summaries are at most `BEHIND_S` behind."""
-        return self.good and self.catch_up_s <= BEHIND_S and (self.summary_behind_s.p95 or 0) <= BEHIND_S
+    def samples_sent(self) -> int:
+        """In all batches."""
+        return self.batches_sent * self.rate_hz
 
     @property
     def samples_lost(self) -> int:
@@ -96,16 +97,17 @@ class Fleet:
     @property
     def good(self) -> bool:
         """True if nothing is lost or stored twice and every topic is in order."""
-        return (
-            self.samples_sent == self.samples_summarized
-            and not self.batches_lost
-            and not self.topics_out_of_order
-            and self.batches_stored == self.batches_sent
-        )
+        whole = self.samples_sent == self.samples_summarized and self.batches_stored == self.batches_sent
+        return whole and not self.batches_lost and not self.topics_out_of_order
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether nothing is lost, and summaries are at most `BEHIND_S` behind."""
+        return self.good and self.catch_up_s <= BEHIND_S and (self.summary_behind_s.p95 or 0) <= BEHIND_S
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures with the derived ones."""
-        derived = ("samples_lost", "good", "keeps_up", "cpu_ms_a_batch")
+        derived = ("samples_sent", "samples_lost", "good", "keeps_up", "cpu_ms_a_batch")
         return {**asdict(self), **{name: getattr(self, name) for name in derived}}
 
 
@@ -127,9 +129,9 @@ def table(runs: Sequence[Fleet]) -> Table:
         "CPU for a batch": lambda run: f"{run.cpu_ms_a_batch:.2f} ms",
     }
     rows = [[name, *(str(figure(run)) for run in runs)] for name, figure in figures.items()]
-    parts = list(runs[0].cpu_percent)
-    rows += [[f"CPU, {part}", *(f"{run.cpu_percent[part]:.0f} %" for run in runs)] for part in parts]
-    rows += [[f"memory, {part}", *(f"{run.rss_mb[part]:.0f} MB" for run in runs)] for part in parts]
+    for part in runs[0].cpu_percent:
+        rows.append([f"CPU, {part}", *(f"{run.cpu_percent[part]:.0f} %" for run in runs)])
+        rows.append([f"memory, {part}", *(f"{run.rss_mb[part]:.0f} MB" for run in runs)])
     head = ["", *(f"{run.robots} robot{'s' * (run.robots > 1)}" for run in runs)]
     title = f"Robots with a certificate and a session each, a batch of {runs[0].rate_hz} samples a second"
     return Table(title, head, rows)
@@ -151,52 +153,42 @@ def limits(runs: Sequence[Fleet]) -> Table:
     return Table(f"Robots whose summaries are at most {BEHIND_S:.0f} s behind", head, rows)
 
 
-# Takes the name of the step when it begins.
-Tell = Callable[[str], None]
-# After so long without a change no more summaries come.
-_CATCH_UP_S = 120.0
-# The processes that a deployment consists of here.
-OURS = ("emulator", "Lambda workers")
-
-
 def measure(
-    embedded: EmbeddedCloud,
-    count: int,
-    seconds: int,
-    tell: Tell,
-    *,
-    rate_hz: int = 50,
-    prefix: str = "bench",
+    embedded: EmbeddedCloud, count: int, seconds: int, say: Say, *, rate_hz: int = 50, prefix: str = "bench"
 ) -> Fleet:
     """Register ``count`` robots, drive them, and count what arrived."""
     cloud, names = embedded.cloud, [f"{prefix}-{count}-{i:04}" for i in range(count)]
+    emulator = embedded.emulator.pid
+
+    def usage(generator: int) -> dict[str, machine.Usage]:
+        parts = (machine.usage_of(generator), machine.usage_of(emulator), machine.usage_below(emulator))
+        return dict(zip(("load generator", *OURS), parts, strict=True))
+
     with tempfile.TemporaryDirectory() as folder:
-        tell(f"{count} robots: registering")
+        say(f"{count} robots: registering")
         bundles = {name: str(robots.add(cloud, name, out=Path(folder)).folder) for name in names}
-        tell(f"{count} robots: connecting")
+        say(f"{count} robots: connecting")
         load = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, seconds, rate_hz)
-        emulator = embedded.emulator.pid
         file = Path(folder) / "load.json"
         file.write_text(json.dumps(asdict(load)))
-        with _generator(file) as generator:
+        with process("bench.load.generator", str(file)) as generator:
             pid, began = next(said["pid"] for said in generator if "pid" in said), time.monotonic()
-            tell(f"{count} robots: driving")
-            before = after = _usage(pid, emulator)
+            say(f"{count} robots: driving")
+            before = after = usage(pid)
             took_s, sent = 1.0, None
             with _summary_age(cloud, names[0]) as behind:
                 while sent is None:
                     sent = next(generator).get("sent")
                     # The generator's memory disappears with the process, which ends when all is sent.
                     if sent is None:
-                        after, took_s = _usage(pid, emulator), time.monotonic() - began
-    batches = sent["batches"]
+                        after, took_s = usage(pid), time.monotonic() - began
+    batches: dict[str, int] = {name: len(times) for name, times in sent["sent_ms"].items()}
     began = time.monotonic()
-    tell(f"{count} robots: waiting for the summaries")
-    in_summary = _summarized(cloud, batches, rate_hz)
-    done = _usage(pid, emulator)
-    catch_up_s = time.monotonic() - began
-    tell(f"{count} robots: counting the batches")
-    arrived = [_stored(cloud, name, sent["sent_ms"][name]) for name in names]
+    say(f"{count} robots: waiting for the summaries")
+    summarized = _summarized(cloud, batches, rate_hz)
+    done, catch_up_s = usage(pid), time.monotonic() - began
+    say(f"{count} robots: counting the batches")
+    arrived = [_Stored(cloud, name, sent["sent_ms"][name]) for name in names]
     return Fleet(
         robots=count,
         rate_hz=rate_hz,
@@ -204,12 +196,10 @@ def measure(
         batches_sent=sum(batches.values()),
         batches_stored=sum(each.batches for each in arrived),
         batches_lost=sum(each.missing for each in arrived),
-        samples_sent=sum(batches.values()) * rate_hz,
-        samples_summarized=in_summary,
+        samples_summarized=summarized,
         topics_out_of_order=sum(not each.ordered for each in arrived),
         resent=sent["resent"],
         lost_sessions=sent["lost_sessions"],
-        generator_late_ms_max=sent["late_ms_max"],
         delay_ms=Spread.of([ms for each in arrived for ms in each.delays_ms]),
         ack_ms=Spread.of(sent["ack_ms"]),
         summary_behind_s=Spread.of(behind),
@@ -223,29 +213,6 @@ def measure(
 
 
 @contextmanager
-def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
-    """Run the process that drives the robots; yield its output, a dictionary for each line."""
-    command = [sys.executable, "-m", "bench.load.generator", str(load)]
-
-    def said() -> Iterator[dict[str, Any]]:
-        yield from map(json.loads, process.stdout or ())
-        raise InstrumentError(f"the load generator ended with status {process.wait()}")
-
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield said()
-        finally:
-            process.terminate()
-
-
-def _usage(generator: int, emulator: int) -> dict[str, machine.Usage]:
-    return {
-        "load generator": machine.usage_of(generator),
-        **dict(zip(OURS, (machine.usage_of(emulator), machine.usage_below(emulator)), strict=True)),
-    }
-
-
-@contextmanager
 def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     """Collect the age of the newest summarised second of a robot, in seconds, once a second."""
     seen: list[float] = []
@@ -254,7 +221,7 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     def watch() -> None:
         while not over.wait(1.0):
             try:
-                newest = _ends(cloud, robot)[1:]
+                newest = summarized_ends(cloud, robot)[1:]
             except (BotoCoreError, ClientError):
                 # An overloaded cloud answers late or not at all; only the stored items count.
                 continue
@@ -276,16 +243,13 @@ class _Stored:
     ``ordered`` is True if they arrived and are stored in the order of their numbers.
     """
 
-    def __init__(self, items: Sequence[dict[str, Any]], sent_ms: Sequence[int]) -> None:
+    def __init__(self, cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> None:
+        items = list(audit.headers(cloud, robot, VESC_STREAM))
         seqs = [batch_id(item[BATCH]).seq for item in items]
         received = [int(item[RECEIVED_MS]) for item in items]
         self.batches, self.missing = len(items), len(set(range(len(sent_ms))) - set(seqs))
         self.ordered = seqs == sorted(seqs) and received == sorted(received)
         self.delays_ms = [float(ms - sent_ms[seq]) for seq, ms in zip(seqs, received, strict=True)]
-
-
-def _stored(cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> _Stored:
-    return _Stored(list(headers(cloud, robot, VESC_STREAM)), sent_ms)
 
 
 def _summarized(cloud: Cloud, batches: dict[str, int], rate_hz: int) -> int:
@@ -298,7 +262,7 @@ def _summarized(cloud: Cloud, batches: dict[str, int], rate_hz: int) -> int:
         counted, looked_at = 0, None
         while True:
             # Counting is expensive: count only when the summaries reach the last second that was sent.
-            ends = _ends(cloud, name)
+            ends = summarized_ends(cloud, name)
             over = time.monotonic() - since > _CATCH_UP_S
             if over or (ends and ends[1] - ends[0] + 1 >= seconds):
                 counted = audit.samples_summarized(cloud, name, VESC_STREAM)
@@ -312,21 +276,13 @@ def _summarized(cloud: Cloud, batches: dict[str, int], rate_hz: int) -> int:
     return total
 
 
-def _ends(cloud: Cloud, robot: str) -> list[int]:
-    """Return the first and the last summarised second of a robot; empty if it has none."""
-    table, topic = summary_table(cloud), topic_of(cloud, robot, VESC_STREAM)
-    ends = (table.first(topic, newest=newest, attributes=(SECOND,)) for newest in (False, True))
-    return [int(item[SECOND]["N"]) for item in ends if item is not None]
-
-
 def drive_fleets(
     target: Target, say: Say, *, robots: list[int], seconds: int, rate: int, limit: bool
 ) -> Section:
     """Drive a fleet of each number, or look for the largest one that keeps up."""
-    section, runs = Section("fleet", "Many robots at once"), list[Fleet]()
-    if target.embedded is None:
+    section, runs, embedded = Section("fleet", "Many robots at once"), list[Fleet](), target.embedded
+    if embedded is None:
         raise InstrumentError("the robots of a fleet drive on the embedded cloud alone")
-    embedded = target.embedded
 
     def drive(count: int) -> Fleet:
         prefix = f"bench-{len(runs)}"
@@ -335,17 +291,19 @@ def drive_fleets(
 
     if limit:
         look_for(drive, robots[0])
-        section.tables.append(limits(runs))
     else:
         for count in robots:
             drive(count)
-        section.tables.append(table(runs))
-    whole = [run for run in runs if run.keeps_up or not limit]
-    section.ratio("samples lost in all fleets", sum(run.samples_lost for run in whole), 0, unit="samples")
-    disordered = sum(not run.good for run in whole)
+    section.tables.append(limits(runs) if limit else table(runs))
+    _count_lost(section, [run for run in runs if run.keeps_up or not limit])
+    disordered = sum(not run.good for run in runs if run.keeps_up or not limit)
     section.ratio("fleets with a batch lost, doubled or out of order", disordered, 0, unit="fleets")
     section.raw = {"runs": [run.as_json() for run in runs]}
     return section
+
+
+def _count_lost(section: Section, runs: Sequence[Fleet]) -> None:
+    section.ratio("samples lost in all fleets", sum(run.samples_lost for run in runs), 0, unit="samples")
 
 
 def look_for(drive: Callable[[int], Fleet], robots: int) -> int:
@@ -360,25 +318,18 @@ def look_for(drive: Callable[[int], Fleet], robots: int) -> int:
     return keeps
 
 
-# Seconds that each fleet drives; a large fleet makes as many batches in less time.
-FLEETS = {1: 10, 10: 10, 100: 10, 500: 4}
-
-
 def run(target: Target, say: Say) -> Section:
     """Drive each fleet for some seconds: a batch of 50 samples a second and robot."""
-    section = Section("scale", "Scale")
-    if target.embedded is None:
+    section, embedded = Section("scale", "Scale"), target.embedded
+    if embedded is None:
         section.notes.append(
             "Not run on AWS: 500 robots would be registered in your account. What the quotas allow is in the "
             "section on cost."
         )
         return section
-    runs = [
-        measure(target.embedded, count, seconds, say, prefix="bench-scale")
-        for count, seconds in FLEETS.items()
-    ]
+    runs = [measure(embedded, count, s, say, prefix="bench-scale") for count, s in FLEETS.items()]
     section.tables.append(table(runs))
-    section.ratio("samples lost in all fleets", sum(run.samples_lost for run in runs), 0, unit="samples")
+    _count_lost(section, runs)
     last = runs[-1]
     busiest = max(last.cpu_percent, key=lambda part: last.cpu_percent[part])
     section.notes.append(

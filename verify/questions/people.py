@@ -70,7 +70,10 @@ def _rights(lab: Lab, connect: Connect, robot: str) -> dict[str, Any]:
 
 def _in_role(lab: Lab, name: str) -> Seen:
     role = Role(lab.cloud, name)
-    connect = lambda: Person(lab.cloud, role.credentials(), role.client_id())  # noqa: E731
+
+    def connect() -> Person:
+        return Person(lab.cloud, role.credentials(), role.client_id())
+
     return _rights(lab, connect, lab.name("verify-watched"))
 
 

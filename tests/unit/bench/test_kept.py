@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from bench.load.counting import Counted
 from bench.sections import kept, soak
-from bench.sections.kept import OPEN_MOST_S, Counted, Kills
+from bench.sections.kept import OPEN_MOST_S, Kills
 from bench.sections.soak import Look, Soak
 from local.figures import Spread
 
@@ -20,7 +21,6 @@ DRIVE = Kills(
     seconds=10.0,
     restart_s=Spread.of([]),
     cars={"car1": CAR},
-    agent_kills={"car1": 1},
     open_s={"car1": [0.9]},
 )
 
@@ -32,7 +32,7 @@ DRIVE = Kills(
         ({"open_s": {"car1": [None]}}, True),
         ({"open_s": {"car1": [OPEN_MOST_S + 0.1]}}, False),
         # An agent ended badly, and nobody had killed it.
-        ({"agent_kills": {}}, False),
+        ({"open_s": {}}, False),
         ({"cars": {"car1": replace(CAR, lost=50, incomplete=("vesc",))}}, False),
         ({"cars": {"car1": replace(CAR, summarized=99)}}, False),
     ],
@@ -53,7 +53,7 @@ def test_the_table_names_what_was_open():
 )
 def test_memory_may_not_grow_after_the_first_quarter_and_nothing_is_lost(last, sent, reached):
     memory = (80.0, 100.0, 100.0, last)
-    looks = [Look(hour + 1, 300, 10.0 * hour, mb, 700.0, 5.0, 1.0) for hour, mb in enumerate(memory)]
+    looks = [Look(hour + 1, 300, mb, 700.0, 5.0, 1.0, 10.0 * hour) for hour, mb in enumerate(memory)]
     car = Counted(15_000, 300, 0, 0, (), 0, 15_000, 15_000)
     section = soak.report(Soak(4, 1, looks, {"car1": sent}, {"car1": car}))
     assert [ratio.reached for ratio in section.ratios] == reached
