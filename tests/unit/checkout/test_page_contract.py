@@ -1,4 +1,4 @@
-"""The page's generated code has the contract's fields and formulas. test_docs_parts.py keeps it current."""
+"""The page's generated code has the contract's fields and formulas. docs/test_pages.py keeps it current."""
 
 from __future__ import annotations
 
