@@ -158,7 +158,7 @@ def _asked(questions: Sequence[Question], phase: str, target: Target, console: C
 def _looked(cloud: Cloud, console: Console) -> list[str]:
     """The preflight's lines for the report. Raises `InstrumentError` if the deployment would fail."""
     found = preflight.look(cloud, Settings(namespace=cloud.namespace))
-    lines = [preflight.line(finding) for finding in found]
+    lines = list(map(str, found))
     for text in lines:
         console.print(report.redacted(text), markup=False, highlight=False)
     if preflight.stopped(found):

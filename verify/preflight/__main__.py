@@ -68,12 +68,6 @@ def context(given: Sequence[str]) -> Mapping[str, Any]:
     return {**in_file, **{key: value for key, _, value in pairs}}
 
 
-def line(finding: Finding) -> str:
-    """A finding in one line."""
-    done = f" -> {finding.do}" if finding.do else ""
-    return f"{finding.verdict.value}: {finding.item}: {finding.found}{done}"
-
-
 def show(findings: Sequence[Finding], console: Console) -> None:
     """Print one line per finding, and below it the remedy."""
     for finding in findings:

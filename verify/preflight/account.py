@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.catalog.rules import RULES
@@ -12,7 +14,7 @@ from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import UNRESERVED, Settings
 from verify.preflight.deployed import resources
-from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
+from verify.preflight.finding import Clients, Found, fine, item, known, listed, stops, warning
 
 # The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
 # manifest.
@@ -49,11 +51,9 @@ def credentials(clients: Clients, _settings: Settings) -> Found:
 @item("bootstrap", f"ssm GetParameter {BOOTSTRAP_PARAMETER}")
 def bootstrap(clients: Clients, _settings: Settings) -> Found:
     """Check that the CDK's bootstrap stack exists, and is new enough for our templates."""
-    try:
-        answer = clients.client("ssm").get_parameter(Name=BOOTSTRAP_PARAMETER)
-    except ClientError as error:
-        if code(error) != "ParameterNotFound":
-            raise
+    ssm = clients.client("ssm")
+    answer = known("ParameterNotFound", ssm.get_parameter, Name=BOOTSTRAP_PARAMETER)
+    if answer is None:
         return stops("this account and region are not bootstrapped", "`make bootstrap`, once")
     version = int(answer["Parameter"]["Value"])
     if version < BOOTSTRAP:
@@ -64,13 +64,7 @@ def bootstrap(clients: Clients, _settings: Settings) -> Found:
 @item("AWS IoT's log", "iot GetV2LoggingOptions")
 def iot_log(clients: Clients, settings: Settings) -> Found:
     """Check that the region's one setting is free if `iort_log_level` needs it."""
-    iot = clients.client("iot")
-    try:
-        options = iot.get_v2_logging_options()
-    except ClientError as error:
-        if code(error) != "NotConfiguredException":
-            raise
-        options = {}
+    options = known("NotConfiguredException", clients.client("iot").get_v2_logging_options) or {}
     # CloudFormation's handler treats a disabled log as free.
     configured = bool(options.get("roleArn")) and not options.get("disableAllLogs")
     said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
@@ -202,15 +196,10 @@ def spending(_clients: Clients, settings: Settings) -> Found:
 @item("policy versions", "iot ListPolicyVersions of the robots' and the claims' policy")
 def policy_versions(clients: Clients, settings: Settings) -> Found:
     """Check that a changed policy has room for another version."""
-    counts = {}
-    for name in (fleet_name(settings.namespace), claim_name(settings.namespace)):
-        try:
-            answer = clients.client("iot").list_policy_versions(policyName=name)
-        except ClientError as error:
-            if code(error) != "ResourceNotFoundException":
-                raise
-            continue
-        counts[name] = len(answer["policyVersions"])
+    ask = partial(known, "ResourceNotFoundException", clients.client("iot").list_policy_versions)
+    names = (fleet_name(settings.namespace), claim_name(settings.namespace))
+    answers = {name: ask(policyName=name) for name in names}
+    counts = {name: len(answer["policyVersions"]) for name, answer in answers.items() if answer}
     if not counts:
         return fine("no policy yet")
     text = ", ".join(f"{name} has {count} of {POLICY_VERSIONS}" for name, count in counts.items())

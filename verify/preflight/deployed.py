@@ -4,6 +4,7 @@ cannot change in one step."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -14,7 +15,7 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace, rule_name
 from iort_station.errors import StationError
 from stacks.settings import NEW_ACCOUNT, PROD, Settings
-from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
+from verify.preflight.finding import Clients, Found, fine, item, known, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = (
@@ -43,40 +44,30 @@ class Resource(NamedTuple):
 
 def stack(clients: Clients, name: str) -> dict[str, Any] | None:
     """A stack as CloudFormation describes it; None if it does not exist."""
-    try:
-        answer = clients.client("cloudformation").describe_stacks(StackName=name)
-    except ClientError as error:
-        if code(error) != "ValidationError":
-            raise
-        return None
-    found: dict[str, Any] = answer["Stacks"][0]
-    return found
+    describe = clients.client("cloudformation").describe_stacks
+    answer = known("ValidationError", describe, StackName=name)
+    return dict(answer["Stacks"][0]) if answer else None
 
 
 def resources(clients: Clients, name: str) -> list[Resource]:
     """The resources of a stack; empty if it does not exist."""
-    client = clients.client("cloudformation")
-    try:
-        return [
-            Resource(one["ResourceType"], one["LogicalResourceId"], one["PhysicalResourceId"])
-            for one in listed(client, "list_stack_resources", "StackResourceSummaries", StackName=name)
-            if "PhysicalResourceId" in one and one["ResourceStatus"] != "DELETE_COMPLETE"
-        ]
-    except ClientError as error:
-        if code(error) != "ValidationError":
-            raise
-        return []
+
+    def summaries() -> list[dict[str, str]]:
+        client = clients.client("cloudformation")
+        return list(listed(client, "list_stack_resources", "StackResourceSummaries", StackName=name))
+
+    return [
+        Resource(one["ResourceType"], one["LogicalResourceId"], one["PhysicalResourceId"])
+        for one in known("ValidationError", summaries) or ()
+        if "PhysicalResourceId" in one and one["ResourceStatus"] != "DELETE_COMPLETE"
+    ]
 
 
 @item("stacks", "cloudformation DescribeStacks of every stack of the namespace")
 def stacks(clients: Clients, settings: Settings) -> Found:
     """Check that every existing stack can be updated."""
-    states = {}
-    for noun in STACKS:
-        name = f"{settings.namespace}-{noun}"
-        found = stack(clients, name)
-        if found is not None:
-            states[name] = found["StackStatus"]
+    stacks = {name: stack(clients, name) for name in (f"{settings.namespace}-{noun}" for noun in STACKS)}
+    states = {name: str(found["StackStatus"]) for name, found in stacks.items() if found is not None}
     stuck = {name: state for name, state in states.items() if _todo(state)}
     if stuck:
         return stops(
@@ -101,21 +92,9 @@ def _todo(state: str) -> str:
 def names(clients: Clients, settings: Settings) -> Found:
     """Check that fixed names are free if the stack that creates them does not exist."""
     taken: list[str] = []
-    if stack(clients, f"{settings.namespace}-fleet") is None:
-        taken += _taken_of_the_fleet(clients, settings)
-    if stack(clients, f"{settings.namespace}-ingest") is None:
-        ours = {rule_name(rule, settings.namespace) for rule in RULES}
-        rules = {one["ruleName"] for one in listed(clients.client("iot"), "list_topic_rules", "rules")}
-        taken += sorted(f"rule {name}" for name in rules & ours)
-    if stack(clients, f"{settings.namespace}-monitoring") is None:
-        ours = {f"{settings.namespace}-{name}" for name in ("platform", "robots")}
-        entries = listed(
-            clients.client("cloudwatch"),
-            "list_dashboards",
-            "DashboardEntries",
-            DashboardNamePrefix=f"{settings.namespace}-",
-        )
-        taken += sorted(f"dashboard {name}" for name in {one["DashboardName"] for one in entries} & ours)
+    for noun, look in {"fleet": _things, "ingest": _rules, "monitoring": _dashboards}.items():
+        if stack(clients, f"{settings.namespace}-{noun}") is None:
+            taken += look(clients, settings.namespace)
     if taken:
         return stops(
             f"exist without their stack: {', '.join(taken)}",
@@ -124,23 +103,30 @@ def names(clients: Clients, settings: Settings) -> Found:
     return fine("free, or used by this deployment")
 
 
-def _taken_of_the_fleet(clients: Clients, settings: Settings) -> Iterator[str]:
-    iot, fleet, claim = clients.client("iot"), fleet_name(settings.namespace), claim_name(settings.namespace)
-    asked: dict[str, Callable[[], Any]] = {
-        f"thing type {fleet}": lambda: iot.describe_thing_type(thingTypeName=fleet),
-        f"thing group {fleet}": lambda: iot.describe_thing_group(thingGroupName=fleet),
-        f"policy {fleet}": lambda: iot.get_policy(policyName=fleet),
-        f"policy {claim}": lambda: iot.get_policy(policyName=claim),
-        f"provisioning template {fleet}": lambda: iot.describe_provisioning_template(templateName=fleet),
-    }
-    for name, ask in asked.items():
-        try:
-            ask()
-        except ClientError as error:  # noqa: PERF203 - each waits for an answer
-            if code(error) != "ResourceNotFoundException":
-                raise
-        else:
+def _things(clients: Clients, namespace: str) -> Iterator[str]:
+    iot, fleet, claim = clients.client("iot"), fleet_name(namespace), claim_name(namespace)
+    for name, ask in {
+        f"thing type {fleet}": partial(iot.describe_thing_type, thingTypeName=fleet),
+        f"thing group {fleet}": partial(iot.describe_thing_group, thingGroupName=fleet),
+        f"policy {fleet}": partial(iot.get_policy, policyName=fleet),
+        f"policy {claim}": partial(iot.get_policy, policyName=claim),
+        f"provisioning template {fleet}": partial(iot.describe_provisioning_template, templateName=fleet),
+    }.items():
+        if known("ResourceNotFoundException", ask) is not None:
             yield name
+
+
+def _rules(clients: Clients, namespace: str) -> Iterator[str]:
+    ours = {rule_name(rule, namespace) for rule in RULES}
+    rules = {one["ruleName"] for one in listed(clients.client("iot"), "list_topic_rules", "rules")}
+    yield from sorted(f"rule {name}" for name in rules & ours)
+
+
+def _dashboards(clients: Clients, namespace: str) -> Iterator[str]:
+    client, prefix = clients.client("cloudwatch"), f"{namespace}-"
+    entries = listed(client, "list_dashboards", "DashboardEntries", DashboardNamePrefix=prefix)
+    ours = {f"{prefix}{name}" for name in ("platform", "robots")}
+    yield from sorted(f"dashboard {name}" for name in {one["DashboardName"] for one in entries} & ours)
 
 
 @item("kept data", "dynamodb ListTables, s3 ListBuckets, sqs ListQueues, logs DescribeLogGroups")
@@ -176,13 +162,8 @@ def _holders(clients: Clients, namespace: str) -> Iterator[str]:
 
 def has_pubnub_keys(clients: Clients, namespace: str) -> bool:
     """Whether something is stored where PubNub's keys belong. It stays encrypted."""
-    try:
-        clients.client("ssm").get_parameter(Name=pubnub_parameter(namespace))
-    except ClientError as error:
-        if code(error) != "ParameterNotFound":
-            raise
-        return False
-    return True
+    ask = clients.client("ssm").get_parameter
+    return known("ParameterNotFound", ask, Name=pubnub_parameter(namespace)) is not None
 
 
 def transport(clients: Clients, namespace: str) -> str | None:

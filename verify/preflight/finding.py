@@ -6,8 +6,8 @@ import enum
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import wraps
-from typing import Any, NamedTuple, Protocol
+from functools import partial, wraps
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from botocore.exceptions import BotoCoreError, ClientError
 
@@ -16,6 +16,9 @@ from stacks.settings import Settings
 
 _DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "UnauthorizedException"}
 _ACTION = re.compile(r"not authorized to perform:? ([a-z0-9-]+:\w+)", re.IGNORECASE)
+
+
+T = TypeVar("T")
 
 
 class Verdict(enum.Enum):
@@ -41,6 +44,10 @@ class Found(NamedTuple):
     do: str = ""
 
 
+# Nothing to do; the operator should know; the deployment would fail, or lose something.
+fine, warning, stops = (partial(Found, verdict) for verdict in Verdict)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Finding:
     """One item of the preflight: what was ``asked`` and ``found``, the verdict, and the remedy, ``do``."""
@@ -51,23 +58,12 @@ class Finding:
     verdict: Verdict
     do: str = ""
 
+    def __str__(self) -> str:
+        done = f" -> {self.do}" if self.do else ""
+        return f"{self.verdict.value}: {self.item}: {self.found}{done}"
+
 
 Item = Callable[[Clients, Settings], Finding]
-
-
-def fine(text: str) -> Found:
-    """Nothing to do."""
-    return Found(Verdict.FINE, text)
-
-
-def warning(text: str, do: str) -> Found:
-    """The deployment would succeed, but its operator should know."""
-    return Found(Verdict.WARNING, text, do)
-
-
-def stops(text: str, do: str) -> Found:
-    """The deployment would fail, or lose something."""
-    return Found(Verdict.STOPS, text, do)
 
 
 def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found]], Item]:
@@ -88,6 +84,16 @@ def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found
         return ask
 
     return wrap
+
+
+def known(absent: str, ask: Callable[..., T], **arguments: Any) -> T | None:
+    """AWS' answer; None if it is the error with that name, by which AWS says that there is nothing."""
+    try:
+        return ask(**arguments)
+    except ClientError as error:
+        if code(error) != absent:
+            raise
+        return None
 
 
 def listed(client: Any, operation: str, key: str, **arguments: Any) -> Iterator[Any]:

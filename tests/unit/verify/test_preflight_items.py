@@ -13,6 +13,7 @@ ROLE = "arn:aws:iam::123456789012:role/somebody"
 
 
 ALL = dict.fromkeys(deployed.STACKS, "UPDATE_COMPLETE")
+PUBLISHES = "Inbound publish requests per second per account"
 LIVE = ("AWS::Lambda::Function", "Live848578DF", "iort-processing-Live")
 LOG = {"roleArn": ROLE, "defaultLogLevel": "ERROR", "disableAllLogs": False}
 KEY = "iort-storage:ExportsOutputFnGetAttKey961B73FDArn5A860C43"
@@ -30,116 +31,89 @@ def versions(count):
     return {"ListPolicyVersions": {"policyVersions": [{"versionId": str(i)} for i in range(count)]}}
 
 
+def executions(*of, **more):
+    return {"GetAccountSettings": limits(*of), **more}
+
+
+def holding(noun, *resource):
+    """All stacks, one of which has this resource."""
+    return stack_answers(ALL, resources={noun: [resource]})
+
+
+def rules(*names):
+    return {"ListTopicRules": {"rules": [{"ruleName": name} for name in names]}}
+
+
+MAIL, SITE, LOGGED = {"alarm_email": "a@b.org"}, {"site": True}, {"iot_log_level": "error"}
+DEFENDER, AUDITED = {"device_defender": True}, {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}
+PROD = {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB}
+RESERVED = {"GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5}}
+BATCHES = {"ListTables": {"TableNames": ["iort-storage-Batches-A", "another-storage-Batches"]}}
+LAST = "https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"
+STORAGE = stack_answers({"storage": "UPDATE_COMPLETE"})
+OF_PROD = stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")])
+STUCK = (
+    *("ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED", "DELETE_FAILED", "REVIEW_IN_PROGRESS"),
+    *("UPDATE_ROLLBACK_FAILED", "UPDATE_IN_PROGRESS"),
+)
+
+
 CASES = [
     ("spending", {}, {}, WARNING, "alarm_email: nobody hears of an alarm; budget_usd: nobody hears"),
-    ("spending", {"alarm_email": "a@b.org"}, {}, WARNING, "not set: budget_usd"),
-    ("spending", {"alarm_email": "a@b.org", "budget_usd": 50}, {}, FINE, "at most 1,612 write units"),
+    ("spending", MAIL, {}, WARNING, "not set: budget_usd"),
+    ("spending", MAIL | {"budget_usd": 50}, {}, FINE, "at most 1,612 write units"),
     (
         "spending",
-        {"alarm_email": "a@b.org", "budget_usd": 50, "files_days": 0},
+        MAIL | {"budget_usd": 50, "files_days": 0},
         {},
         WARNING,
-        "not set: files_days: uploaded files are kept",
+        "files_days: uploaded files are kept",
     ),
     ("policy_versions", {}, {}, FINE, "no policy yet"),
     ("policy_versions", {}, versions(4), FINE, "iort-robot has 4 of 5, iort-claim has 4 of 5"),
     ("policy_versions", {}, versions(5), WARNING, "takes no other version"),
     ("bootstrap", {}, {}, FINE, "version 21, needed is 6"),
     ("bootstrap", {}, {"GetParameter": Refused("ParameterNotFound")}, STOPS, "not bootstrapped"),
-    (
-        "bootstrap",
-        {},
-        {"GetParameter": {"Parameter": {"Value": "5"}}},
-        STOPS,
-        "version must be 6 or newer, got 5",
-    ),
+    ("bootstrap", {}, {"GetParameter": {"Parameter": {"Value": "5"}}}, STOPS, "must be 6 or newer, got 5"),
     ("iot_log", {}, {}, FINE, "not configured; iot_log_level is off"),
-    ("iot_log", {"iot_log_level": "error"}, {}, FINE, "not configured; iot_log_level is error"),
+    ("iot_log", LOGGED, {}, FINE, "not configured; iot_log_level is error"),
     ("iot_log", {}, {"GetV2LoggingOptions": LOG}, FINE, "configured (ERROR); iot_log_level is off"),
-    ("iot_log", {"iot_log_level": "error"}, {"GetV2LoggingOptions": LOG}, STOPS, "already exists"),
+    ("iot_log", LOGGED, {"GetV2LoggingOptions": LOG}, STOPS, "already exists"),
+    ("iot_log", LOGGED, {"GetV2LoggingOptions": {**LOG, "disableAllLogs": True}}, FINE, "not configured"),
     (
         "iot_log",
-        {"iot_log_level": "error"},
-        {"GetV2LoggingOptions": {**LOG, "disableAllLogs": True}},
-        FINE,
-        "not configured",
-    ),
-    (
-        "iot_log",
-        {"iot_log_level": "error"},
-        {"GetV2LoggingOptions": LOG}
-        | stack_answers(ALL, resources={"account": [("AWS::IoT::Logging", "Log", "123456789012")]}),
+        LOGGED,
+        {"GetV2LoggingOptions": LOG, **holding("account", "AWS::IoT::Logging", "Log", "1")},
         FINE,
         "by this deployment",
     ),
-    ("audit", {"device_defender": True}, {}, FINE, "not configured; wanted"),
-    ("audit", {}, {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}, FINE, "configured; not wanted"),
+    ("audit", DEFENDER, {}, FINE, "not configured; wanted"),
+    ("audit", {}, AUDITED, FINE, "configured; not wanted"),
+    ("audit", DEFENDER, AUDITED, STOPS, "already exists"),
     (
         "audit",
-        {"device_defender": True},
-        {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}},
-        STOPS,
-        "already exists",
-    ),
-    (
-        "audit",
-        {"device_defender": True},
-        {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}
-        | stack_answers(ALL, resources={"account": [("AWS::IoT::AccountAuditConfiguration", "Audit", "1")]}),
+        DEFENDER,
+        AUDITED | holding("account", "AWS::IoT::AccountAuditConfiguration", "Audit", "1"),
         FINE,
         "by this deployment",
     ),
     ("concurrency", {}, {}, FINE, "0 are to be reserved"),
-    ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 concurrent executions"),
+    ("concurrency", {}, executions(10, 10), WARNING, "10 concurrent executions"),
+    ("concurrency", PROD, executions(105, 105), FINE, "5 are to be reserved"),
+    ("concurrency", PROD, executions(104, 104), STOPS, "requires 100 unreserved"),
     (
         "concurrency",
-        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
-        {"GetAccountSettings": limits(105, 105)},
-        FINE,
-        "5 are to be reserved",
-    ),
-    (
-        "concurrency",
-        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
-        {"GetAccountSettings": limits(104, 104)},
-        STOPS,
-        "requires 100 unreserved",
-    ),
-    (
-        "concurrency",
-        {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB},
-        {
-            "GetAccountSettings": limits(105, 100),
-            "GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5},
-        }
-        | stack_answers(ALL, resources={"processing": [LIVE]}),
+        PROD,
+        executions(105, 100, **RESERVED) | holding("processing", *LIVE),
         FINE,
         "100 of them unreserved",
     ),
-    (
-        "concurrency",
-        {"stage": "prod", "account_concurrency": 104, **BY_PUBNUB},
-        {"GetAccountSettings": limits(104, 104)},
-        FINE,
-        "0 are to be reserved",
-    ),
+    ("concurrency", PROD | {"account_concurrency": 104}, executions(104, 104), FINE, "0 are to be reserved"),
     ("cloudfront", {}, {"ListDistributions": denied("cloudfront:ListDistributions")}, FINE, "not wanted"),
-    ("cloudfront", {"site": True}, {}, WARNING, "cannot be read"),
-    (
-        "cloudfront",
-        {"site": True},
-        stack_answers(ALL, resources={"site": [("AWS::S3::Bucket", "Page", "iort-site-page")]}),
-        FINE,
-        "deployed",
-    ),
+    ("cloudfront", SITE, {}, WARNING, "cannot be read"),
+    ("cloudfront", SITE, holding("site", "AWS::S3::Bucket", "Page", "iort-site-page"), FINE, "deployed"),
     ("quotas", {}, {}, FINE, "first limit: "),
-    (
-        "quotas",
-        {},
-        {"ListServiceQuotas": {"Quotas": [quota("Inbound publish requests per second per account", 500)]}},
-        WARNING,
-        "Inbound publish requests per second per account, 500",
-    ),
+    ("quotas", {}, {"ListServiceQuotas": {"Quotas": [quota(PUBLISHES, 500)]}}, WARNING, f"{PUBLISHES}, 500"),
     (
         "quotas",
         {},
@@ -151,44 +125,26 @@ CASES = [
     (
         "quotas",
         {},
-        {"ListTopicRules": {"rules": [{"ruleName": f"other{n}"} for n in range(992)]}},
+        rules(*(f"other{number}" for number in range(992))),
         STOPS,
         "992 rules of others and 10 of ours exceed the limit 1000",
     ),
-    (
-        "quotas",
-        {},
-        {"ListTopicRules": {"rules": [{"ruleName": f"iort_{n}"} for n in ("live", "record")]}},
-        FINE,
-        "robots",
-    ),
+    ("quotas", {}, rules("iort_live", "iort_record"), FINE, "robots"),
     ("stacks", {}, {}, FINE, "none: a first one"),
     ("stacks", {}, stack_answers(ALL), FINE, "10 of 10"),
     *(
         ("stacks", {}, stack_answers({**ALL, "fleet": state}), STOPS, f"iort-fleet is {state}")
-        for state in (
-            "ROLLBACK_COMPLETE",
-            "ROLLBACK_FAILED",
-            "CREATE_FAILED",
-            "DELETE_FAILED",
-            "REVIEW_IN_PROGRESS",
-            "UPDATE_ROLLBACK_FAILED",
-            "UPDATE_IN_PROGRESS",
-        )
+        for state in STUCK
     ),
     ("stacks", {}, stack_answers({"storage": "UPDATE_ROLLBACK_COMPLETE"}), FINE, "1 of 10"),
     ("names", {}, {}, FINE, "free"),
     ("names", {}, {"GetPolicy": {"policyName": "a"}}, STOPS, "policy iort-robot, policy iort-claim"),
     ("names", {}, {"DescribeThingType": {"thingTypeName": "a"}}, STOPS, "thing type iort-robot"),
-    ("names", {}, {"ListTopicRules": {"rules": [{"ruleName": "iort_live"}]}}, STOPS, "rule iort_live"),
+    ("names", {}, rules("iort_live"), STOPS, "rule iort_live"),
     (
         "names",
         {},
-        {
-            "ListDashboards": {
-                "DashboardEntries": [{"DashboardName": "iort-platform"}, {"DashboardName": "iort-x"}]
-            }
-        },
+        {"ListDashboards": {"DashboardEntries": [{"DashboardName": f"iort-{n}"} for n in ("platform", "x")]}},
         STOPS,
         "without their stack: dashboard iort-platform",
     ),
@@ -198,9 +154,9 @@ CASES = [
         "kept",
         {},
         {
-            "ListTables": {"TableNames": ["iort-storage-Batches-A", "another-storage-Batches"]},
+            **BATCHES,
             "ListBuckets": {"Buckets": [{"Name": "iort-storage-files-a"}]},
-            "ListQueues": {"QueueUrls": ["https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"]},
+            "ListQueues": {"QueueUrls": [LAST]},
             "DescribeLogGroups": {"logGroups": [{"logGroupName": "iort-fleet-AdmitLog-A"}]},
         },
         WARNING,
@@ -209,19 +165,14 @@ CASES = [
     (
         "kept",
         {},
-        {
-            "ListTables": {"TableNames": ["iort-storage-Batches-A"]},
-            "ListQueues": {"QueueUrls": ["https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"]},
-        }
-        | stack_answers(
-            ALL,
-            resources={
-                "storage": [("AWS::DynamoDB::Table", "Batches", "iort-storage-Batches-A")],
-                "quarantine": [
-                    ("AWS::SQS::Queue", "L", "https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A")
-                ],
-            },
-        ),
+        {"ListQueues": {"QueueUrls": [LAST]}} | holding("quarantine", "Q", "L", LAST),
+        FINE,
+        "no left",
+    ),
+    (
+        "kept",
+        {},
+        BATCHES | holding("storage", "T", "Batches", "iort-storage-Batches-A"),
         FINE,
         "no leftovers",
     ),
@@ -247,7 +198,7 @@ CASES = [
         "deployed is AWS IoT",
     ),
     ("changes", {}, {}, FINE, "nothing is deployed"),
-    ("changes", {"site": True, "device_defender": True}, stack_answers(ALL), FINE, "none that must not be"),
+    ("changes", SITE | DEFENDER, stack_answers(ALL), FINE, "none that must not be"),
     (
         "changes",
         {},
@@ -255,31 +206,13 @@ CASES = [
         STOPS,
         "iort-fleet, iort-ingest import the key",
     ),
-    ("changes", {}, stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(KEY), FINE, "none that must"),
+    ("changes", {}, STORAGE | exported(KEY), FINE, "none that must"),
     *(
-        (
-            "changes",
-            {key: True},
-            stack_answers({"storage": "UPDATE_COMPLETE"}) | exported(KEY, "iort-fleet"),
-            FINE,
-            "none that must",
-        )
+        ("changes", {key: True}, STORAGE | exported(KEY, "iort-fleet"), FINE, "none that must")
         for key in ("customer_key", "keep_customer_key")
     ),
-    (
-        "changes",
-        {},
-        stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")]),
-        WARNING,
-        "protected",
-    ),
-    (
-        "changes",
-        {"stage": "prod"},
-        stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")]),
-        FINE,
-        "none that must",
-    ),
+    ("changes", {}, OF_PROD, WARNING, "protected"),
+    ("changes", {"stage": "prod"}, OF_PROD, FINE, "none that must"),
     ("changes", {}, stack_answers(ALL), WARNING, "iort-site, iort-account (stays as it is)"),
 ]
 
