@@ -63,41 +63,42 @@ def until(true: Callable[[], object], what: str, seconds: float = WAIT_S) -> Non
 
 
 class ProbeFixture:
-    """Robots and a function that exist from `__enter__` to `__exit__`.
-
-    ``a`` and ``b`` are the names of the robots, ``function`` is the name of the function.
-    """
+    """Two robots, ``a`` and ``b``, and a function that exist from `__enter__` to `__exit__`."""
 
     def __init__(self, target: Target) -> None:
         self.target, self._exit = target, ExitStack()
-        self.cloud, self.namespace = target.cloud, target.cloud.namespace
+        self.cloud, self.namespace, self.client = target.cloud, target.cloud.namespace, target.cloud.client
         self._drives = self._seq = 0
 
     def __enter__(self) -> Self:
         self._bundles = [self.target.robot(f"bench-ability-{i}") for i in range(2)]
         self.a, self.b = (bundle.robot for bundle in self._bundles)
-        self.function = self._exit.enter_context(
-            temporary_function(self.target, "who", _WHO, memory_mb=128, timeout_s=10)
-        )
+        function = temporary_function(self.target, "who", _WHO, memory_mb=128, timeout_s=10)
+        self.function = self._exit.enter_context(function)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._exit.close()
 
-    def client(self, index: int) -> RawClient:
+    def connection(self, index: int = 0) -> RawClient:
         """Return a connection of the first robot (0) or the second (1)."""
         return RawClient(self._bundles[index].folder)
 
-    def topic(self, lane: str, robot: str, name: str) -> str:
-        return build_topic(lane, robot, name, self.namespace)
+    def table(self, name: str) -> str:
+        """The name of a table."""
+        return self.cloud.output("storage", f"{name}Table")
+
+    def topic(self, lane: str, name: str) -> str:
+        """A topic of the first robot."""
+        return build_topic(lane, self.a, name, self.namespace)
 
     def pong(self, path: str) -> dict[str, Any]:
         """Return the answer of the path to a ping of the first robot."""
-        with self.client(0) as client:
-            client.subscribe(self.topic(PONG, self.a, path))
+        with self.connection() as connection:
+            connection.subscribe(self.topic(PONG, path))
             number = time.time_ns() % 1_000_000
-            client.publish(self.topic(PING, self.a, path), encode_ping(number, time.time_ns() // 1000))
-            answer: dict[str, Any] = json.loads(client.receive()[1])
+            connection.publish(self.topic(PING, path), encode_ping(number, time.time_ns() // 1000))
+            answer: dict[str, Any] = json.loads(connection.receive()[1])
         equal(answer["id"], number)
         return answer
 
@@ -111,10 +112,10 @@ class ProbeFixture:
             Batch(boot, i, [(first_s + i) * 1_000_000 + k * 20_000 for k in range(50)], {"speed": [i] * 50})
             for i in range(3)
         ]
-        with self.client(0) as client:
+        with self.connection() as connection:
             for batch in batches:
-                client.publish(record_topic(self.a, VESC_STREAM, self.namespace), encode_batch(batch))
-            client.ping()
+                connection.publish(record_topic(self.a, VESC_STREAM, self.namespace), encode_batch(batch))
+            connection.ping()
             until(lambda: sum(b.boot == boot for b in self.stored()) == 3, "the rule to store the batches")
         return batches
 
@@ -122,24 +123,30 @@ class ProbeFixture:
         """Return the first robot's batches in the telemetry table."""
         return list(audit.batches(self.cloud, self.a, VESC_STREAM))
 
-    def live_until(self, client: RawClient, true: Callable[[], object], what: str) -> None:
+    def summarized(self) -> int:
+        """The first robot's samples in the summary table."""
+        return audit.samples_summarized(self.cloud, self.a, VESC_STREAM)
+
+    def live_until(self, connection: RawClient, true: Callable[[], object], what: str) -> None:
         """Publish live samples until ``true``; the first may be stale before a cold function starts."""
 
         def heard() -> object:
             self._seq += 1
             now_us = time.time_ns() // 1000
             live = encode_live(LiveSample("0badcafe", self._seq, now_us, now_us, {"speed": 1}))
-            client.publish(self.topic(LIVE, self.a, VESC_STREAM), live)
+            connection.publish(self.topic(LIVE, VESC_STREAM), live)
             return true()
 
         until(heard, what)
 
+    def invoke(self, function: str, event: object) -> dict[str, Any]:
+        """A function's answer."""
+        answer = self.client("lambda").invoke(FunctionName=function, Payload=json.dumps(event).encode())
+        return dict(json.loads(answer["Payload"].read()))
+
     def who(self, seconds: float) -> dict[str, Any]:
         """Return ``instance`` and ``memory_mb`` from the function, which takes ``seconds`` to answer."""
-        payload = json.dumps({"seconds": seconds}).encode()
-        answer = self.cloud.client("lambda").invoke(FunctionName=self.function, Payload=payload)
-        found: dict[str, Any] = json.loads(answer["Payload"].read())
-        return found
+        return self.invoke(self.function, {"seconds": seconds})
 
 
 WRITERS = 8
@@ -147,13 +154,9 @@ WRITERS = 8
 
 def stores(fixture: ProbeFixture) -> str:
     """An item comes back as it was put."""
-    client, table = fixture.cloud.client("dynamodb"), fixture.cloud.output("storage", "RobotsTable")
-    item = {
-        "robot": {"S": fixture.target.name("bench-ability-item")},
-        "value": {"S": uuid.uuid4().hex},
-        "n": {"N": "1.5"},
-    }
-    key = {"robot": item["robot"]}
+    client, table = fixture.client("dynamodb"), fixture.table("Robots")
+    key = {"robot": {"S": fixture.target.name("bench-ability-item")}}
+    item = {**key, "value": {"S": uuid.uuid4().hex}, "n": {"N": "1.5"}}
     client.put_item(TableName=table, Item=item)
     try:
         equal(client.get_item(TableName=table, Key=key, ConsistentRead=True)["Item"], item)
@@ -166,13 +169,13 @@ def range_of_time(fixture: ProbeFixture) -> str:
     """A range query returns the batches that begin in the range."""
     sent = fixture.drive()
     first, last = batches_between(sent[1].t_us, sent[2].t_us - 1)
-    answer = fixture.cloud.client("dynamodb").query(
-        TableName=fixture.cloud.output("storage", "TelemetryTable"),
+    answer = fixture.client("dynamodb").query(
+        TableName=fixture.table("Telemetry"),
         KeyConditionExpression="topic = :topic AND #batch BETWEEN :a AND :b",
         # A reserved word of DynamoDB.
         ExpressionAttributeNames={"#batch": BATCH},
         ExpressionAttributeValues={
-            ":topic": {"S": build_topic(RECORD, fixture.a, VESC_STREAM, fixture.namespace)},
+            ":topic": {"S": fixture.topic(RECORD, VESC_STREAM)},
             ":a": {"S": first},
             ":b": {"S": last},
         },
@@ -183,18 +186,15 @@ def range_of_time(fixture: ProbeFixture) -> str:
 
 def stream_of_changes(fixture: ProbeFixture) -> str:
     """The function behind the stream summarises the stored batches."""
-    before = audit.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM)
+    before = fixture.summarized()
     fixture.drive()
-    until(
-        lambda: audit.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM) >= before + 150,
-        "the stream's function to write the other table",
-    )
+    until(lambda: fixture.summarized() >= before + 150, "the stream's function to write the other table")
     return "batches of one table arrived summarised in the other"
 
 
 def many_writers(fixture: ProbeFixture) -> str:
     """Threads write as fast as they can; a throttled write raises."""
-    client, table = fixture.cloud.client("dynamodb"), fixture.cloud.output("storage", "RobotsTable")
+    client, table = fixture.client("dynamodb"), fixture.table("Robots")
 
     def write(i: int) -> int:
         key = {"robot": {"S": fixture.target.name(f"bench-writer-{i}")}}
@@ -210,8 +210,7 @@ def many_writers(fixture: ProbeFixture) -> str:
 
 def on_demand(fixture: ProbeFixture) -> str:
     """The table describes itself as on demand."""
-    table = fixture.cloud.output("storage", "TelemetryTable")
-    described = fixture.cloud.client("dynamodb").describe_table(TableName=table)["Table"]
+    described = fixture.client("dynamodb").describe_table(TableName=fixture.table("Telemetry"))["Table"]
     mode = described.get("BillingModeSummary", {}).get("BillingMode")
     if mode != "PAY_PER_REQUEST":
         raise AbilityMissingError(f"the billing mode is {mode}")
@@ -223,9 +222,8 @@ INSTANCES = 4
 
 def computes(fixture: ProbeFixture) -> str:
     """Lambda 2 answers an empty event."""
-    function = fixture.cloud.output("processing", "SummarizeFunction")
-    answer = fixture.cloud.client("lambda").invoke(FunctionName=function, Payload=b'{"Records": []}')
-    equal(json.loads(answer["Payload"].read()), {"batchItemFailures": []})
+    summarize = fixture.cloud.output("processing", "SummarizeFunction")
+    equal(fixture.invoke(summarize, {"Records": []}), {"batchItemFailures": []})
     return "Lambda 2 answered an event"
 
 
@@ -241,7 +239,7 @@ def many_instances(fixture: ProbeFixture) -> str:
 
 def memory_size(fixture: ProbeFixture) -> str:
     """The function sees its memory size change."""
-    client = fixture.cloud.client("lambda")
+    client = fixture.client("lambda")
     before = fixture.who(0)["memory_mb"]
     client.update_function_configuration(FunctionName=fixture.function, MemorySize=512)
     client.get_waiter("function_updated_v2").wait(FunctionName=fixture.function)
@@ -255,8 +253,8 @@ CLIENTS = 20
 
 def robot_to_robot(fixture: ProbeFixture) -> str:
     """A message of one robot reaches another robot's subscription."""
-    topic, payload = fixture.topic(FLEET, fixture.a, "pose"), uuid.uuid4().hex.encode()
-    with fixture.client(0) as one, fixture.client(1) as other:
+    topic, payload = fixture.topic(FLEET, "pose"), uuid.uuid4().hex.encode()
+    with fixture.connection() as one, fixture.connection(1) as other:
         other.subscribe(topic)
         one.publish(topic, payload)
         equal(other.receive(), (topic, payload))
@@ -273,7 +271,7 @@ def rule_republishes(fixture: ProbeFixture) -> str:
 
 def newest_state(fixture: ProbeFixture) -> str:
     """The shadow returns the state that was written to it."""
-    client, value = fixture.cloud.client("iot-data"), uuid.uuid4().hex
+    client, value = fixture.client("iot-data"), uuid.uuid4().hex
     document = json.dumps({"state": {"desired": {"bench": value}}})
     client.update_thing_shadow(thingName=fixture.b, shadowName=SHADOW, payload=document)
     kept = json.loads(client.get_thing_shadow(thingName=fixture.b, shadowName=SHADOW)["payload"].read())
@@ -283,20 +281,20 @@ def newest_state(fixture: ProbeFixture) -> str:
 
 def any_mqtt_client(fixture: ProbeFixture) -> str:
     """A client of another MQTT version than the agent's gets its message back."""
-    with fixture.client(0) as client:
-        topic = fixture.topic(PING, fixture.a, BROKER)
-        client.subscribe(topic)
-        took_s = client.round_trip(topic, b"{}")
+    with fixture.connection() as connection:
+        topic = fixture.topic(PING, BROKER)
+        connection.subscribe(topic)
+        took_s = connection.round_trip(topic, b"{}")
     return f"a client of a hundred lines had its message back in {took_s * 1000:.1f} ms"
 
 
 def messages_over_https(fixture: ProbeFixture) -> str:
     """A message that was sent over HTTPS arrives over MQTT."""
-    topic, payload = fixture.topic(CMD, fixture.a, "bench"), uuid.uuid4().hex.encode()
-    with fixture.client(0) as client:
-        client.subscribe(topic)
-        fixture.cloud.client("iot-data").publish(topic=topic, qos=0, payload=payload)
-        equal(client.receive(), (topic, payload))
+    topic, payload = fixture.topic(CMD, "bench"), uuid.uuid4().hex.encode()
+    with fixture.connection() as connection:
+        connection.subscribe(topic)
+        fixture.client("iot-data").publish(topic=topic, qos=0, payload=payload)
+        equal(connection.receive(), (topic, payload))
     return "a message put in over HTTPS came out over MQTT"
 
 
@@ -315,11 +313,10 @@ def rule_to_function(fixture: ProbeFixture) -> str:
 
 def what_fails_is_kept(fixture: ProbeFixture) -> str:
     """A message that is no batch reaches the quarantine unchanged."""
-    mark = uuid.uuid4().hex
-    message = json.dumps({"bench": mark}).encode()
-    with fixture.client(0) as client:
-        client.publish(record_topic(fixture.a, VESC_STREAM, fixture.namespace), message)
-        client.ping()
+    message = json.dumps({"bench": uuid.uuid4().hex}).encode()
+    with fixture.connection() as connection:
+        connection.publish(record_topic(fixture.a, VESC_STREAM, fixture.namespace), message)
+        connection.ping()
 
     def there() -> bool:
         listed = quarantine.entries(fixture.cloud, robot=fixture.a)
@@ -344,8 +341,8 @@ LISTENERS = 4
 
 def live_sample(fixture: ProbeFixture) -> str:
     """A live sample reaches a subscriber."""
-    with fixture.target.listener(fixture.a) as listener, fixture.client(0) as client:
-        fixture.live_until(client, lambda: listener.heard, "the subscriber to hear a sample")
+    with fixture.target.listener(fixture.a) as listener, fixture.connection() as connection:
+        fixture.live_until(connection, lambda: listener.heard, "the subscriber to hear a sample")
         return f"a live sample came to a subscriber after {listener.heard[0].delay_ms:.0f} ms"
 
 
@@ -354,7 +351,7 @@ def many_subscribers(fixture: ProbeFixture) -> str:
     with ExitStack() as stack:
         listeners = [stack.enter_context(fixture.target.listener(fixture.a)) for _ in range(LISTENERS)]
         fixture.live_until(
-            stack.enter_context(fixture.client(0)),
+            stack.enter_context(fixture.connection()),
             lambda: all(listener.heard for listener in listeners),
             "all subscribers to hear a sample",
         )
@@ -363,20 +360,19 @@ def many_subscribers(fixture: ProbeFixture) -> str:
 
 def metrics(fixture: ProbeFixture) -> str:
     """CloudWatch returns the mean of the values of a metric."""
-    client, now = fixture.cloud.client("cloudwatch"), datetime.now(timezone.utc)
-    name = f"Bench{uuid.uuid4().hex[:8]}"
+    client, now = fixture.client("cloudwatch"), datetime.now(timezone.utc)
+    name, minutes = f"Bench{uuid.uuid4().hex[:8]}", timedelta(minutes=5)
     values = {"Values": [1.0, 2.0, 6.0], "Counts": [1.0, 1.0, 1.0]}
-    client.put_metric_data(
-        Namespace="iort-bench", MetricData=[{"MetricName": name, "Timestamp": now, **values}]
-    )
-    found: list[dict[str, Any]] = []
+    metric: Any = {"MetricName": name, "Timestamp": now, **values}
+    client.put_metric_data(Namespace="iort-bench", MetricData=[metric])
+    found: list[Any] = []
 
     def there() -> bool:
         found[:] = client.get_metric_statistics(
             Namespace="iort-bench",
             MetricName=name,
-            StartTime=now - timedelta(minutes=5),
-            EndTime=now + timedelta(minutes=5),
+            StartTime=now - minutes,
+            EndTime=now + minutes,
             Period=60,
             Statistics=["Average", "SampleCount"],
         )["Datapoints"]
@@ -390,21 +386,17 @@ def metrics(fixture: ProbeFixture) -> str:
 def logs(fixture: ProbeFixture) -> str:
     """The log has the lines of an invocation."""
     function = fixture.cloud.output("processing", "EchoFunction")
-    client = fixture.cloud.client("lambda")
+    client, logs = fixture.client("lambda"), fixture.client("logs")
     group = client.get_function_configuration(FunctionName=function)["LoggingConfig"]["LogGroup"]
     since = int(time.time() * 1000) - 1000
     fixture.pong(LAMBDA)
-    logs = fixture.cloud.client("logs")
-    until(
-        lambda: bool(logs.filter_log_events(logGroupName=group, startTime=since)["events"]),
-        "the log's lines",
-    )
+    until(lambda: logs.filter_log_events(logGroupName=group, startTime=since)["events"], "the log's lines")
     return "an invocation's lines are in its log"
 
 
 def dashboards(fixture: ProbeFixture) -> str:
     """The deployment has dashboards with widgets."""
-    client = fixture.cloud.client("cloudwatch")
+    client = fixture.client("cloudwatch")
     names = [entry["DashboardName"] for entry in client.list_dashboards()["DashboardEntries"]]
     if not names:
         raise AbilityMissingError("there is no dashboard")

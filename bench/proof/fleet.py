@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import pickle
 import random
-from collections.abc import Iterator, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -202,8 +203,7 @@ _STANDS_S = 5.0
 _STANDING = Wish(0.0, 0.0)
 # The time between a measurement and its stamp differs by so much, as on a busy computer.
 _JITTER_US = 300.0
-# The sensors' resolutions are decimal, so that the columns are kept as integers.
-_SCALES = (1, 10, 100, 1000)
+T = TypeVar("T")
 
 
 class Simulated(NamedTuple):
@@ -213,20 +213,32 @@ class Simulated(NamedTuple):
     truth: dict[str, float]
 
 
+def cached(path: Path, make: Callable[[], T]) -> T:
+    """What an earlier run kept under the path, or what ``make`` makes, which is kept."""
+    if path.exists():
+        found: T = pickle.loads(zlib.decompress(path.read_bytes()))  # noqa: S301 - this function's own file
+        return found
+    made = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{random.getrandbits(64):x}")
+    partial.write_bytes(zlib.compress(pickle.dumps(made), 1))
+    partial.replace(path)
+    return made
+
+
+def version(*paths: str | Path) -> str:
+    """The version of what makes something: its code, in folders and files."""
+    files = [
+        file
+        for path in map(Path, paths)
+        for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])
+    ]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
 def simulated(spec: DriveSpec, kept: Path | None = KEPT) -> Simulated:
     """Simulate a drive, or take it from the folder ``kept``."""
-    if kept is None:
-        return _simulate(spec)
-    path = kept / f"{digest(spec)}.npz"
-    if not path.exists():
-        made = _simulate(spec)
-        kept.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{random.getrandbits(64):x}.npz")
-        np.savez(partial, **_packed(made))
-        partial.replace(path)
-        return made
-    with np.load(path) as arrays:
-        return _unpacked(dict(arrays))
+    return cached(kept / digest(spec), lambda: _simulate(spec)) if kept else _simulate(spec)
 
 
 def _simulate(spec: DriveSpec) -> Simulated:
@@ -301,41 +313,12 @@ def _parameters(spec: DriveSpec, vehicle: Vehicle) -> dict[str, float]:
 
 @cache
 def _simulator() -> str:
-    """The version of what makes a drive: its code."""
-    (folder,) = iort_agent.sources.sim.__path__
-    code = [*sorted(Path(folder).glob("*.py")), Path(__file__)]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()
+    return version(*iort_agent.sources.sim.__path__, __file__)
 
 
 def digest(spec: DriveSpec) -> str:
     """A name for a drive as this simulator makes it."""
     return hashlib.sha256(f"{_simulator()} {spec!r}".encode()).hexdigest()[:32]
-
-
-def _packed(made: Simulated) -> dict[str, Any]:
-    """The arrays of a drive, in a quarter of the bytes."""
-    arrays: dict[str, Any] = {"truth": np.array(json.dumps(made.truth))}
-    for stream, block in made.streams.items():
-        arrays[f"{stream}/times"] = block.times_us
-        for name, column in block.columns.items():
-            scale = next((s for s in _SCALES if bool((np.round(column * s) / s == column).all())), None)
-            small = column if scale is None else np.round(column * scale).astype(np.int32)
-            if scale is not None and abs(small).max(initial=0) < 2**15:
-                small = small.astype(np.int16)
-            arrays[f"{stream}/{name}/{scale or ''}"] = small
-    return arrays
-
-
-def _unpacked(arrays: Mapping[str, Any]) -> Simulated:
-    truth = json.loads(str(arrays["truth"]))
-    times = {name.split("/")[0]: column for name, column in arrays.items() if name.endswith("/times")}
-    columns: dict[str, dict[str, Any]] = {stream: {} for stream in times}
-    for key, column in arrays.items():
-        stream, _, rest = key.partition("/")
-        name, _, scale = rest.partition("/")
-        if stream in columns and rest != "times":
-            columns[stream][name] = column / float(scale) if scale else column
-    return Simulated({stream: Block(times[stream], columns[stream]) for stream in times}, truth)
 
 
 _S = 1_000_000

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
-import random
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import iort_analysis
 import iort_contract
-from bench.proof.fleet import DriveSpec, digest, simulated
+from bench.proof.fleet import DriveSpec, cached, digest, simulated, version
 from iort_agent.sources.sim import ALL
 from iort_agent.sources.sim.vehicle import AIR_KG_PER_M3, G_MPS2, WIND_MPS, VehicleConfig
 from iort_analysis.evaluation import evaluate
@@ -35,11 +30,10 @@ B = TypeVar("B")
 
 @dataclass(frozen=True)
 class Analysed:
-    """A drive's result without its tables, the truth, and the processor time that the analysis took."""
+    """A drive's result without its tables, and the truth."""
 
     result: DriveResult
     truth: dict[str, float]
-    cpu_s: float
 
     @property
     def measured(self) -> Measured:
@@ -49,12 +43,11 @@ class Analysed:
 
 def analysed(spec: DriveSpec) -> Analysed:
     """Simulate and analyse a drive, or take what an earlier run kept."""
-    path = KEPT / _version() / f"{digest(spec)}.pickle"
-    if path.exists():
-        found: Analysed = pickle.loads(path.read_bytes())  # noqa: S301 - this module's own file
-        return found
+    return cached(KEPT / _version() / digest(spec), lambda: _analyse(spec))
+
+
+def _analyse(spec: DriveSpec) -> Analysed:
     streams, truth = simulated(spec)
-    began = time.process_time()
     # What the owner of a car knows: its weight, cells and pole pairs, the rated capacity, and the gain of its
     # vesc.yaml.
     car = spec.vehicle
@@ -65,14 +58,8 @@ def analysed(spec: DriveSpec) -> Analysed:
         "pole_pairs": float(car.pole_pairs),
     }
     result = analyse(spec.key, streams, F1TENTH, known)
-    cpu_s = time.process_time() - began
     truth = {**truth, "seconds": spec.seconds, "motor_sensor": float(spec.fields == ALL)}
-    made = Analysed(replace(result, mined=replace(result.mined, tables={})), truth, cpu_s)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".{random.getrandbits(64):x}")
-    partial.write_bytes(pickle.dumps(made))
-    partial.replace(path)
-    return made
+    return Analysed(replace(result, mined=replace(result.mined, tables={})), truth)
 
 
 def on_all_cores(work: Callable[[A], B], items: Iterable[A], done: Done) -> list[B]:
@@ -91,10 +78,7 @@ def on_all_cores(work: Callable[[A], B], items: Iterable[A], done: Done) -> list
 
 @cache
 def _version() -> str:
-    """The version of the analysis: its code, the contract's, and this module's."""
-    folders: Sequence[str] = [*iort_analysis.__path__, *iort_contract.__path__]
-    code = [*sorted(path for folder in folders for path in Path(folder).rglob("*.py")), Path(__file__)]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()[:16]
+    return version(*iort_analysis.__path__, *iort_contract.__path__, __file__)
 
 
 # Estimates that are only compared with the car's own earlier drives, in a VESC's units: their interval says

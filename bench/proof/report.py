@@ -6,7 +6,7 @@ import base64
 import json
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from statistics import median
@@ -120,40 +120,21 @@ def detected(plan: Plan, found: Mapping[Case, Detected]) -> Section:
         strong = found[kind, "strong"]
         others = [f"{name} {n}" for name, n in strong.others.most_common() if n >= _OFTEN * strong.drives]
         cells = [_shown(found[kind, strength], _TARGETS.get(strength)) for strength in STRENGTHS]
-        rows.append(
-            [kind, ", ".join(sorted(RIGHT[kind])), _strengths(kind), what.unit, *cells, ", ".join(others)]
-        )
-    section.table(
-        f"{plan.cars} cars, each with {plan.baseline} healthy drives of {plan.seconds / 60:g} minutes before",
-        [
-            "fault",
-            "right finding",
-            "weak, middle, strong",
-            "unit",
-            *STRENGTHS,
-            "other findings of the strong",
-        ],
-        rows,
+        right, strengths = ", ".join(sorted(RIGHT[kind])), _strengths(kind)
+        rows.append([kind, right, strengths, what.unit, *cells, ", ".join(others)])
+    head = ["fault", "right finding", "weak, middle, strong", "unit", *STRENGTHS]
+    title = (
+        f"{plan.cars} cars, each with {plan.baseline} healthy drives of {plan.seconds / 60:g} minutes before"
     )
-    section.plot(
-        "detection",
-        "Drives with a fault in which it was found",
-        plots.grouped(
-            {strength: {kind: _percent(found[kind, strength]) for kind in KINDS} for strength in STRENGTHS},
-            unit="%",
-        ),
-    )
+    section.table(title, [*head, "other findings of the strong"], rows)
+    bars = {strength: {kind: _percent(found[kind, strength]) for kind in KINDS} for strength in STRENGTHS}
+    title = "Drives with a fault in which it was found"
+    section.plot("detection", title, plots.grouped(bars, unit="%"))
     for strength in STRENGTHS:
         of = [found[kind, strength] for kind in KINDS]
         share = 100 * sum(one.found for one in of) / sum(one.drives for one in of)
-        section.ratio(
-            f"faults found, {strength}",
-            round(share, 1),
-            _TARGETS.get(strength),
-            unit="%",
-            at_least=True,
-            tolerance=1.05,
-        )
+        settings: dict[str, Any] = {"unit": "%", "at_least": True, "tolerance": 1.05}
+        section.ratio(f"faults found, {strength}", round(share, 1), _TARGETS.get(strength), **settings)
     section.notes.append(
         "A fault counts as found if its first drive has a finding of the right kind. A sensor's fault is in "
         "another field from car to car."
@@ -183,31 +164,38 @@ def alarms(plan: Plan, judged: Sequence[Judged]) -> Section:
 def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) -> Section:
     """How often the intervals hold the truth."""
     section = Section("coverage", "Intervals that hold the truth")
-    head = ["parameter", "drives", "held", "width, median", "off, median"]
     found = dict(sorted(found.items()))
-    others = INDICATORS | SPANNING
-    parameters = {name: one for name, one in found.items() if name not in others}
-    spanning = {name: one for name, one in found.items() if name in SPANNING}
-    indicators = {name: one for name, one in found.items() if name in INDICATORS}
-    section.table(
-        f"90 % intervals of {drives} healthy cars with a drive each",
-        head,
-        [_coverage(name, one, good=_covers(one)) for name, one in parameters.items()],
+    parameters, spanning, indicators = (
+        {name: one for name, one in found.items() if belongs(name)}
+        for belongs in (
+            lambda name: name not in INDICATORS | SPANNING,
+            SPANNING.__contains__,
+            INDICATORS.__contains__,
+        )
     )
-    section.table(
-        "Intervals that span the makes and ages of battery cells, which no owner tells",
-        head,
-        [_coverage(name, one, good=100 * one.share >= _LEAST_SPANNED) for name, one in spanning.items()],
-    )
-    section.table(
-        "Indicators: only compared with the car's own earlier drives",
-        head,
-        [_coverage(name, one, good=True) for name, one in indicators.items()],
-    )
-    outside = [name for name, one in parameters.items() if not _covers(one)]
+    tables: dict[str, tuple[Mapping[str, Coverage], Callable[[float], bool]]] = {
+        f"90 % intervals of {drives} healthy cars with a drive each": (parameters, _covers),
+        "Intervals that span the makes and ages of battery cells, which no owner tells": (
+            spanning,
+            lambda share: share >= _LEAST_SPANNED,
+        ),
+        "Indicators: only compared with the car's own earlier drives": (indicators, lambda _: True),
+    }
+    for title, (group, good) in tables.items():
+        rows = [
+            [
+                name,
+                str(one.drives),
+                _marked(f"{100 * one.share:.1f} %", good=good(100 * one.share)),
+                f"{median(one.widths):.2g} {one.unit}",
+                f"{median(one.off):+.2g} {one.unit}",
+            ]
+            for name, one in group.items()
+        ]
+        section.table(title, ["parameter", "drives", "held", "width, median", "off, median"], rows)
     section.ratio(
         f"parameters of {len(parameters)} whose intervals hold the truth less or more often than 85 to 95 %",
-        len(outside),
+        sum(not _covers(100 * one.share) for one in parameters.values()),
         0.0,
         unit="parameters",
         tolerance=1.0,
@@ -267,20 +255,9 @@ def speed(hour: Hour, robot_hours: float, ours: Bill, floor: Bill) -> Section:
     return section
 
 
-def _covers(one: Coverage) -> bool:
+def _covers(percent: float) -> bool:
     low, high = _COVERED
-    return low <= 100 * one.share <= high
-
-
-def _coverage(name: str, one: Coverage, *, good: bool) -> list[str]:
-    held = _marked(f"{100 * one.share:.1f} %", good=good)
-    return [
-        name,
-        str(one.drives),
-        held,
-        f"{median(one.widths):.2g} {one.unit}",
-        f"{median(one.off):+.2g} {one.unit}",
-    ]
+    return low <= percent <= high
 
 
 def _strengths(kind: str) -> str:

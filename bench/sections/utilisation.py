@@ -12,8 +12,6 @@ import base64
 import inspect
 import json
 import re
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -26,6 +24,7 @@ from bench import plots, thesis
 from bench.floors import live as live_floor
 from bench.floors import summarize as summarize_floor
 from bench.load import stored_drive
+from bench.load.counting import process
 from bench.report import NOT_MEASURED, Section, ratio, spread
 from bench.sections import Declared
 from iort_agent.sources.sim import Sensors
@@ -37,7 +36,7 @@ from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import LIVE, RECORD, build_topic
-from testkit import ROOT, machine
+from testkit import machine
 from testkit.car import RATE_HZ
 from testkit.target import Say, Target, configure, temporary_function
 from testkit.waiting import InstrumentError, reached
@@ -70,11 +69,11 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
     """
     began_ms = int(time.time() * 1000)
     before = _cpu(target)
-    told = [invoke(target, function, event(i)) for i in range(calls)]
+    answers = [invoke(target, function, event(i)) for i in range(calls)]
     if target.embedded is not None:
         found.cpu_ms.append(machine.spent_ms(before, _cpu(target)) / calls)
     # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
-    reports = [line for line in told if line is not None]
+    reports = [line for line in answers if line is not None]
     if len(reports) < calls:
         reports = _logged(target, function, began_ms, calls)
     found.duration_ms.append([float(match[1]) for line in reports if (match := _REPORT.match(line))])
@@ -82,11 +81,8 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
 
 
 def _cpu(target: Target) -> dict[int, int]:
-    return (
-        {}
-        if target.embedded is None
-        else machine.threads_ns(machine.descendants(target.embedded.emulator.pid))
-    )
+    pids = machine.descendants(target.embedded.emulator.pid) if target.embedded else []
+    return machine.threads_ns(pids)
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
@@ -181,15 +177,9 @@ ROUNDS = 3
 CALLS = 60
 BATCHES = 100
 _LIVE, _ONE, _EMPTY = "Lambda 1 (live)", "Lambda 2, an event of 1 batch", "empty function"
-_BACKLOG = f"Lambda 2, an event of {BATCHES} batches"
-_LIVE_FLOOR, _ONE_FLOOR, _BACKLOG_FLOOR = (f"floor of {name}" for name in (_LIVE, _ONE, _BACKLOG))
-# A function, its floor, and the most that it may take of the floor's processor time, without the empty
-# function's.
-_RATIOS = (
-    (_LIVE, _LIVE_FLOOR, 3.0),
-    (_ONE, _ONE_FLOOR, None),
-    (_BACKLOG, _BACKLOG_FLOOR, 3.0),
-)
+_BACKLOG, _FLOOR = f"Lambda 2, an event of {BATCHES} batches", "floor of "
+# A function, and the most that it may take of its floor's processor time, without the empty function's.
+_MOST = {_LIVE: 3.0, _ONE: None, _BACKLOG: 3.0}
 _THESIS = {_LIVE: f"{thesis.LAMBDA_1[256]} (256 MB)", _ONE: thesis.LAMBDA_2}
 # What an invocation costs by itself.
 _NOTHING = "def handler(event, context):\n    return None\n"
@@ -197,50 +187,34 @@ _NOTHING = "def handler(event, context):\n    return None\n"
 
 def run(target: Target, say: Say) -> Section:
     """Invoke the functions in turns, warm and cold; then the node's cycle."""
-    section = Section("utilisation", "Utilisation (table 6.5)")
+    section, robot = Section("utilisation", "Utilisation (table 6.5)"), target.name(ROBOT)
     say("storing a drive")
-    batches = stored_drive.store(target, target.name(ROBOT), stored_drive.simulated(BATCHES * RATE_HZ))
+    batches = stored_drive.store(target, robot, stored_drive.simulated(BATCHES * RATE_HZ))
+    arrivals, topic = count(), build_topic(LIVE, robot, VESC_STREAM, target.cloud.namespace)
     # The newest batch alone is what a driving car makes of the stream; all of them, a backlog.
-    arrivals = count()
-
-    def live(number: int) -> dict[str, Any]:
-        topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
-        return live_event(topic, number)
-
-    def one(_: int) -> dict[str, Any]:
-        return stream_event(batches[-1:], next(arrivals))
-
-    def many(_: int) -> dict[str, Any]:
-        return stream_event(batches, next(arrivals))
-
-    names = {_LIVE: target.cloud.output("processing", "LiveFunction")}
-    names[_ONE] = names[_BACKLOG] = target.cloud.output("processing", "SummarizeFunction")
+    events: dict[str, Event] = {
+        _LIVE: lambda number: live_event(topic, number),
+        _ONE: lambda _: stream_event(batches[-1:], next(arrivals)),
+        _BACKLOG: lambda _: stream_event(batches, next(arrivals)),
+    }
     with ExitStack() as stack:
-        names |= _floors(target, stack)
-        events: dict[str, Event] = {
-            _LIVE: live,
-            _LIVE_FLOOR: live,
-            _ONE: one,
-            _ONE_FLOOR: one,
-            _BACKLOG: many,
-            _BACKLOG_FLOOR: many,
-            _EMPTY: lambda _: {},
-        }
-        for name in sorted(set(names.values())):
-            stack.enter_context(reporting(target, name))
-        found = {name: Measured() for name in events}
+        names = _deploy(target, stack)
+        # Each function, and its floor after it.
+        events = {name: events.get(name.removeprefix(_FLOOR), lambda _: {}) for name in names}
+        for function in sorted(set(names.values())):
+            stack.enter_context(reporting(target, function))
         for name, event in events.items():
             invoke(target, names[name], event(0))
+        found = {name: Measured() for name in names}
         for turn in range(ROUNDS):
             for name, event in events.items():
                 say(f"{name}, warm, {turn + 1} of {ROUNDS}")
-                calls = CALLS // 10 if name in {_BACKLOG, _BACKLOG_FLOOR} else CALLS
+                calls = CALLS // 10 if _BACKLOG in name else CALLS
                 measure(target, names[name], event, calls, found[name])
-        sizes = _memory_sizes(target, names[_LIVE], live, say)
+        sizes = _memory_sizes(target, names[_LIVE], events[_LIVE], say)
         cold = {name: _cold(target, names[name], events[name], say) for name in (_LIVE, _ONE, _EMPTY)}
     say("the node's cycle")
-    cycle = _cycle()
-    report(section, found, cold, sizes, cycle)
+    report(section, found, cold, sizes, _cycle())
     return section
 
 
@@ -267,27 +241,21 @@ def report(
     head = ["function", "duration, warm: median (p95, p99)", "processor time", "cold", "thesis, 2018"]
     section.table("An invocation", head, rows)
     if sizes:
-        section.table(
-            "Lambda 1 by memory size",
-            ["memory", "duration, warm", "thesis, 2018"],
-            [
-                [f"{mb} MB", _duration(one), thesis.LAMBDA_1.get(mb, NOT_MEASURED)]
-                for mb, one in sizes.items()
-            ],
-        )
+        rows = [
+            [f"{mb} MB", _duration(one), thesis.LAMBDA_1.get(mb, NOT_MEASURED)] for mb, one in sizes.items()
+        ]
+        section.table("Lambda 1 by memory size", ["memory", "duration, warm", "thesis, 2018"], rows)
     else:
-        section.table(
-            "Projection, not a measurement: processor time by the share of a vCPU of each memory size",
-            ["function", *(f"{size} MB" for size in SIZES_MB)],
-            [[name, *(f"{ms:.1f} ms" for ms in values)] for name, values in _projected(found).items()],
-        )
+        title = "Projection, not a measurement: processor time by the share of a vCPU of each memory size"
+        rows = [[name, *(f"{ms:.1f} ms" for ms in values)] for name, values in _projected(found).items()]
+        section.table(title, ["function", *(f"{size} MB" for size in SIZES_MB)], rows)
         section.notes.append(
             f"On the embedded cloud the memory size changes nothing. The projection is processor time x "
             f"{ONE_VCPU_MB} MB / memory, by AWS' word that {ONE_VCPU_MB} MB have one vCPU; waiting for "
             "DynamoDB or PubNub is not in it, and this machine's core is not AWS'."
         )
-    for name, floor, most in _RATIOS:
-        times = ratio(_beyond(found, name), _beyond(found, floor))
+    for name, most in _MOST.items():
+        times = ratio(_beyond(found, name), _beyond(found, _FLOOR + name))
         section.ratio(f"{name}: processor / its floor", times and round(times, 2), most, tolerance=1.6)
     cycles = round(cycle["p50"] / thesis.NODE_CYCLE_MS, 5)
     section.ratio("node's cycle / thesis' 2 ms", cycles, 0.05, tolerance=3, by_machine=True)
@@ -361,41 +329,35 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
     return found
 
 
-def _floors(target: Target, stack: ExitStack) -> dict[str, str]:
-    """Deploy the floors and the empty function until the stack ends; their names."""
+def _deploy(target: Target, stack: ExitStack) -> dict[str, str]:
+    """The functions by name, each with its floor after it, and the empty one; what is not ours stays until
+    the stack ends."""
     cloud = target.cloud
-    live = {"PUBNUB_PARAMETER": pubnub_parameter(cloud.namespace)}
-    summarize = {
-        "DICTIONARY": DICTIONARY.decode(),
-        "TABLE": cloud.output("storage", "SummaryTable"),
-        "TOPIC": build_topic(RECORD, target.name(f"{ROBOT}-floor"), VESC_STREAM, cloud.namespace),
-    }
+    live, summarize = (cloud.output("processing", f"{name}Function") for name in ("Live", "Summarize"))
+    topic = build_topic(RECORD, target.name(f"{ROBOT}-floor"), VESC_STREAM, cloud.namespace)
 
-    def deployed(name: str, source: str, like: str, variables: dict[str, str]) -> str:
+    def deployed(name: str, source: str, like: str, **variables: str) -> str:
         function = temporary_function(target, name, source, memory_mb=256, like=like, variables=variables)
         return stack.enter_context(function)
 
-    floor = deployed("summarize_floor", inspect.getsource(summarize_floor), "Summarize", summarize)
+    live_source, summarize_source = map(inspect.getsource, (live_floor, summarize_floor))
+    parameter, table = pubnub_parameter(cloud.namespace), cloud.output("storage", "SummaryTable")
+    variables = {"DICTIONARY": DICTIONARY.decode(), "TABLE": table, "TOPIC": topic}
+    floor = deployed("summarize_floor", summarize_source, "Summarize", **variables)
     return {
-        _LIVE_FLOOR: deployed("live_floor", inspect.getsource(live_floor), "Live", live),
-        _ONE_FLOOR: floor,
-        _BACKLOG_FLOOR: floor,
-        _EMPTY: deployed("empty", _NOTHING, "Echo", {}),
+        _LIVE: live,
+        _FLOOR + _LIVE: deployed("live_floor", live_source, "Live", PUBNUB_PARAMETER=parameter),
+        _ONE: summarize,
+        _FLOOR + _ONE: floor,
+        _BACKLOG: summarize,
+        _FLOOR + _BACKLOG: floor,
+        _EMPTY: deployed("empty", _NOTHING, "Echo"),
     }
 
 
 def _cycle() -> dict[str, float]:
-    done = subprocess.run(
-        [sys.executable, "-m", "bench.ros.cycle", "5000"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise InstrumentError(f"bench.ros.cycle failed: {done.stderr[-800:]}")
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
+    with process("bench.ros.cycle", "5000") as objects:
+        return next(objects)
 
 
 SECTION = Declared("functions and node, beside their floors", run)

@@ -65,7 +65,7 @@ def drive(*events: Event, **estimates: float) -> Analysed:
     found = {name: Estimate(value, 0.9 * value, 1.1 * value, "ohm") for name, value in estimates.items()}
     mined = Mined(estimates=found, events=events)
     result = DriveResult(SPEC.key, SPEC.key.start_us, 3000, {}, mined)
-    return Analysed(result, {"battery_resistance_ohm": 0.03}, 0.1)
+    return Analysed(result, {"battery_resistance_ohm": 0.03})
 
 
 def event(kind: str) -> Event:
@@ -108,5 +108,5 @@ def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
     once, twice, slow = (report.bill(*these, 600.0) for these in ((100, 2.0), (200, 2.0), (100, 20.0)))
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
-    assert slow.dollars["Lambda, computing"] > once.dollars["Lambda, computing"]
-    assert slow.dollars["DynamoDB, samples read"] == once.dollars["DynamoDB, samples read"]
+    assert slow.dollars["Lambda, GB-second, Arm"] > once.dollars["Lambda, GB-second, Arm"]
+    assert slow.dollars["DynamoDB, read request unit, up to 4 KB"] == once.dollars["DynamoDB, read request unit, up to 4 KB"]
