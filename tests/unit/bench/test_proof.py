@@ -108,5 +108,6 @@ def test_more_hours_cost_more_and_a_slower_analysis_takes_longer():
     once, twice, slow = (report.bill(*these, 600.0) for these in ((100, 2.0), (200, 2.0), (100, 20.0)))
     assert sum(twice.dollars.values()) == pytest.approx(2 * sum(once.dollars.values()))
     assert slow.seconds > once.seconds
-    assert slow.dollars["Lambda, GB-second, Arm"] > once.dollars["Lambda, GB-second, Arm"]
-    assert slow.dollars["DynamoDB, read request unit, up to 4 KB"] == once.dollars["DynamoDB, read request unit, up to 4 KB"]
+    computing, reading = "Lambda, GB-second, Arm", "DynamoDB, read request unit, up to 4 KB"
+    assert slow.dollars[computing] > once.dollars[computing]
+    assert slow.dollars[reading] == once.dollars[reading]
