@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iort_analysis.statistics.distributions import sides, tail
 from iort_contract.messages.analysis import Estimate
@@ -64,14 +65,8 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
     reach = _CLIPPED * np.hypot(scale, errors)
     values = np.clip(values, middle - reach, middle + reach)
     among = len(values) - 1
-    weights = errors**-2.0
-    off = values - np.average(values, weights=weights)
-    surplus = float((weights * off**2).sum()) - among
-    scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
-    # 0 also where one drive is so much surer than the others that its weight is the whole.
-    between = max(0.0, surplus / scaled) if scaled > 0 else 0.0
     freedom = among + _PRIOR_DRIVES
-    variance = (among * between + _PRIOR_DRIVES * expected_spread**2) / freedom
+    variance = (among * _between(values, errors) + _PRIOR_DRIVES * expected_spread**2) / freedom
     weights = 1 / (errors**2 + variance)
     return Baseline(
         float(np.average(values, weights=weights)),
@@ -80,6 +75,16 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
         freedom,
         len(values),
     )
+
+
+def _between(values: NDArray[np.float64], errors: NDArray[np.float64]) -> float:
+    """The variance by which values differ beyond their errors (DerSimonian and Laird)."""
+    weights = errors**-2.0
+    off = values - np.average(values, weights=weights)
+    surplus = float((weights * off**2).sum()) - (len(values) - 1)
+    scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
+    # 0 also where one drive is so much surer than the others that its weight is the whole.
+    return max(0.0, surplus / scaled) if scaled > 0 else 0.0
 
 
 def fleet_baseline(robots: Sequence[Sequence[Estimate]], expected_spread: float) -> Baseline:
@@ -108,12 +113,8 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     values = np.array([one.value for one in estimates])
     errors = np.array([(one.high - one.low) / 2 / sides() for one in estimates])
     errors = np.maximum(errors, 1e-9 * max(float(np.abs(values).max()), 1e-12))
-    weights, among = errors**-2.0, len(values) - 1
-    surplus = float((weights * (values - np.average(values, weights=weights)) ** 2).sum()) - among
-    scaled = float(weights.sum() - (weights**2).sum() / weights.sum())
-    # 0 where one drive is so much surer than the others that its weight is the whole.
-    between = max(0.0, surplus / scaled) if scaled > 0 else 0.0
-    weights = 1 / (errors**2 + between)
+    among = len(values) - 1
+    weights = 1 / (errors**2 + _between(values, errors))
     mean = float(np.average(values, weights=weights))
     scatter = float((weights * (values - mean) ** 2).sum()) / among
     # Drives that agree by chance are no reason for less than their own errors give.

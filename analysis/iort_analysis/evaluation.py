@@ -128,46 +128,42 @@ def evaluate(
     others = sorted(fleet, key=lambda one: (one.drive.robot, str(one.drive)))
     for result in results:
         earlier = sorted(_before(own.values(), result.drive), key=lambda one: str(one.drive))
-        changes = _Comparison(result, earlier, _before(others, result.drive))
-        candidates += changes.findings
+        changes, unusual = _changes(result, earlier, _before(others, result.drive))
+        candidates += changes
         if result is results[-1]:
             candidates += _trends(result, earlier)
         candidates += [_of_event(result, event) for event in result.mined.events]
-        usual = {name: e for name, e in result.mined.estimates.items() if name not in changes.unusual}
+        usual = {name: e for name, e in result.mined.estimates.items() if name not in unusual}
         own[result.drive] = Measured(result.drive, usual)
     return _explained(_discovered(candidates))
 
 
-class _Comparison:
-    """The estimates of a drive that changed for the worse, and the names of those that are unusual."""
-
-    def __init__(self, result: DriveResult, earlier: Sequence[Measured], fleet: Sequence[Measured]) -> None:
-        self.findings: list[Finding] = []
-        self.unusual: set[str] = set()
-        for name, estimate in sorted(result.mined.estimates.items()):
-            # A result may be of another version of the analysis.
-            parameter = PARAMETERS.get(name)
-            expected = parameter and _expected(parameter, earlier, fleet)
-            if parameter and expected:
-                self._compare(result, parameter, estimate, *expected)
-
-    def _compare(
-        self, result: DriveResult, parameter: Parameter, found: Estimate, expected: Baseline, whose: str
-    ) -> None:
-        effect, p_up, p_down = expected.change(found)
-        p = {"up": p_up, "down": p_down, "either": 2 * min(p_up, p_down)}[parameter.worse]
+def _changes(
+    result: DriveResult, earlier: Sequence[Measured], fleet: Sequence[Measured]
+) -> tuple[list[Finding], set[str]]:
+    """The estimates of a drive that changed, and the names of those that are unusual."""
+    findings: list[Finding] = []
+    unusual: set[str] = set()
+    for name, found in sorted(result.mined.estimates.items()):
+        # A result may be of another version of the analysis.
+        parameter = PARAMETERS.get(name)
+        expected = parameter and _expected(parameter, earlier, fleet)
+        if not parameter or not expected:
+            continue
+        usual, whose = expected
+        effect, p_up, p_down = usual.change(found)
         if min(p_up, p_down) < _UNUSUAL:
-            self.unusual.add(parameter.name)
+            unusual.add(name)
         if parameter.kind:
-            finding = _of_parameter(result, parameter, changed(parameter, found, expected, whose))
-            self.findings.append(
-                replace(
-                    finding,
-                    effect=rounded(effect),
-                    baseline=rounded(expected.interval(found.unit)),
-                    p=p,
-                )
-            )
+            text, at = changed(parameter, found, usual, whose), usual.interval(found.unit)
+            p = _chance(parameter, p_up, p_down)
+            findings.append(_of_parameter(result, parameter, text, effect=effect, baseline=at, p=p))
+    return findings, unusual
+
+
+def _chance(parameter: Parameter, p_up: float, p_down: float) -> float:
+    """The chance of such a change for the worse."""
+    return {"up": p_up, "down": p_down, "either": 2 * min(p_up, p_down)}[parameter.worse]
 
 
 def _expected(
@@ -209,21 +205,17 @@ def _trends(result: DriveResult, earlier: Sequence[Measured]) -> Iterable[Findin
             [one.estimates[name].value for one in having],
             newest.unit,
         )
-        p = {"up": found.p_up, "down": found.p_down, "either": 2 * min(found.p_up, found.p_down)}
         slope, low, high, _ = found.per_day
         effect = Estimate(slope * found.days, low * found.days, high * found.days, newest.unit)
-        finding = _of_parameter(result, parameter, trending(parameter, newest, effect, found.days))
-        at = having[0].estimates[name]
-        yield replace(
-            finding,
-            subject=f"{name}_trend",
-            effect=rounded(effect),
-            baseline=rounded(at),
-            p=min(1.0, p[parameter.worse]),
-        )
+        text, at = trending(parameter, newest, effect, found.days), having[0].estimates[name]
+        p = min(1.0, _chance(parameter, found.p_up, found.p_down))
+        finding = _of_parameter(result, parameter, text, effect=effect, baseline=at, p=p)
+        yield replace(finding, subject=f"{name}_trend")
 
 
-def _of_parameter(result: DriveResult, parameter: Parameter, text: str) -> Finding:
+def _of_parameter(
+    result: DriveResult, parameter: Parameter, text: str, *, effect: Estimate, baseline: Estimate, p: float
+) -> Finding:
     return Finding(
         drive=result.drive,
         kind=parameter.kind,
@@ -234,6 +226,9 @@ def _of_parameter(result: DriveResult, parameter: Parameter, text: str) -> Findi
         stream=result.vesc,
         fields=parameter.fields,
         text=text,
+        effect=rounded(effect),
+        baseline=rounded(baseline),
+        p=p,
     )
 
 
