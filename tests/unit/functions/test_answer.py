@@ -56,9 +56,9 @@ def ask(body=None, **changes):
     return Ask(**{"id": ID, "sent_us": NOW_US, "valid_ms": 5_000, "body": body or {}, **changes})
 
 
-def event(asked, robot="car", name="echo"):
+def event(asked, robot="car", name="echo", received_s=0):
     message = asked if isinstance(asked, bytes) else encode_ask(asked)
-    return rule_event(message, build_topic(ASK, robot, name), NOW_MS)
+    return rule_event(message, build_topic(ASK, robot, name), NOW_MS + 1000 * received_s)
 
 
 @pytest.fixture(autouse=True)
@@ -125,15 +125,9 @@ def test_the_quota_is_a_robots_own_and_new_each_hour(serve, dynamodb):
     assert [serve(ask({"n": n})) for n in range(2)] == [{"n": 0}, {"n": 1}]
     assert serve(ask()).reason == OVER_QUOTA
     assert serve(ask({"n": 1}), robot="car2") == {"n": 1}
-    assert answer_at(serve, NOW_S + 3600) == {"n": 3}
-
-
-def answer_at(serve, now_s):
-    """The answer to a question that the rule received at this time."""
-    asked = encode_ask(ask({"n": 3}, sent_us=int(now_s * 1e6)))
-    received = rule_event(asked, build_topic(ASK, "car", "echo"), int(now_s * 1000))
-    answer.serve(received, ARN, serve.desk, now_s)
-    return serve.said[-1][1].body
+    assert serve(ask({"n": 3}, sent_us=NOW_US + 3_600_000_000), now_s=NOW_S + 3600, received_s=3600) == {
+        "n": 3
+    }
 
 
 def test_an_unregistered_robot_is_not_answered(serve, dynamodb):
@@ -161,10 +155,6 @@ def test_a_late_question_costs_no_quota(serve):
     assert serve(ask({"n": 1})) == {"n": 1}
 
 
-def text(size):
-    return "x" * size
-
-
 def uploaded(s3, content, name="ask/track.json", robot="car"):
     """The file of a body, as the agent's upload leaves it."""
     sha256 = hashlib.sha256(content).hexdigest()
@@ -174,7 +164,7 @@ def uploaded(s3, content, name="ask/track.json", robot="car"):
 
 
 def test_a_large_body_is_a_file_both_ways(serve, s3):
-    body = {"text": text(MAX_INLINE_BYTES)}
+    body = {"text": "x" * MAX_INLINE_BYTES}
     found = serve(ask(uploaded(s3, json.dumps(body).encode())))
     assert found.place.startswith(f"https://{FILES}.s3.eu-west-1.amazonaws.com/results/ask/car/{ID}.json?")
     stored = s3.get_object(Bucket=FILES, Key=f"results/ask/car/{ID}.json")["Body"].read()
@@ -183,21 +173,14 @@ def test_a_large_body_is_a_file_both_ways(serve, s3):
 
 
 def test_too_large_a_question_or_answer_is_refused(serve, s3):
-    assert serve(ask({"text": text(MAX_INLINE_BYTES)})).reason == TOO_LARGE
-    huge = uploaded(s3, json.dumps({"text": text(ECHO.max_question_bytes)}).encode())
+    assert serve(ask({"text": "x" * MAX_INLINE_BYTES})).reason == TOO_LARGE
+    huge = uploaded(s3, json.dumps({"text": "x" * ECHO.max_question_bytes}).encode())
     assert serve(ask(huge)).reason == TOO_LARGE
-    serve.work = lambda *_: {"text": text(ECHO.max_answer_bytes)}
+    serve.work = lambda *_: {"text": "x" * ECHO.max_answer_bytes}
     assert serve(ask()).reason == TOO_LARGE
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"robot": "car2"},
-        {"name": "notes.json"},
-        {"content": b"no JSON"},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"robot": "car2"}, {"name": "notes.json"}, {"content": b"no JSON"}])
 def test_a_file_that_is_not_the_robots_own_question_is_refused(serve, s3, wrong):
     given = {"content": b"{}", **wrong}
     assert serve(ask(uploaded(s3, **given))).reason == INVALID
@@ -282,9 +265,8 @@ def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
         "both": (2.0, "0000000002000000"),
     }
     assert answer.handler({**asked, "robot": "car2"}, Context)["refused"] == NO_DATA
-    nothing = AnalysedDrive(
-        DriveKey("car3", 1, "00c0ffee"), 2, "nightly", 1, {}, {"mass": "16 s are too short"}, {}
-    )
+    missing = {"mass": "16 s are too short"}
+    nothing = AnalysedDrive(DriveKey("car3", 1, "00c0ffee"), 2, "nightly", 1, {}, missing, {})
     FindingsTable(deployed, FINDINGS).put_drive(nothing)
     refused = answer.handler({**asked, "robot": "car3"}, Context)
     assert (refused["refused"], "16 s are too short" in str(refused)) == (NO_DATA, True)
@@ -314,8 +296,7 @@ def test_the_raceline_uses_the_questions_limits_then_the_calibration_then_defaul
     assert set(lengths) == {"s_m", "x_m", "y_m", "offset_m", "curvature_1pm", "speed_mps", "time_s"}
     assert len(set(lengths.values())) == 1
     assert len(json.dumps(found)) < MAX_INLINE_BYTES
-    columns = vars(parse_track(HALL))
-    as_lists = {name: list(values) for name, values in columns.items()}
+    as_lists = {name: list(values) for name, values in vars(parse_track(HALL)).items()}
     assert raceline(track=as_lists, car={"grip": 0.5})["body"] == found
 
 

@@ -10,7 +10,7 @@ from botocore.exceptions import ClientError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from functions import alert, echo, presence
+from functions import presence
 from functions.quarantine import Entry, Store, Stream, entries, process
 from functions.shared.queues import DeadLetterQueue, Refused, message
 from iort_contract.catalog.rules import RULES
@@ -36,11 +36,12 @@ from iort_contract.tables import (
     ROBOT,
     TOPIC,
 )
-from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
+from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, RECORD, RULE, SHADOW, build_topic
 from testkit.dynamodb import QUARANTINE, TOPIC_OF_CAR
 from tests.rule_sql import evaluate
 from verify.lab import spoofed
 
+REFUSAL = "DynamoDBv2Action: The provided key element does not match the schema"
 RAW = b"\xff\x00not JSON, not even text"
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
 STREAM_ARN = "arn:aws:dynamodb:eu-west-1:0:table/telemetry/stream/1"
@@ -55,6 +56,7 @@ INFO = {
 
 def rule_error(payload=RAW, topic=TOPIC_OF_CAR, **changes):
     """As IoT Core's "Rule error handling" shows it."""
+    action, error = REFUSAL.split(": ")
     return json.dumps(
         {
             "ruleName": "iort_record",
@@ -62,13 +64,7 @@ def rule_error(payload=RAW, topic=TOPIC_OF_CAR, **changes):
             "cloudwatchTraceId": "7e146a2c",
             "clientId": "car",
             "base64OriginalPayload": base64.b64encode(payload).decode(),
-            "failures": [
-                {
-                    "failedAction": "DynamoDBv2Action",
-                    "failedResource": "telemetry",
-                    "errorMessage": "The provided key element does not match the schema",
-                }
-            ],
+            "failures": [{"failedAction": action, "failedResource": "telemetry", "errorMessage": error}],
             **changes,
         }
     )
@@ -111,7 +107,6 @@ LIVE_EVENT = {"topic": build_topic("live", "car", "vesc"), "v": 9}
 RULE_RECORD, INVOKED = f"{BY_RULE} iort_record", f"{BY_FUNCTION} iort-processing-Live-1"
 PREFIX, LEFT = "$aws/rules/iort_record/", "RetryAttemptsExhausted; the records have left the stream"
 EXHAUSTED = "Lambda 2 failed: RetryAttemptsExhausted"
-REFUSAL = "DynamoDBv2Action: The provided key element does not match the schema"
 
 
 def said(topic, robot, source=BY_STREAM, reason=REFUSAL):
@@ -161,27 +156,11 @@ def _content(payload):
     return json.loads(payload.decode("utf-8", "surrogatepass"))
 
 
+FORMS = ("base64OriginalPayload", "base64Item", "reason", "ruleName", "failures")
+FORMS += ("requestPayload", "requestContext", "DDBStreamBatchInfo")
 documents = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(max_size=10),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(
-            st.sampled_from(
-                [
-                    "base64OriginalPayload",
-                    "base64Item",
-                    "reason",
-                    "ruleName",
-                    "failures",
-                    "requestPayload",
-                    "requestContext",
-                    "DDBStreamBatchInfo",
-                ]
-            ),
-            inner,
-            max_size=4,
-        )
-    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(FORMS), inner, max_size=4),
     max_leaves=10,
 )
 
@@ -329,6 +308,10 @@ def test_the_records_of_a_failed_batch_are_read_after_empty_pages(empty):
     assert [record["dynamodb"]["SequenceNumber"] for record in found] == ["2", "3"]
 
 
+def test_expired_records_read_as_an_empty_list():
+    assert Stream(FakeStreams(trimmed=True)).records(INFO) == []
+
+
 def test_a_batch_that_is_read_only_in_part_stays_in_the_queue(dynamodb, store):
     answer = process(sqs_event(failed_batch()), store, Stream(FakeStreams(ends_at=3)).records)
     assert answer == {"batchItemFailures": [{"itemIdentifier": "m0"}]}
@@ -345,17 +328,9 @@ def test_a_message_larger_than_an_item_is_cut(dynamodb, store):
     assert item["reason"]["S"].endswith("no batch")
 
 
-def test_expired_records_read_as_an_empty_list():
-    assert Stream(FakeStreams(trimmed=True)).records(INFO) == []
-
-
 class FakeQueue:
     def __init__(self, refuses=(), *, throttled=False):
         self.refuses, self.throttled, self.calls = refuses, throttled, []
-
-    @property
-    def bodies(self):
-        return [body for call in self.calls for body in call]
 
     def send_message_batch(self, *, QueueUrl, Entries):
         assert QueueUrl == "queue"
@@ -380,16 +355,14 @@ def test_refused_records_are_sent_in_calls_within_the_limits_of_sqs():
     assert DeadLetterQueue(queue, queue_url="queue").refuse([]) == []
 
 
-def test_records_that_a_throttled_queue_does_not_take_are_returned():
+@pytest.mark.parametrize("throttled", [False, True])
+def test_records_that_the_queue_does_not_take_are_returned(throttled):
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(12)]
-    assert DeadLetterQueue(FakeQueue(throttled=True), queue_url="queue").refuse(refused) == refused
-
-
-def test_records_that_the_queue_does_not_take_are_returned():
-    refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(3)]
-    queue = FakeQueue(refuses={"reason 1"})
-    assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == [refused[1]]
-    assert [json.loads(body)["reason"] for body in queue.bodies] == ["reason 0", "reason 2"]
+    queue = FakeQueue(refuses={"reason 1", "reason 11"}, throttled=throttled)
+    left = refused if throttled else [refused[1], refused[11]]
+    assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == left
+    taken = [one.reason for one in refused if one not in left]
+    assert [json.loads(body)["reason"] for call in queue.calls for body in call] == taken
 
 
 def test_a_record_too_large_for_a_queue_is_sent_as_its_key():
@@ -483,35 +456,9 @@ def test_a_batch_without_nonfinite_is_stored_without_it():
     assert decode_item(item)[1] == decode_batch(message)
 
 
-def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time():
-    event = of_rule("echo", WHOSE["echo"], spoofed(PING_MESSAGE, "b", PING, LAMBDA))
-    topic, payload = echo.pong(event)
-    assert topic == build_topic(PONG, "a", LAMBDA)
-    assert decode_pong(payload) == (7, T_US, NOW_MS)
-    assert json.loads(payload) == {**json.loads(PING_MESSAGE), RECEIVED_MS: NOW_MS}
-
-
 def test_the_rules_pong_has_the_clouds_time():
     answer = of_rule("pong", WHOSE["pong"], spoofed(PING_MESSAGE, "b", PING, RULE))
     assert decode_pong(json.dumps(answer)) == (7, T_US, NOW_MS)
-
-
-@pytest.mark.parametrize("rule", ["fault", "battery"])
-def test_an_alert_names_the_robot_of_the_topic(rule):
-    event = of_rule(rule, WHOSE[rule], spoofed(LIVE_MESSAGE, "b", LIVE, "vesc"))
-    told = []
-
-    class Everything:
-        def take(self, robot, _key, _now_s):
-            return robot == "a"
-
-    def notify(*mail):
-        told.append(mail)
-
-    alert.process(event, 10.5, Everything(), notify, NOW_MS // 1000)
-    ((subject, text),) = told
-    assert subject.startswith("iort: a, ")
-    assert "2023-11-14 22:13:20 UTC" in text
 
 
 def test_a_version_belongs_to_the_robot_of_the_shadows_topic():

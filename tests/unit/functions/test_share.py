@@ -390,27 +390,23 @@ def measured_batch(columns, *, times_us=None):
 
 def test_the_worst_values_of_a_drive_are_measured():
     first = measured_batch({"voltage_input": [12.1, 11.9], "temp_fet": [40.0, 41.5], "fault_code": [0, 5]})
-    second = measured_batch(
-        {"voltage_input": [11.2, 11.6], "temp_fet": [0.0, 39.0], "temp_motor": [55.5, None]}
-    )
-    measured = measure("vesc", [first, second])
-    assert measured == {
-        "SampleGaps": 0,
-        "FaultSamples": 1,
-        "BatteryVolts": [11.2],
-        "TemperatureDegC": [55.5],
-    }
+    hot = {"voltage_input": [11.2, 11.6], "temp_fet": [0.0, 39.0], "temp_motor": [55.5, None]}
+    measured = measure("vesc", [first, measured_batch(hot)])
+    worst = {"BatteryVolts": [11.2], "TemperatureDegC": [55.5]}
+    assert measured == {"SampleGaps": 0, "FaultSamples": 1, **worst}
 
 
-def test_unmeasured_values_are_not_counted():
+@pytest.mark.parametrize(
+    ("stream", "columns"),
+    [
+        ("vesc", {"voltage_input": [0.0, None], "temp_fet": [0, 0]}),
+        ("vesc", {"voltage_input": [0.0], "temp_motor": [-273.15], "temp_fet": [-57]}),
+        ("imu", {"x": [1.0], "fault_code": ["odd"], "voltage_input": [True]}),
+    ],
+)
+def test_unmeasured_values_are_not_counted(stream, columns):
     nothing = {"SampleGaps": 0, "FaultSamples": 0, "BatteryVolts": [], "TemperatureDegC": []}
-    assert measure("vesc", [measured_batch({"voltage_input": [0.0, None], "temp_fet": [0, 0]})]) == nothing
-    cold = {"voltage_input": [0.0], "temp_motor": [-273.15], "temp_fet": [-57]}
-    assert measure("vesc", [measured_batch(cold)]) == nothing
-    assert (
-        measure("imu", [measured_batch({"x": [1.0], "fault_code": ["odd"], "voltage_input": [True]})])
-        == nothing
-    )
+    assert measure(stream, [measured_batch(columns)]) == nothing
 
 
 def test_a_hole_is_a_gap():
@@ -420,11 +416,8 @@ def test_a_hole_is_a_gap():
 
 def test_round_trips_and_the_agents_own_figures_are_measured():
     rtt = measured_batch({"broker_ms": [12.0, None], "rule_ms": [None, 31.5], "lambda_ms": [None, None]})
-    assert measure(RTT_STREAM, [rtt]) == {
-        "RoundTripBrokerMs": [12.0],
-        "RoundTripRuleMs": [31.5],
-        "RoundTripLambdaMs": [],
-    }
+    figures = {"RoundTripBrokerMs": [12.0], "RoundTripRuleMs": [31.5], "RoundTripLambdaMs": []}
+    assert measure(RTT_STREAM, [rtt]) == figures
     agent = measured_batch({"backlog_batches": [0, 7], "thread_errors": [0, 2]})
     assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0], "ThreadErrors": 2}
 
@@ -438,13 +431,7 @@ def test_several_robots_share_one_log_line_without_loss_of_values():
     one = {"SampleGaps": 1, "FaultSamples": 0, "BatteryVolts": [11.2], "TemperatureDegC": []}
     rtt = {"RoundTripBrokerMs": [5.0] * 3}
     (line,) = together([one, {**one, "BatteryVolts": [12.0]}, rtt])
-    assert line == {
-        "SampleGaps": 2,
-        "FaultSamples": 0,
-        "BatteryVolts": [11.2, 12.0],
-        "TemperatureDegC": [],
-        "RoundTripBrokerMs": [5.0] * 3,
-    }
+    assert line == {**one, "SampleGaps": 2, "BatteryVolts": [11.2, 12.0], **rtt}
     many = list(together({**one, "BatteryVolts": [float(n)]} for n in range(MOST_VALUES + 1)))
     assert [len(line["BatteryVolts"]) for line in many] == [MOST_VALUES, 1]
     assert sum(line.get("SampleGaps", 0) for line in many) == MOST_VALUES + 1
