@@ -13,7 +13,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_analysis import AnalysisError
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_station.cli.options import CloudOptions, say
+from iort_station.cli.options import CloudOptions, option, say
 from iort_station.cli.verbs import Verbs
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError, UsageError
@@ -43,27 +43,22 @@ def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by po
 @app.callback()
 def _cloud_options(
     context: typer.Context,
-    namespace: Annotated[str, typer.Option(help="The deployment's namespace.")] = DEFAULT_NAMESPACE,
-    profile: Annotated[str | None, typer.Option(help="AWS profile.")] = None,
-    region: Annotated[str | None, typer.Option(help="AWS region.")] = None,
+    namespace: Annotated[str, option("The deployment's namespace.")] = DEFAULT_NAMESPACE,
+    profile: Annotated[str | None, option("AWS profile.")] = None,
+    region: Annotated[str | None, option("AWS region.")] = None,
     local: Annotated[
-        bool,
-        typer.Option(
-            "--local", help="Use the embedded cloud; the default if one runs and no AWS option is given."
-        ),
+        bool, option("Use the embedded cloud; the default if one runs and no AWS option is given.", "--local")
     ] = False,
     embedded: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            f"The file of an embedded cloud. Default: {EMBEDDED} in this folder or one above, or else "
+            "that of `make up`.",
             envvar=EMBEDDED_VARIABLE,
-            help=(
-                f"The file of an embedded cloud. Default: {EMBEDDED} in this folder or one above, or else "
-                "that of `make up`."
-            ),
         ),
     ] = None,
     _version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+        bool, option("Print the version.", "--version", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     context.obj = CloudOptions(namespace, profile, region, local, embedded)

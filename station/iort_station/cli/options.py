@@ -187,60 +187,54 @@ def say_archived(archived: Archived | None) -> None:
         say(f"{hours} from the archive, {iso_s(archived['from_us'])} to {iso_s(archived['to_us'])}")
 
 
-Robot = Annotated[str, typer.Argument(help="The robot's name.", autocompletion=robots)]
-Stream = Annotated[str, typer.Argument(help="The stream, for example vesc.", autocompletion=streams)]
-OneRobot = Annotated[str | None, typer.Option("--robot", help="Only this robot.", autocompletion=robots)]
+def option(text: str, *names: str, **how: Any) -> Any:
+    """An option of a verb, with its help; its names are made of the parameter's unless given."""
+    return typer.Option(*names, help=text, **how)
+
+
+def argument(text: str, **how: Any) -> Any:
+    """An argument of a verb, with its help."""
+    return typer.Argument(help=text, **how)
+
+
+Robot = Annotated[str, argument("The robot's name.", autocompletion=robots)]
+Stream = Annotated[str, argument("The stream, for example vesc.", autocompletion=streams)]
+OneRobot = Annotated[str | None, option("Only this robot.", "--robot", autocompletion=robots)]
 Fields = Annotated[
     str | None,
-    typer.Option(
+    option(
+        f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived.",
         "--fields",
-        help=f"Only these fields, separated by commas; {' and '.join(DERIVED)} are derived.",
         autocompletion=fields,
     ),
 ]
-Where = Annotated[
-    str | None, typer.Option("--where", help="Filter, for example 'speed_mps > 1.2 and fault_code == 0'.")
-]
-Every = Annotated[str | None, typer.Option("--every", help="Combine samples: 100ms, 1s, 1m.")]
+Where = Annotated[str | None, option("Filter, for example 'speed_mps > 1.2 and fault_code == 0'.", "--where")]
+Every = Annotated[str | None, option("Combine samples: 100ms, 1s, 1m.", "--every")]
 From = Annotated[
     str | None,
-    typer.Option(
-        "--from", help="Start time: -10m, 20:04, 2026-05-04T10:00:00Z. With --to alone: the beginning."
-    ),
+    option("Start time: -10m, 20:04, 2026-05-04T10:00:00Z. With --to alone: the beginning.", "--from"),
 ]
-To = Annotated[str | None, typer.Option("--to", help="End time (exclusive). With --from alone: now.")]
-Last = Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d; or all.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. A script must give it.")]
+To = Annotated[str | None, option("End time (exclusive). With --from alone: now.", "--to")]
+Last = Annotated[str | None, option("The time up to now: 5m, 2h, 7d; or all.", "--last")]
+AsJson = Annotated[bool, option("Print JSON.", "--json")]
+DryRun = Annotated[bool, option("Only say what would be done.", "--dry-run")]
+Force = Annotated[bool, option("Overwrite what is there.", "--force")]
+Yes = Annotated[bool, option("Do not ask. A script must give it.", "--yes")]
 State = Annotated[
     Path | None,
-    typer.Option(
-        envvar="IORT_STATE", metavar="FOLDER", help="The state folder of `make up`. Default: the user's own."
-    ),
+    option("The state folder of `make up`. Default: the user's own.", envvar="IORT_STATE", metavar="FOLDER"),
 ]
-Token = Annotated[
-    str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token for reading, if needed.")
-]
+Token = Annotated[str, option("PubNub's access token for reading, if needed.", envvar="PUBNUB_ACCESS_TOKEN")]
 LiveWay = Annotated[
     Literal["pubnub", "iot"] | None,
-    typer.Option(
-        "--live", help="The way of live messages: PubNub, or AWS IoT's own. Default: the deployment's."
-    ),
+    option("The way of live messages: PubNub, or AWS IoT's own. Default: the deployment's.", "--live"),
 ]
 TrackFile = Annotated[
-    Path | None,
-    typer.Option("--track", metavar="FILE", help="A CSV file of the cars' track, which the page shows."),
+    Path | None, option("A CSV file of the cars' track, which the page shows.", "--track", metavar="FILE")
 ]
 
 # The range of a verb that would otherwise read years.
 SHORT = "5m"
-
-
-def to_file(help_text: str) -> Any:
-    """The option --out, where a verb writes; its help says what."""
-    return typer.Option("--out", "-o", help=help_text)
 
 
 def state_folder(context: typer.Context, state: Path | None) -> Path:

@@ -87,9 +87,7 @@ def trajectory(runs: Sequence[Run]) -> Figure:
     return _finished(figure, runs, f"ring: start, dot: end{note}")
 
 
-def _tracks(
-    runs: Sequence[Run],
-) -> tuple[list[tuple[Any, Any]], tuple[str, str], str]:
+def _tracks(runs: Sequence[Run]) -> tuple[list[tuple[Any, Any]], tuple[str, str], str]:
     """Each run's x and y in metres, the names of the axes, and a note for the title."""
     fields = [position_of(run.result) for run in runs]
     if len({each.degrees for each in fields}) > 1:
@@ -213,10 +211,7 @@ def _bins(values: Any) -> int:
 
 
 def _style(i: int) -> dict[str, Any]:
-    return {
-        "color": COLOURS[i % len(COLOURS)],
-        "linestyle": _DASHES[i // len(COLOURS) % len(_DASHES)],
-    }
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": _DASHES[i // len(COLOURS) % len(_DASHES)]}
 
 
 def _labelled(runs: Sequence[Run], field: str) -> str:

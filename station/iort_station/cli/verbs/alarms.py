@@ -13,8 +13,9 @@ from rich.text import Text
 
 from iort_contract.messages.page import AlarmEntry
 from iort_contract.tables import NO_ROBOT
+from iort_station.cli import options
 from iort_station.cli.console import Lines, bar, errors, out, print_json
-from iort_station.cli.options import AsJson, DryRun, OneRobot, Range, When, examples, ranged, say
+from iort_station.cli.options import AsJson, DryRun, OneRobot, Range, When, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -35,11 +36,11 @@ _MORE = {
 @commands.command("alarms", epilog=examples("alarms", "alarms --all"))
 def alarms_(
     context: typer.Context,
-    every: Annotated[bool, typer.Option("--all", help="Also the alarms that are not raised.")] = False,
+    every: Annotated[bool, option("Also the alarms that are not raised.", "--all")] = False,
     acknowledge: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Note that somebody has seen this alarm.")
+        str | None, option("Note that somebody has seen this alarm.", metavar="NAME")
     ] = None,
-    by: Annotated[str, typer.Option(help="Who has seen it. Default: this machine's user.")] = "",
+    by: Annotated[str, option("Who has seen it. Default: this machine's user.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """List the raised alarms: since when, what they mean and what to do."""
@@ -60,7 +61,7 @@ def alarms_(
     for alarm in shown:
         _print(alarm)
     if not raised:
-        say(f"none of {len(found)} alarms is raised")
+        options.say(f"none of {len(found)} alarms is raised")
 
 
 def _print(alarm: AlarmEntry) -> None:
@@ -102,9 +103,7 @@ _HEX_WIDTH = 16
 def errors_(
     context: typer.Context,
     when: When,
-    entry_id: Annotated[
-        str | None, typer.Argument(metavar="ID", help="Show this message with its bytes.")
-    ] = None,
+    entry_id: Annotated[str | None, argument("Show this message with its bytes.", metavar="ID")] = None,
     robot: OneRobot = None,
     as_json: AsJson = False,
 ) -> None:
@@ -206,7 +205,7 @@ def replay_errors(
     robot: OneRobot = None,
     dry_run: DryRun = False,
     again: Annotated[
-        bool, typer.Option("--again", help=f"Also messages replayed {quarantine.MAX_REPLAYS} times already.")
+        bool, option(f"Also messages replayed {quarantine.MAX_REPLAYS} times already.", "--again")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -30,7 +30,7 @@ from iort_contract.messages.analysis import (
 from iort_contract.page import history_link
 from iort_station.cli import options
 from iort_station.cli.console import errors, out, print_json, tell
-from iort_station.cli.options import AsJson, Robot, When, examples, ranged, say
+from iort_station.cli.options import AsJson, Robot, When, argument, examples, option, ranged, say
 from iort_station.cloud import Cloud
 from iort_station.data import findings
 from iort_station.data import findings as stored
@@ -51,14 +51,11 @@ def analyse(
     context: typer.Context,
     when: When,
     robots: Annotated[
-        list[str] | None,
-        typer.Argument(help="The robots.", autocompletion=options.robots, show_default=False),
+        list[str] | None, argument("The robots.", autocompletion=options.robots, show_default=False)
     ] = None,
-    fleet: Annotated[bool, typer.Option("--fleet", help="Every registered robot.")] = False,
-    new: Annotated[bool, typer.Option("--new", help="Only drives that have not been analysed.")] = False,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Wait for the findings, and show how far it is.")
-    ] = False,
+    fleet: Annotated[bool, option("Every registered robot.", "--fleet")] = False,
+    new: Annotated[bool, option("Only drives that have not been analysed.", "--new")] = False,
+    wait: Annotated[bool, option("Wait for the findings, and show how far it is.", "--wait")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Analyse the drives of robots in the cloud, as it does every night.
@@ -162,18 +159,17 @@ def findings_(
     context: typer.Context,
     when: When,
     robot: Annotated[
-        str | None,
-        typer.Argument(help="The robot. Default: all.", autocompletion=options.robots, show_default=False),
+        str | None, argument("The robot. Default: all.", autocompletion=options.robots, show_default=False)
     ] = None,
     drives: Annotated[
-        bool, typer.Option("--drives", help="List the analysed drives, and what could not be computed.")
+        bool, option("List the analysed drives, and what could not be computed.", "--drives")
     ] = False,
-    count: Annotated[int, typer.Option(min=1, max=10_000, help="The most to list; the newest.")] = 50,
+    count: Annotated[int, option("The most to list; the newest.", min=1, max=10_000)] = 50,
     page: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "The page for the links, such as http://localhost:8080/. Default: the embedded cloud's.",
             metavar="URL",
-            help="The page for the links, such as http://localhost:8080/. Default: the embedded cloud's.",
             show_default=False,
         ),
     ] = None,
@@ -286,14 +282,12 @@ def note(
     robot: Robot,
     when: When,
     text: Annotated[
-        str | None, typer.Argument(help=f"The note, at most {MAX_NOTE_CHARACTERS} characters. Default: list.")
+        str | None, argument(f"The note, at most {MAX_NOTE_CHARACTERS} characters. Default: list.")
     ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="TIME", help="The time that it is about. Default: now.")
-    ] = None,
-    by: Annotated[str | None, typer.Option(help="Who writes it. Default: you.")] = None,
-    remove: Annotated[str | None, typer.Option(metavar="ID", help="Delete the note of this id.")] = None,
-    count: Annotated[int, typer.Option(min=1, max=10_000, help="The most to list; the newest.")] = 50,
+    at: Annotated[str | None, option("The time that it is about. Default: now.", metavar="TIME")] = None,
+    by: Annotated[str | None, option("Who writes it. Default: you.")] = None,
+    remove: Annotated[str | None, option("Delete the note of this id.", metavar="ID")] = None,
+    count: Annotated[int, option("The most to list; the newest.", min=1, max=10_000)] = 50,
     as_json: AsJson = False,
 ) -> None:
     """Write a note about a robot, or list its notes, the newest first.

@@ -16,7 +16,7 @@ from iort_contract.tables import ROBOT
 from iort_contract.topics import check_robot, check_stream
 from iort_station.cli import options
 from iort_station.cli.console import Lines, errors, out, print_json
-from iort_station.cli.options import AsJson, Range, When, examples, ranged, say_archived
+from iort_station.cli.options import AsJson, Range, When, argument, examples, option, ranged, say_archived
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
@@ -35,27 +35,22 @@ _LISTED = 20
 def audit_(
     context: typer.Context,
     when: When,
-    robot: Annotated[
-        str | None, typer.Argument(help="The robot's name.", autocompletion=options.robots)
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Every registered robot.")] = False,
+    robot: Annotated[str | None, argument("The robot's name.", autocompletion=options.robots)] = None,
+    every: Annotated[bool, option("Every registered robot.", "--all")] = False,
     streams: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "Only this stream; may be repeated. Default: all known.",
             "--stream",
-            help="Only this stream; may be repeated. Default: all known.",
             autocompletion=options.streams,
         ),
     ] = None,
-    late: Annotated[
-        str, typer.Option(help="Count a batch as late if it took so much longer than the fastest.")
-    ] = "5s",
+    late: Annotated[str, option("Count a batch as late if it took so much longer than the fastest.")] = "5s",
     from_start: Annotated[
-        bool, typer.Option("--from-start", help="Count batches before the first stored one as missing.")
+        bool, option("Count batches before the first stored one as missing.", "--from-start")
     ] = False,
     hashes: Annotated[
-        bool,
-        typer.Option("--hashes", help="Also hash what each run recorded, to compare it with another cloud."),
+        bool, option("Also hash what each run recorded, to compare it with another cloud.", "--hashes")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -124,13 +119,7 @@ class _Audited(NamedTuple):
 
 
 def _audit(
-    cloud: Cloud,
-    robot: str,
-    within: Range,
-    streams: list[str] | None,
-    late_us: int,
-    *,
-    from_start: bool,
+    cloud: Cloud, robot: str, within: Range, streams: list[str] | None, late_us: int, *, from_start: bool
 ) -> _Audited:
     # numpy takes longer to load than TAB may take.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above

@@ -23,7 +23,7 @@ from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cli import options
 from iort_station.cli.console import Lines, errors, out, print_json, tell
-from iort_station.cli.options import AsJson, CloudOptions, Robot, examples, say
+from iort_station.cli.options import AsJson, CloudOptions, Robot, argument, examples, option, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import control, registry, stopping
@@ -41,22 +41,20 @@ commands = typer.Typer()
 def send(
     context: typer.Context,
     robot: Robot,
-    name: Annotated[str, typer.Argument(help="The command: a key of downlink.cmd in the robot's car.yaml.")],
-    message: Annotated[str, typer.Argument(help="The ROS message as JSON, with the fields of its type.")],
+    name: Annotated[str, argument("The command: a key of downlink.cmd in the robot's car.yaml.")],
+    message: Annotated[str, argument("The ROS message as JSON, with the fields of its type.")],
     lease_ms: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=MAX_LEASE_MS, help="How long the robot may move, from now; needed if it moves."
-        ),
+        option("How long the robot may move, from now; needed if it moves.", min=1, max=MAX_LEASE_MS),
     ] = None,
     valid_ms: Annotated[
-        int, typer.Option(min=1, max=MAX_VALID_MS, help="The robot rejects it if it arrives later than this.")
+        int, option("The robot rejects it if it arrives later than this.", min=1, max=MAX_VALID_MS)
     ] = fleet_commands.VALID_MS,
     seconds: Annotated[
-        float, typer.Option(min=0, help="How long to wait for the robot's answer.")
+        float, option("How long to wait for the robot's answer.", min=0)
     ] = fleet_commands.ANSWER_S,
     takeover: Annotated[
-        bool, typer.Option("--takeover", help="Take the wheel from whoever drives; refused otherwise.")
+        bool, option("Take the wheel from whoever drives; refused otherwise.", "--takeover")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -122,12 +120,10 @@ _ELSEWHERE = (
 @commands.command("stop", epilog=examples("stop car7", "stop car7 --release", "stop --all --release"))
 def stop(
     context: typer.Context,
-    robots: Annotated[
-        list[str] | None, typer.Argument(help="The robots' names.", autocompletion=options.robots)
-    ] = None,
-    everyone: Annotated[bool, typer.Option("--all", help="Every robot of the registry.")] = False,
-    release: Annotated[bool, typer.Option("--release", help="Let them move again.")] = False,
-    seconds: Annotated[float, typer.Option(min=0, help="How long to wait for the robots.")] = 10.0,
+    robots: Annotated[list[str] | None, argument("The robots' names.", autocompletion=options.robots)] = None,
+    everyone: Annotated[bool, option("Every robot of the registry.", "--all")] = False,
+    release: Annotated[bool, option("Let them move again.", "--release")] = False,
+    seconds: Annotated[float, option("How long to wait for the robots.", min=0)] = 10.0,
     as_json: AsJson = False,
 ) -> None:
     """Stop robots in an emergency, until --release.
@@ -316,14 +312,12 @@ def config(
     robot: Robot,
     changes: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[NAME=VALUE]...", help="live.rate_hz=5, fields.vesc=speed,fault_code, log_level=debug"
-        ),
+        argument("live.rate_hz=5, fields.vesc=speed,fault_code, log_level=debug", metavar="[NAME=VALUE]..."),
     ] = None,
     unset: Annotated[
-        list[str] | None, typer.Option(help="A setting to withdraw; car.yaml's value applies again.")
+        list[str] | None, option("A setting to withdraw; car.yaml's value applies again.")
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for the robot's answer.")] = 30.0,
+    seconds: Annotated[float, option("How long to wait for the robot's answer.", min=0.1)] = 30.0,
     as_json: AsJson = False,
 ) -> None:
     """Show a robot's settings, or change them and wait for its answer.
@@ -364,12 +358,7 @@ def _change(text: str) -> tuple[str, Any]:
 
 
 def _print(
-    robot: str,
-    state: State,
-    rejected: Mapping[str, Rejection],
-    wanted: Mapping[str, Any],
-    *,
-    as_json: bool,
+    robot: str, state: State, rejected: Mapping[str, Rejection], wanted: Mapping[str, Any], *, as_json: bool
 ) -> None:
     in_force, pending = state.reported.settings, state.pending()
     if as_json:
@@ -394,11 +383,8 @@ def _print(
 def ask(
     context: typer.Context,
     robot: Robot,
-    question: Annotated[str, typer.Argument(help=f"One of {', '.join(QUESTIONS)}.")],
-    body: Annotated[
-        Path | None,
-        typer.Option(help="A JSON file with the body of the question."),
-    ] = None,
+    question: Annotated[str, argument(f"One of {', '.join(QUESTIONS)}.")],
+    body: Annotated[Path | None, option("A JSON file with the body of the question.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Ask the cloud what a robot may ask, and print the answer: indented, or as one line of JSON.

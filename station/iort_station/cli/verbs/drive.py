@@ -39,7 +39,7 @@ from iort_contract.messages.live import (
 )
 from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
 from iort_station.cli.console import out
-from iort_station.cli.options import Robot, examples
+from iort_station.cli.options import Robot, examples, option
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry, stopping
@@ -149,9 +149,9 @@ def drive(
     context: typer.Context,
     robot: Robot,
     max_speed: Annotated[
-        float | None, typer.Option(min=0.01, help="The top speed in m/s; at most the car's own limit.")
+        float | None, option("The top speed in m/s; at most the car's own limit.", min=0.01)
     ] = None,
-    by: Annotated[str | None, typer.Option(help="Who drives, as others see it. Default: the user.")] = None,
+    by: Annotated[str | None, option("Who drives, as others see it. Default: the user.")] = None,
 ) -> None:
     """Drive a car by the keys of this terminal, until q.
 

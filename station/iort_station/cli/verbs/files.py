@@ -15,7 +15,7 @@ from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_station.cli import console, options
 from iort_station.cli.console import bar
-from iort_station.cli.options import AsJson, Force, Range, Robot, When, Yes, agreed, examples, ranged, to_file
+from iort_station.cli.options import AsJson, Force, Robot, When, Yes, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import files, registry
@@ -26,17 +26,13 @@ commands = typer.Typer(
     name="files", no_args_is_help=True, help="Bags, images and other files that robots have uploaded."
 )
 
-_Name = Annotated[str, typer.Option(help="Only names that match, for example '*.bag'.")]
+_Name = Annotated[str, option("Only names that match, for example '*.bag'.")]
 
 
 @commands.command("list", epilog=examples("files list car7 --name '*.bag' --last 7d"))
 @ranged
 def list_(
-    context: typer.Context,
-    robot: Robot,
-    when: When,
-    name: _Name = "*",
-    as_json: AsJson = False,
+    context: typer.Context, robot: Robot, when: When, name: _Name = "*", as_json: AsJson = False
 ) -> None:
     """List a robot's files in the order of their time.
 
@@ -61,13 +57,10 @@ def get(
     when: When,
     which: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Names or keys; a name means its newest file. Default: all.",
-            autocompletion=options.files,
-        ),
+        argument("Names or keys; a name means its newest file. Default: all.", autocompletion=options.files),
     ] = None,
     name: _Name = "*",
-    out: Annotated[Path, to_file("The folder to write the files into.")] = Path(),
+    out: Annotated[Path, option("The folder to write the files into.", "--out", "-o")] = Path(),
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -105,13 +98,13 @@ def get(
 def empty(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Delete every file of every robot, and the results of queries. Do so before you destroy the stacks."""
     cloud = context.obj.cloud()
-    agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
+    options.agreed(f"Delete every file of the deployment {cloud.namespace}, for good?", yes=yes)
     counts: list[int] = []
     files.empty(cloud, counts.append)
     console.tell({"deleted": sum(counts)}, f"{sum(counts)} deleted", as_json=as_json)
 
 
-def _chosen(cloud: Cloud, robot: str, name: str, within: Range) -> Iterator[StoredFile]:
+def _chosen(cloud: Cloud, robot: str, name: str, within: options.Range) -> Iterator[StoredFile]:
     one = None
     for one in files.listed(cloud, robot, start_us=within.start_us, end_us=within.end_us):
         if fnmatch.fnmatch(one.name, name):

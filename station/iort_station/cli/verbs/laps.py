@@ -13,7 +13,7 @@ from iort_contract.catalog.car import GROUPS
 from iort_contract.messages.analysis import encode_estimate
 from iort_station.cli import console
 from iort_station.cli.console import Lines, out, print_json, reading
-from iort_station.cli.options import AsJson, Force, Robot, When, examples, ranged, say, to_file
+from iort_station.cli.options import AsJson, Force, Robot, When, examples, option, ranged, say
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
 from iort_station.output import check_free
@@ -49,11 +49,9 @@ def laps(
     context: typer.Context,
     robot: Robot,
     when: When,
-    compare: Annotated[
-        tuple[int, int] | None, typer.Option(help="The delta-time of two laps of a run: 3 7.")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, max=1000, help="The most runs to search; the newest.")] = 20,
-    file: Annotated[Path | None, to_file("Draw the comparison: .png, .svg or .pdf.")] = None,
+    compare: Annotated[tuple[int, int] | None, option("The delta-time of two laps of a run: 3 7.")] = None,
+    count: Annotated[int, option("The most runs to search; the newest.", min=1, max=1000)] = 20,
+    file: Annotated[Path | None, option("Draw the comparison: .png, .svg or .pdf.", "--out", "-o")] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -189,7 +187,7 @@ def calibrate(
     context: typer.Context,
     robot: Robot,
     when: When,
-    count: Annotated[int, typer.Option(min=1, max=1000, help="The most drives to use; the newest.")] = 10,
+    count: Annotated[int, option("The most drives to use; the newest.", min=1, max=1000)] = 10,
     as_json: AsJson = False,
 ) -> None:
     """Print the parameters of a robot's car with 90 % intervals, and lines for its vesc.yaml.

@@ -26,7 +26,7 @@ from iort_contract.page import PUBNUB_ORIGIN
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli import options
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, LiveWay, Robot, Token, examples, say
+from iort_station.cli.options import AsJson, LiveWay, Robot, Token, examples, option, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry, viewing
@@ -47,15 +47,10 @@ _RATE_HZ = 1 / _REFRESH_S
 @commands.command("watch", epilog=examples("watch", "watch --json --seconds 5"))
 def watch(
     context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for every update.")] = False,
-    seconds: Annotated[
-        float | None, typer.Option(min=0, help="Stop after this time. Default: never.")
-    ] = None,
+    as_json: Annotated[bool, option("Print a line of JSON for every update.", "--json")] = False,
+    seconds: Annotated[float | None, option("Stop after this time. Default: never.", min=0)] = None,
     rate: Annotated[
-        float,
-        typer.Option(
-            min=LIVE_MIN_RATE_HZ, max=LIVE_MAX_RATE_HZ, help="Updates a second to ask of each stream."
-        ),
+        float, option("Updates a second to ask of each stream.", min=LIVE_MIN_RATE_HZ, max=LIVE_MAX_RATE_HZ)
     ] = _RATE_HZ,
     live: LiveWay = None,
     token: Token = "",
@@ -137,10 +132,10 @@ def trace_(
     context: typer.Context,
     robot: Robot,
     stream: Annotated[
-        str, typer.Option(help="The stream whose live updates to follow.", autocompletion=options.streams)
+        str, option("The stream whose live updates to follow.", autocompletion=options.streams)
     ] = VESC_STREAM,
-    updates: Annotated[int, typer.Option(min=1, help="How many updates to wait for.")] = 50,
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for them at most.")] = 15.0,
+    updates: Annotated[int, option("How many updates to wait for.", min=1)] = 50,
+    seconds: Annotated[float, option("How long to wait for them at most.", min=0.1)] = 15.0,
     live: LiveWay = None,
     as_json: AsJson = False,
 ) -> None:
@@ -158,11 +153,7 @@ def trace_(
 
     way = live or transport(cloud)
     viewer = Viewer(cloud, [robot], broker=way == IOT)
-    with (
-        listening(cloud, way, robot=robot, on_update=take),
-        viewer,
-        errors.status(f"listening to {robot}"),
-    ):
+    with listening(cloud, way, robot=robot, on_update=take), viewer, errors.status(f"listening to {robot}"):
         here_to_pubnub = _pubnub_clock(cloud) if way == PUBNUB else None
         enough.wait(seconds)
     if not found:

@@ -13,7 +13,7 @@ from rich.progress import DownloadColumn, TransferSpeedColumn
 from iort_contract.tables import NO_ROBOT
 from iort_station.cli import options
 from iort_station.cli.console import bar, errors, out, print_json
-from iort_station.cli.options import AsJson, CloudOptions, DryRun, examples, say
+from iort_station.cli.options import AsJson, CloudOptions, DryRun, argument, examples, option, say
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -31,29 +31,22 @@ _DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "403"}
 def move_(
     context: typer.Context,
     to: Annotated[
-        str,
-        typer.Option(metavar="aws|FOLDER", help="An AWS account, or the folder of another embedded cloud."),
+        str, option("An AWS account, or the folder of another embedded cloud.", metavar="aws|FOLDER")
     ],
     names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="ROBOT", help="Default: every robot.", autocompletion=options.robots),
+        list[str] | None, argument("Default: every robot.", metavar="ROBOT", autocompletion=options.robots)
     ] = None,
-    to_profile: Annotated[str | None, typer.Option(help="The AWS profile of --to aws.")] = None,
-    to_region: Annotated[str | None, typer.Option(help="The AWS region of --to aws.")] = None,
+    to_profile: Annotated[str | None, option("The AWS profile of --to aws.")] = None,
+    to_region: Annotated[str | None, option("The AWS region of --to aws.")] = None,
     bundles: Annotated[
-        Path | None,
-        typer.Option(help="Make a certificate for each robot there, in a bundle in this folder."),
+        Path | None, option("Make a certificate for each robot there, in a bundle in this folder.")
     ] = None,
-    with_files: Annotated[
-        bool, typer.Option("--files/--no-files", help="Whether to copy the robots' files.")
-    ] = True,
+    with_files: Annotated[bool, option("Whether to copy the robots' files.", "--files/--no-files")] = True,
     same_robots: Annotated[
-        bool,
-        typer.Option("--same-robots", help="Robots that both sides have registered already are the same."),
+        bool, option("Robots that both sides have registered already are the same.", "--same-robots")
     ] = False,
     units: Annotated[
-        int,
-        typer.Option(min=1, help="Speed in write units of DynamoDB (1 KB) a second. A stream takes 1,000."),
+        int, option("Speed in write units of DynamoDB (1 KB) a second. A stream takes 1,000.", min=1)
     ] = 500,
     dry_run: DryRun = False,
     as_json: AsJson = False,

@@ -9,7 +9,7 @@ import typer
 
 from iort_station import kept
 from iort_station.cli.console import tell
-from iort_station.cli.options import AsJson, LiveWay, Token, TrackFile, Yes, agreed, examples, say
+from iort_station.cli.options import AsJson, LiveWay, Token, TrackFile, Yes, agreed, examples, option, say
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.fleet.roles import transport
@@ -23,17 +23,16 @@ commands = typer.Typer()
 @commands.command("dashboard", epilog=examples("dashboard --port 8080"))
 def dashboard(
     context: typer.Context,
-    port: Annotated[int, typer.Option(help="The page's port; 0 takes a free one.")] = 8080,
+    port: Annotated[int, option("The page's port; 0 takes a free one.")] = 8080,
     host: Annotated[
         str,
-        typer.Option(
-            help="The address to listen on. Whoever reaches it can read the cars' past; "
+        option(
+            "The address to listen on. Whoever reaches it can read the cars' past; "
             "only a page on 127.0.0.1 sends commands."
         ),
     ] = "127.0.0.1",
     name: Annotated[
-        list[str] | None,
-        typer.Option(help="Another name of this server than localhost; may be repeated."),
+        list[str] | None, option("Another name of this server than localhost; may be repeated.")
     ] = None,
     live: LiveWay = None,
     token: Token = "",
@@ -78,7 +77,7 @@ def dashboard(
 @commands.command("invite", epilog=examples("invite", "invite --port 8080"))
 def invite(
     port: Annotated[
-        int | None, typer.Option(help="The page's port, if you serve several. Default: the only one.")
+        int | None, option("The page's port, if you serve several. Default: the only one.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -94,11 +93,10 @@ def invite(
 def pubnub(
     context: typer.Context,
     publish_key: Annotated[
-        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="The publish key. Default: asks for it.")
+        str | None, option("The publish key. Default: asks for it.", envvar="PUBNUB_PUBLISH_KEY")
     ] = None,
     subscribe_key: Annotated[
-        str | None,
-        typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="The subscribe key. Default: asks for it."),
+        str | None, option("The subscribe key. Default: asks for it.", envvar="PUBNUB_SUBSCRIBE_KEY")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -121,13 +119,13 @@ def site(
     context: typer.Context,
     token: Annotated[
         str,
-        typer.Option(
+        option(
+            "PubNub's access token for reading. Everybody who opens the page can read it.",
             envvar="PUBNUB_ACCESS_TOKEN",
-            help="PubNub's access token for reading. Everybody who opens the page can read it.",
         ),
     ] = "",
     remove: Annotated[
-        bool, typer.Option("--remove", help="Empty the bucket instead, before you destroy the stack.")
+        bool, option("Empty the bucket instead, before you destroy the stack.", "--remove")
     ] = False,
     track: TrackFile = None,
     yes: Yes = False,

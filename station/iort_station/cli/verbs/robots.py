@@ -17,19 +17,7 @@ from iort_contract.catalog.derived import F1TENTH
 from iort_contract.messages.commands import NO_MOTION
 from iort_station.cli import options
 from iort_station.cli.console import Console, Lines, errors, out, print_json, reading, tell
-from iort_station.cli.options import (
-    AsJson,
-    Force,
-    From,
-    Last,
-    Robot,
-    When,
-    Yes,
-    agreed,
-    examples,
-    say,
-    to_file,
-)
+from iort_station.cli.options import AsJson, Force, From, Last, Robot, When, Yes, argument, examples, option
 from iort_station.cloud import Cloud
 from iort_station.errors import UsageError
 from iort_station.fleet import control, identity, registry, robots, stopping
@@ -45,12 +33,12 @@ _STOP = (
 )
 _Gain = Annotated[
     float | None,
-    typer.Option(
-        help=f"erpm per m/s (vesc.yaml). Default: {F1TENTH.speed_to_erpm_gain:g} for the page alone.",
+    option(
+        f"erpm per m/s (vesc.yaml). Default: {F1TENTH.speed_to_erpm_gain:g} for the page alone.",
         show_default=False,
     ),
 ]
-_ClaimFolder = Annotated[Path, to_file("The folder to write the claim into.")]
+_ClaimFolder = Annotated[Path, option("The folder to write the claim into.", "--out", "-o")]
 
 
 commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots that may connect.")
@@ -59,8 +47,10 @@ commands = typer.Typer(name="robots", no_args_is_help=True, help="The robots tha
 @commands.command("add", epilog=examples("robots add car8 --out robots"))
 def add(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="The robot's name.")],
-    folder: Annotated[Path, to_file("Where to write the robot's folder of configuration and keys.")] = Path(),
+    name: Annotated[str, argument("The robot's name.")],
+    folder: Annotated[
+        Path, option("Where to write the robot's folder of configuration and keys.", "--out", "-o")
+    ] = Path(),
     speed_to_erpm_gain: _Gain = None,
     as_json: AsJson = False,
 ) -> None:
@@ -81,13 +71,11 @@ def add(
 @commands.command("register", epilog=examples("robots register car20 car21 --days 7"))
 def register(
     context: typer.Context,
-    names: Annotated[list[str], typer.Argument(help="The robots' names.")],
+    names: Annotated[list[str], argument("The robots' names.")],
     serial: Annotated[
-        str | None, typer.Option(help="The serial number of the one machine that may claim the name.")
+        str | None, option("The serial number of the one machine that may claim the name.")
     ] = None,
-    days: Annotated[
-        float, typer.Option(help="How many days the name can be claimed.", min=0)
-    ] = identity.DAYS,
+    days: Annotated[float, option("How many days the name can be claimed.", min=0)] = identity.DAYS,
     speed_to_erpm_gain: _Gain = None,
     as_json: AsJson = False,
 ) -> None:
@@ -103,9 +91,9 @@ def register(
 @commands.command("claim", epilog=examples("robots claim car9 --out claim-car9"))
 def claim(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
+    name: Annotated[str | None, argument("The robot's name; not with --lasting.")] = None,
     folder: _ClaimFolder = Path("claim"),
-    lasting: Annotated[bool, typer.Option(help="Valid until revoked, instead of five minutes.")] = False,
+    lasting: Annotated[bool, option("Valid until revoked, instead of five minutes.")] = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -131,11 +119,11 @@ def rotate(
     name: Robot,
     folder: _ClaimFolder = Path("claim"),
     finish: Annotated[
-        bool, typer.Option("--finish", help="The robot has its new certificate: wait, and revoke the old.")
+        bool, option("The robot has its new certificate: wait, and revoke the old.", "--finish")
     ] = False,
-    wait: Annotated[bool, typer.Option(help="Wait for the robot, then revoke the old certificate.")] = True,
+    wait: Annotated[bool, option("Wait for the robot, then revoke the old certificate.")] = True,
     settled_s: Annotated[
-        float, typer.Option(help="Seconds that the robot must be connected with the new one.", min=0)
+        float, option("Seconds that the robot must be connected with the new one.", min=0)
     ] = identity.SETTLED_S,
     force: Force = False,
     as_json: AsJson = False,
@@ -164,7 +152,7 @@ def rotate(
 @commands.command("revoke-claims", epilog=examples("robots revoke-claims --yes"))
 def revoke_claims(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -> None:
     """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
-    agreed("Revoke every lasting claim?", yes=yes)
+    options.agreed("Revoke every lasting claim?", yes=yes)
     count = identity.revoke_claims(context.obj.cloud())
     tell({"claims_revoked": count}, f"lasting claims revoked: {count}", as_json=as_json)
 
@@ -186,10 +174,9 @@ def tag(
     context: typer.Context,
     name: Robot,
     changes: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="TAG=VALUE", help="Tags to set, for example lab=north team=blue."),
+        list[str] | None, argument("Tags to set, for example lab=north team=blue.", metavar="TAG=VALUE")
     ] = None,
-    remove: Annotated[list[str] | None, typer.Option(help="A tag to remove; may be repeated.")] = None,
+    remove: Annotated[list[str] | None, option("A tag to remove; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show or change a robot's tags. The page finds and groups robots by them."""
@@ -228,18 +215,16 @@ def set_(
     context: typer.Context,
     name: Robot,
     parameters: Annotated[
-        list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{', '.join([*robots.F1TENTH, *KNOWN])}.")
+        list[str], argument(f"{', '.join([*robots.F1TENTH, *KNOWN])}.", metavar="PARAMETER=VALUE")
     ],
     start: From = None,
     last: Last = None,
     also: Annotated[
         list[str] | None,
-        typer.Option(
-            "--stream", help="Another stream with a speed field, unknown by its name; may be repeated."
-        ),
+        option("Another stream with a speed field, unknown by its name; may be repeated.", "--stream"),
     ] = None,
     wait: Annotated[
-        bool, typer.Option(help="Wait a minute first. --no-wait is for a robot that was silent for a minute.")
+        bool, option("Wait a minute first. --no-wait is for a robot that was silent for a minute.")
     ] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -265,7 +250,7 @@ def set_(
     from iort_station.operations import recompute  # noqa: PLC0415 - see above
 
     if wait:
-        say(f"waiting {recompute.SETTLED_S:.0f} s, while Lambda 2 may still use the old parameters")
+        options.say(f"waiting {recompute.SETTLED_S:.0f} s, while Lambda 2 may still use the old parameters")
         recompute.wait_until_settled()
     streams = dict.fromkeys([*recompute.streams(cloud, name, from_us), *(also or ())])
     for stream in streams:
@@ -274,9 +259,9 @@ def set_(
         facts = {"robot": name, "stream": stream, "seconds": done.seconds, "left_out": done.left_out}
         tell(facts, f"{name} {stream}: {done.seconds:,} seconds recomputed", as_json=as_json)
         if done.left_out:
-            say(f"{done.left_out} stored items are in no summary: not a batch, or too many samples")
+            options.say(f"{done.left_out} stored items are in no summary: not a batch, or too many samples")
     if not streams:
-        say(f"{name}: 0 seconds recomputed: no summary has a speed")
+        options.say(f"{name}: 0 seconds recomputed: no summary has a speed")
 
 
 @commands.command("list", epilog=examples("robots list"))
@@ -303,15 +288,11 @@ def list_(context: typer.Context, as_json: AsJson = False) -> None:
         )
     (out if out.is_terminal else Console(width=_PIPE_WIDTH)).print(table)
     if moving := [str(row[tables.ROBOT]) for row in rows if stoppable.get(str(row[tables.ROBOT])) is False]:
-        say(f"an emergency stop does NOT stop {', '.join(moving)}: {NO_MOTION}")
+        options.say(f"an emergency stop does NOT stop {', '.join(moving)}: {NO_MOTION}")
 
 
 @commands.command("show", epilog=examples("robots show car7"))
-def show(
-    context: typer.Context,
-    name: Robot,
-    as_json: AsJson = False,
-) -> None:
+def show(context: typer.Context, name: Robot, as_json: AsJson = False) -> None:
     """Show a robot: its connection, its share of Lambda 2, its provisioning, its certificates."""
     cloud = context.obj.cloud()
     row, held = registry.get(cloud, name), identity.certificates(cloud, name)
@@ -362,11 +343,9 @@ def show(
 @commands.command("remove", epilog=examples("robots remove car8 --yes"))
 def remove(
     context: typer.Context,
-    name: Annotated[
-        str | None, typer.Argument(help="The robot; not with --all.", autocompletion=options.robots)
-    ] = None,
+    name: Annotated[str | None, argument("The robot; not with --all.", autocompletion=options.robots)] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Remove every robot and lasting claim, before `make destroy`.")
+        bool, option("Remove every robot and lasting claim, before `make destroy`.", "--all")
     ] = False,
     yes: Yes = False,
     as_json: AsJson = False,
@@ -377,12 +356,12 @@ def remove(
     cloud = context.obj.cloud()
     if name is not None:
         registry.get(cloud, name)
-        agreed(f"Remove {name} and revoke its certificates?", yes=yes)
+        options.agreed(f"Remove {name} and revoke its certificates?", yes=yes)
         robots.remove(cloud, name)
         tell({"removed": name}, f"{name} is removed", as_json=as_json)
         return
     names = sorted(str(row[tables.ROBOT]) for row in robots.listed(cloud))
-    agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
+    options.agreed(f"Remove {len(names)} robots and every lasting claim?", yes=yes)
     for one in names:
         robots.remove(cloud, one)
         tell({"removed": one}, f"{one} is removed", as_json=as_json)
@@ -395,7 +374,7 @@ def _motion(cloud: Cloud, rows: Iterable[Mapping[str, Any]]) -> Mapping[str, sto
     try:
         return stopping.motion(cloud, [str(row[tables.ROBOT]) for row in rows])
     except ClientError as error:
-        say(f"whether a stop ends their motion cannot be read: {error}")
+        options.say(f"whether a stop ends their motion cannot be read: {error}")
         return {}
 
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from iort_contract.messages.page import Run
 from iort_station.cli.console import errors, out, print_json
-from iort_station.cli.options import AsJson, Robot, When, examples, ranged, say, say_archived
+from iort_station.cli.options import AsJson, Robot, When, examples, option, ranged, say, say_archived
 from iort_station.cloud import Cloud
 from iort_station.times import between, between_hours, iso, iso_s
 
@@ -30,9 +30,9 @@ def runs(
     context: typer.Context,
     robot: Robot,
     when: When,
-    count: Annotated[int, typer.Option(min=1, max=1000, help="The most runs to list; the newest.")] = 20,
+    count: Annotated[int, option("The most runs to list; the newest.", min=1, max=1000)] = 20,
     with_gaps: Annotated[
-        bool, typer.Option("--gaps", help="Count missing batches; reads every batch of the listed runs.")
+        bool, option("Count missing batches; reads every batch of the listed runs.", "--gaps")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

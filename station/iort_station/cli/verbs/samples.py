@@ -12,25 +12,20 @@ import typer
 
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.catalog.vesc import NO_SENSOR_DEGC
+from iort_station.cli import options
 from iort_station.cli.console import Console, reading, tell
 from iort_station.cli.options import (
-    SHORT,
     AsJson,
     Every,
     Fields,
     Force,
-    Range,
     Robot,
     Stream,
     When,
     Where,
-    examples,
-    names,
+    argument,
+    option,
     ranged,
-    say,
-    say_archived,
-    say_refused,
-    to_file,
 )
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
@@ -57,7 +52,7 @@ _ENDINGS: dict[str, Format] = {
 
 @commands.command(
     "query",
-    epilog=examples(
+    epilog=options.examples(
         "query car7 vesc --last 10m --fields speed_mps,voltage_input",
         "query car7 vesc --last 1h --where 'speed_mps > 1.2' --every 1s",
         "query car7 vesc --last 7d --out car7.parquet",
@@ -72,31 +67,25 @@ def query(
     fields: Fields = None,
     where: Where = None,
     every: Every = None,
-    summary: Annotated[
-        bool, typer.Option("--summary", help="The summary of each second instead of samples.")
-    ] = False,
+    summary: Annotated[bool, option("The summary of each second instead of samples.", "--summary")] = False,
     form: Annotated[
-        Format | None,
-        typer.Option("--format", help="The output format. Default: the ending of --out, or else a table."),
+        Format | None, option("The output format. Default: the ending of --out, or else a table.", "--format")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
+    as_json: Annotated[bool, option("The same as --format jsonl.", "--json")] = False,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
+        bool, option("Leave formulas and control characters in the texts of CSV.", "--raw")
     ] = False,
-    out: Annotated[Path | None, to_file("The file to write. Default: standard output.")] = None,
+    out: Annotated[Path | None, option("The file to write. Default: standard output.", "--out", "-o")] = None,
     force: Force = False,
     on: Annotated[
         Literal["client", "lambda"],
-        typer.Option(help="Select samples on this machine, or in the cloud's query function."),
+        option("Select samples on this machine, or in the cloud's query function."),
     ] = "client",
     source: Annotated[
         Literal["auto", "table", "archive"],
-        typer.Option(help="Read the table and, of what expires, the archive; or only one of them."),
+        option("Read the table and, of what expires, the archive; or only one of them."),
     ] = "auto",
-    scan: Annotated[
-        bool,
-        typer.Option("--scan", help="Scan the whole table, which is slow; for comparison."),
-    ] = False,
+    scan: Annotated[bool, option("Scan the whole table, which is slow; for comparison.", "--scan")] = False,
 ) -> None:
     """Print recorded samples, combined samples, or the summary of each second.
 
@@ -111,7 +100,7 @@ def query(
         raise UsageError("a terminal cannot show Parquet: give --out FILE, or use a pipe")
     if out is not None:
         check_free(out, force=force)
-    within = when.range(SHORT)
+    within = when.range(options.SHORT)
     cloud = context.obj.cloud()
     began = time.monotonic()
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
@@ -121,7 +110,7 @@ def query(
             stream,
             within.start_us,
             within.end_us,
-            fields=names(fields),
+            fields=options.names(fields),
             where=where,
             every=every,
             summary=summary,
@@ -136,14 +125,14 @@ def query(
     else:
         with whole(out, force=force) as part, part.open("w", encoding="utf-8", newline="") as file:
             _write(result, form, file, raw=raw)
-    say_refused(result.refused, result.reason)
+    options.say_refused(result.refused, result.reason)
     if result.absent:
         counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
-        say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")
-    say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
-    say_archived(result.origin.told())
+        options.say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")
+    options.say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
+    options.say_archived(result.origin.told())
     if not len(result) and (extent := inventory.extent(cloud, robot, stream)):
-        say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
+        options.say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
 
 
 def _form_of(out: Path | None) -> Format:
@@ -174,9 +163,11 @@ def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
         shown = tables.terminal(result, console.width)
         console.print(shown.table)
         if shown.rows < len(result):
-            say(f"{shown.rows} of {len(result):,} shown; a pipe or --out FILE.csv gets every one")
+            options.say(f"{shown.rows} of {len(result):,} shown; a pipe or --out FILE.csv gets every one")
         if shown.left_out:
-            say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --out FILE.csv")
+            options.say(
+                f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --out FILE.csv"
+            )
     else:
         tables.plain(result, file)
 
@@ -190,17 +181,17 @@ _BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
 
 @commands.command(
     "export",
-    epilog=examples("export car7 vesc --last 10m --out car7.mcap", "export car7 --last 10m --out all.mcap"),
+    epilog=options.examples(
+        "export car7 vesc --last 10m --out car7.mcap", "export car7 --last 10m --out all.mcap"
+    ),
 )
 @ranged
 def export(
     context: typer.Context,
     robot: Robot,
     when: When,
-    out: Annotated[Path, to_file("The file to write: .mcap or .bag.")],
-    streams: Annotated[
-        list[str] | None, typer.Argument(help="The streams, for example vesc. Default: all.")
-    ] = None,
+    out: Annotated[Path, option("The file to write: .mcap or .bag.", "--out", "-o")],
+    streams: Annotated[list[str] | None, argument("The streams, for example vesc. Default: all.")] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -221,7 +212,7 @@ def export(
     if kind is None:
         raise UsageError(f"the file must end in {' or '.join(bags.KINDS)}, got {out}")
     check_free(out, force=force)
-    within = when.range(SHORT)
+    within = when.range(options.SHORT)
     cloud = context.obj.cloud()
     if not streams:
         streams = [name for name in check_recorded(cloud, robot) if name not in _BOOKKEEPING]
@@ -230,7 +221,7 @@ def export(
         for stream in dict.fromkeys(streams):
             selection = select(robot, stream, within.start_us, within.end_us)
             with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
-                written += write(cloud, selection, file, origin=origin, say=say, progress=progress)
+                written += write(cloud, selection, file, origin=origin, say=options.say, progress=progress)
         if not written:
             for stream in streams:
                 check_there(cloud, robot, stream)
@@ -238,7 +229,7 @@ def export(
     archived = origin.within(within.start_us, within.end_us).told()
     told = {"file": str(out), "messages": written, "archive": archived and between_hours(archived)}
     tell(told, f"{out}: {written:,} messages", as_json=as_json)
-    say_archived(archived)
+    options.say_archived(archived)
 
 
 # `iort plot`: pictures of recorded samples.
@@ -246,7 +237,7 @@ def export(
 
 @commands.command(
     "plot",
-    epilog=examples(
+    epilog=options.examples(
         "plot car7 vesc --last 10m --fields speed_mps --out speed.png",
         "plot car7 pose --kind trajectory --last 10m --out track.png",
     ),
@@ -257,19 +248,19 @@ def plot(
     robot: Robot,
     stream: Stream,
     when: When,
-    out: Annotated[Path, to_file("The picture: .png, .svg or .pdf.")],
+    out: Annotated[Path, option("The picture: .png, .svg or .pdf.", "--out", "-o")],
     kind: Annotated[
         Literal["time", "trajectory", "distribution"],
-        typer.Option(help="Fields over time, the way from above, or the distribution of values."),
+        option("Fields over time, the way from above, or the distribution of values."),
     ] = "time",
     fields: Fields = None,
-    also: Annotated[list[str] | None, typer.Option("--with", help="Another robot; may be repeated.")] = None,
+    also: Annotated[list[str] | None, option("Another robot; may be repeated.", "--with")] = None,
     runs: Annotated[
         list[str] | None,
-        typer.Option("--run", help="A run's range, FROM/TO, instead of --from and --to; may be repeated."),
+        option("A run's range, FROM/TO, instead of --from and --to; may be repeated.", "--run"),
     ] = None,
     align: Annotated[
-        Literal["time", "start"], typer.Option(help="Draw several runs by the clock, or from their start.")
+        Literal["time", "start"], option("Draw several runs by the clock, or from their start.")
     ] = "time",
     where: Where = None,
     every: Every = None,
@@ -289,16 +280,16 @@ def plot(
     check_free(out, force=force)
     if runs and when != When():
         raise UsageError("give either --run or --from, --to and --last")
-    ranges = [_run(run) for run in runs] if runs else [when.range(SHORT)]
+    ranges = [_run(run) for run in runs] if runs else [when.range(options.SHORT)]
     cloud = context.obj.cloud()
-    wanted = names(fields)
+    wanted = options.names(fields)
     drawn: list[plots.Run] = []
     for name in dict.fromkeys([robot, *(also or ())]):
         for within in ranges:
             result = _read(cloud, name, stream, within, fields=wanted, where=where, every=every)
-            say_refused(result.refused, result.reason)
+            options.say_refused(result.refused, result.reason)
             if not len(result):
-                say(f"{name} {stream}: no samples in this range")
+                options.say(f"{name} {stream}: no samples in this range")
                 continue
             label = f"{name}, {plots.when(int(result.times_us[0]))} UTC" if runs else name
             drawn.append(plots.Run(label, result))
@@ -316,10 +307,10 @@ def plot(
     archived = Origin([hour for run in drawn for hour in run.result.origin.hours]).told()
     told = {"file": str(out), "samples": count, "archive": archived and between_hours(archived)}
     tell(told, f"{out}: {count:,} samples", as_json=as_json)
-    say_archived(archived)
+    options.say_archived(archived)
 
 
-def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
+def _read(cloud: Cloud, robot: str, stream: str, within: options.Range, **asked: Any) -> Any:
     from iort_station import data  # noqa: PLC0415 - as above
     from iort_station.data.selection import derive  # noqa: PLC0415 - as above
 
@@ -331,7 +322,7 @@ def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) ->
     return replace(result, columns=columns)
 
 
-def _run(text: str) -> Range:
+def _run(text: str) -> options.Range:
     first, separator, last = text.partition("/")
     if not separator:
         raise UsageError(

@@ -14,7 +14,7 @@ from rich.text import Text
 from iort_contract.topics import parse_topic
 from iort_station.cli import console, options
 from iort_station.cli.console import bar, out, print_json, tell
-from iort_station.cli.options import AsJson, DryRun, Force, State, examples, running_state, say, state_folder
+from iort_station.cli.options import AsJson, DryRun, Force, State, argument, examples, option, say
 from iort_station.data.recorded import archive_of
 from iort_station.errors import StationError
 from iort_station.operations import archive
@@ -26,7 +26,7 @@ commands = typer.Typer()
 @commands.command("backup", epilog=examples("backup cloud.tar"))
 def backup_(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="The archive to write.")],
+    file: Annotated[Path, argument("The archive to write.")],
     state: State = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -38,7 +38,7 @@ def backup_(
     """
     from iort_station.upkeep import backup  # noqa: PLC0415 - SQLite takes longer to load than TAB may take
 
-    folder = running_state(context, state)
+    folder = options.running_state(context, state)
     say(f"of the cloud that is kept in {folder}")
     with bar("backup", backup.size_of(folder) if folder.exists() else None) as progress:
         made = backup.back_up(folder, file, force=force, progress=progress)
@@ -60,8 +60,7 @@ def doctor_(
     context: typer.Context,
     state: State = None,
     deep: Annotated[
-        bool,
-        typer.Option("--deep", help="Also read and decode all that is stored, and name what is damaged."),
+        bool, option("Also read and decode all that is stored, and name what is damaged.", "--deep")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -93,7 +92,7 @@ def _looked_at(context: typer.Context, state: Path | None) -> tuple[Iterator[Fin
     from iort_station.cloud import Cloud  # noqa: PLC0415 - as below
     from iort_station.upkeep import doctor  # noqa: PLC0415 - it loads TLS and more
 
-    folder = state_folder(context, state)
+    folder = options.state_folder(context, state)
 
     def kept_cloud() -> Cloud:
         return Cloud.load(folder / kept.CLOUD)
@@ -146,10 +145,10 @@ def _print(finding: Finding) -> None:
 @commands.command("restore", epilog=examples("restore cloud.tar --dry-run"))
 def restore_(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="The archive of `iort backup`.")],
+    file: Annotated[Path, argument("The archive of `iort backup`.")],
     state: State = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Also where a state is already; that one is renamed, and kept.")
+        bool, option("Also where a state is already; that one is renamed, and kept.", "--force")
     ] = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -161,7 +160,7 @@ def restore_(
     """
     from iort_station.upkeep import backup  # noqa: PLC0415 - as in `iort backup`
 
-    folder, earlier = state_folder(context, state), None
+    folder, earlier = options.state_folder(context, state), None
     if not dry_run:
         say(f"to {folder}, for `make up`")
     with bar("restore", file.stat().st_size) as progress:
@@ -194,10 +193,9 @@ commands.add_typer(archive_commands)
 _EMPTY = "nothing is archived yet: an hour is, from a quarter past the next one"
 
 _Robot = Annotated[
-    str | None,
-    typer.Argument(help="Only this robot; needed for a removed one.", autocompletion=options.robots),
+    str | None, argument("Only this robot; needed for a removed one.", autocompletion=options.robots)
 ]
-_Stream = Annotated[str | None, typer.Argument(help="Only this stream.", autocompletion=options.streams)]
+_Stream = Annotated[str | None, argument("Only this stream.", autocompletion=options.streams)]
 
 
 @archive_commands.command("show", epilog=examples("archive show car7"))
