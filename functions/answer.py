@@ -16,7 +16,7 @@ from functions.shared.quotas import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
 from iort_contract.limits import ContractError
-from iort_contract.messages.envelope import event_message
+from iort_contract.messages.envelope import event_message, to_json
 from iort_contract.messages.questions import (
     FAILED,
     INVALID,
@@ -33,7 +33,6 @@ from iort_contract.messages.questions import (
     ask_id,
     decode_ask,
     encode_answer,
-    to_json,
 )
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import ANSWER, Topic, build_topic, check_robot, parse_topic

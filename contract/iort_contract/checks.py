@@ -135,6 +135,13 @@ def check_time(t_us: Any, what: str) -> int:
     return t_us
 
 
+def whole_number(name: str, value: Any, low: int, high: int) -> int:
+    """Return the value, if it is an integer from ``low`` to ``high``."""
+    if type(value) is not int or not low <= value <= high:
+        raise ContractError(f"{name} must be an integer from {low} to {high}, got {shown(value)}")
+    return value
+
+
 def offset_entry(offset_us: Any) -> dict[str, int]:
     """The clock offset as an envelope's entry; empty if unknown."""
     return {} if offset_us is None else {"offset_us": check_time(offset_us, "offset_us")}

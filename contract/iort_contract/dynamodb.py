@@ -103,10 +103,12 @@ def seconds_between(first_s: int | None, last_s: int | None) -> Keys:
 
 
 class TopicTable:
-    """A table whose items have a topic and a sort key. Reads are strongly consistent."""
+    """A table whose items have a topic, or another ``partition_key``, and a sort key. Reads are strongly
+    consistent."""
 
-    def __init__(self, client: Any, name: str, sort_key: str) -> None:
-        self._client, self.name, self._sort_key = client, name, sort_key
+    def __init__(self, client: Any, name: str, sort_key: str, partition_key: str = TOPIC) -> None:
+        self._client, self.name = client, name
+        self._sort_key, self._partition_key = sort_key, partition_key
 
     def pages(
         self,
@@ -127,7 +129,7 @@ class TopicTable:
         """
         if keys is not None and keys.empty:
             return
-        names: dict[str, str] = {"#topic": TOPIC}
+        names: dict[str, str] = {"#topic": self._partition_key}
         values: dict[str, Mapping[str, str]] = {":topic": {"S": topic}}
         condition = "#topic = :topic"
         if keys is not None:

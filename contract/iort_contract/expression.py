@@ -7,8 +7,8 @@ arithmetic gives null and every comparison is false; division by zero gives null
 if it is neither null, zero nor empty. A comparison of a number with a text, or arithmetic with a text, is an
 error, since no sample could match.
 
-The query function evaluates over lists; iort_station.data.selection evaluates over numpy's columns, with the
-same answers.
+`evaluate` walks the tree; a `Calculus` says how to calculate: with one sample's values here, for the query
+function, and with numpy's columns in iort_station.data.selection.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+from functools import reduce
 from typing import Any, Callable, FrozenSet, Mapping, NamedTuple, Sequence, Union
 
 from iort_contract.checks import check_field
@@ -137,16 +138,50 @@ def parse(expression: str) -> Node:
     return _Reader(text).read(tree.body)
 
 
+def children(node: Node) -> tuple[Node, ...]:
+    """The nodes directly below a node."""
+    if isinstance(node, (Arithmetic, Comparison)):
+        return (node.left, node.right)
+    if isinstance(node, (Every, Some)):
+        return node.of
+    return () if isinstance(node, (Field, Constant)) else (node.of,)
+
+
 def names(node: Node) -> frozenset[str]:
     """The fields in a tree."""
     if isinstance(node, Field):
         return frozenset({node.name})
+    return frozenset().union(*map(names, children(node)))
+
+
+class Calculus(NamedTuple):
+    """How to calculate with values of one kind. ``truth`` gives what ``&``, ``|`` and ``^ True`` take."""
+
+    arithmetic: Callable[[str, Any, Any], Any]
+    magnitude: Callable[[Any], Any]
+    compare: Callable[[str, Any, Any], Any]
+    is_null: Callable[[Any], Any]
+    truth: Callable[[Any], Any]
+
+
+def evaluate(node: Node, fields: Mapping[str, Any], how: Calculus) -> Any:
+    """The value of a tree, or whether it is true, with the values of the fields."""
+    if isinstance(node, Field):
+        return fields[node.name]
     if isinstance(node, Constant):
-        return frozenset()
-    if isinstance(node, (Arithmetic, Comparison)):
-        return names(node.left) | names(node.right)
-    parts = node.of if isinstance(node, (Every, Some)) else (node.of,)
-    return frozenset().union(*map(names, parts))
+        return node.value
+    values = [evaluate(child, fields, how) for child in children(node)]
+    if isinstance(node, Arithmetic):
+        return how.arithmetic(node.symbol, *values)
+    if isinstance(node, Magnitude):
+        return how.magnitude(*values)
+    if isinstance(node, Comparison):
+        return how.compare(node.symbol, *values)
+    if isinstance(node, IsNull):
+        return how.is_null(*values)
+    if isinstance(node, Not):
+        return how.truth(*values) ^ True
+    return reduce(operator.and_ if isinstance(node, Every) else operator.or_, map(how.truth, values))
 
 
 def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bool]:
@@ -158,32 +193,8 @@ def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bo
     kinds = {name: frozenset(map(_kind, column)) - {_NULL} for name, column in fields.items()}
     if problem := _mismatch(node, kinds):
         raise MismatchError(problem)
-    return [_is_true(_value(node, {name: column[i] for name, column in fields.items()})) for i in range(n)]
-
-
-def _value(node: Node, sample: Mapping[str, Value]) -> Value:
-    if isinstance(node, Field):
-        return sample[node.name]
-    if isinstance(node, Constant):
-        return node.value
-    if isinstance(node, Arithmetic):
-        return _calculated(node.symbol, _value(node.left, sample), _value(node.right, sample))
-    if isinstance(node, Magnitude):
-        value = _value(node.of, sample)
-        return abs(float(value)) if isinstance(value, (int, float)) else None
-    if isinstance(node, Comparison):
-        return _compared(node.symbol, _value(node.left, sample), _value(node.right, sample))
-    if isinstance(node, IsNull):
-        return _value(node.of, sample) is None
-    if isinstance(node, Every):
-        return all(_is_true(_value(part, sample)) for part in node.of)
-    if isinstance(node, Some):
-        return any(_is_true(_value(part, sample)) for part in node.of)
-    return not _is_true(_value(node.of, sample))
-
-
-def _is_true(value: Value) -> bool:
-    return bool(value)
+    samples = ({name: column[i] for name, column in fields.items()} for i in range(n))
+    return [bool(evaluate(node, sample, _PLAIN)) for sample in samples]
 
 
 def _calculated(symbol: str, left: Value, right: Value) -> float | None:
@@ -202,6 +213,13 @@ def _compared(symbol: str, left: Value, right: Value) -> bool:
     return bool(COMPARISONS[symbol](left, right))
 
 
+def _magnitude(value: Value) -> float | None:
+    return abs(float(value)) if isinstance(value, (int, float)) else None
+
+
+_PLAIN = Calculus(_calculated, _magnitude, _compared, lambda value: value is None, bool)
+
+
 def _kind(value: Value) -> str:
     return _NULL if value is None else _TEXT if isinstance(value, str) else _NUMBER
 
@@ -215,12 +233,7 @@ def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
 
 def _mismatch(node: Node, of: _Kinds) -> str:
     """The error text if the condition mixes numbers and texts of these kinds; empty if it does not."""
-    if isinstance(node, (Field, Constant)):
-        return ""
-    if isinstance(node, (Arithmetic, Comparison)):
-        parts: tuple[Node, ...] = (node.left, node.right)
-    else:
-        parts = node.of if isinstance(node, (Every, Some)) else (node.of,)
+    parts = children(node)
     kinds = frozenset().union(*(_kinds(part, of) for part in parts))
     said = ", ".join(
         f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in parts if _kinds(part, of)

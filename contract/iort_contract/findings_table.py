@@ -11,6 +11,7 @@ from itertools import islice
 from typing import Any, Callable, Iterable, Iterator, Mapping, TypeVar
 
 from iort_contract.checks import json_object
+from iort_contract.dynamodb import Item, Keys, TopicTable
 from iort_contract.limits import ContractError
 from iort_contract.messages.analysis import (
     AnalysedDrive,
@@ -27,7 +28,6 @@ from iort_contract.messages.analysis import (
 from iort_contract.tables import CONTENT, FINDING, NOTE_PREFIX, PARAMETERS_PREFIX, REMOVED_PREFIX, ROBOT
 
 T = TypeVar("T")
-_FIRST, _LAST = "0", "9~"
 
 
 class FindingsTable:
@@ -35,42 +35,28 @@ class FindingsTable:
 
     def __init__(self, client: Any, name: str) -> None:
         self._client, self._name = client, name
+        self._rows = TopicTable(client, name, FINDING, ROBOT)
 
     def findings(
         self, robot: str, start_us: int | None = None, end_us: int | None = None
     ) -> Iterator[Finding]:
         """A robot's findings about drives that begin in a range, the newest first."""
-        first = _FIRST if start_us is None else f"{start_us:016d}"
-        last = _LAST if end_us is None else f"{end_us - 1:016d}~"
-        yield from _decoded(decode_finding, self._content(robot, first, last, newest_first=True))
+        return self._newest(decode_finding, robot, "", (start_us, end_us))
 
     def of_drive(self, drive: DriveKey) -> list[Finding]:
-        return list(_decoded(decode_finding, self._content(drive.robot, f"{drive}-", f"{drive}-~")))
+        return list(_decoded(decode_finding, self._between(drive.robot, f"{drive}-", f"{drive}-~")))
 
     def drives(
-        self,
-        robot: str,
-        start_us: int | None = None,
-        end_us: int | None = None,
-        *,
-        most: int | None = None,
+        self, robot: str, start_us: int | None = None, end_us: int | None = None, *, most: int | None = None
     ) -> Iterator[AnalysedDrive]:
         """A robot's analysed drives that begin in a range, the newest first; at most so many."""
-        rows = self._newest(robot, PARAMETERS_PREFIX, start_us, end_us, most)
-        yield from islice(_decoded(decode_analysed, rows), most)
+        return self._newest(decode_analysed, robot, PARAMETERS_PREFIX, (start_us, end_us), most)
 
     def notes(
-        self,
-        robot: str,
-        start_us: int | None = None,
-        end_us: int | None = None,
-        *,
-        most: int | None = None,
+        self, robot: str, start_us: int | None = None, end_us: int | None = None, *, most: int | None = None
     ) -> Iterator[Note]:
         """A robot's notes about a range, the newest first; at most so many."""
-        yield from islice(
-            _decoded(decode_note, self._newest(robot, NOTE_PREFIX, start_us, end_us, most)), most
-        )
+        return self._newest(decode_note, robot, NOTE_PREFIX, (start_us, end_us), most)
 
     def put_finding(self, finding: Finding) -> None:
         """Write a finding; one of the same id is replaced."""
@@ -94,7 +80,7 @@ class FindingsTable:
     def remove_note(self, robot: str, note_id: str) -> bool:
         """Remove a note, and keep its id; False if there is none of this id."""
         key = f"{NOTE_PREFIX}{note_id}"
-        if next(self._content(robot, key, key), None) is None:
+        if next(self._between(robot, key, key), None) is None:
             return False
         # Before the note goes: a call that ends between them can be repeated.
         self._put(robot, f"{REMOVED_PREFIX}{note_id}", {})
@@ -102,7 +88,7 @@ class FindingsTable:
 
     def removed_notes(self, robot: str) -> set[str]:
         """The ids of a robot's notes that were removed."""
-        rows = self._content(robot, REMOVED_PREFIX, f"{REMOVED_PREFIX}~")
+        rows = self._between(robot, REMOVED_PREFIX, f"{REMOVED_PREFIX}~")
         return {str(row[FINDING]["S"])[len(REMOVED_PREFIX) :] for row in rows}
 
     def _delete(self, robot: str, key: str) -> bool:
@@ -112,47 +98,28 @@ class FindingsTable:
         return "Attributes" in answer
 
     def _newest(
-        self, robot: str, prefix: str, start_us: int | None, end_us: int | None, most: int | None
-    ) -> Iterator[Mapping[str, Any]]:
-        """The rows of a prefix in a range, the newest first."""
-        first = f"{prefix}{'' if start_us is None else f'{start_us:016d}'}"
-        last = f"{prefix}{'~' if end_us is None else f'{end_us - 1:016d}~'}"
-        return self._content(robot, first, last, newest_first=True, page_items=most)
+        self,
+        decode: Callable[[Mapping[str, Any]], T],
+        robot: str,
+        prefix: str,
+        times_us: tuple[int | None, int | None],
+        most: int | None = None,
+    ) -> Iterator[T]:
+        """The contents of a prefix's rows in a range, the newest first; at most so many."""
+        start_us, end_us = times_us
+        first = f"{prefix}0" if start_us is None else f"{prefix}{start_us:016d}"
+        last = f"{prefix}9~" if end_us is None else f"{prefix}{end_us - 1:016d}~"
+        rows = self._between(robot, first, last, newest_first=True, page_items=most)
+        return islice(_decoded(decode, rows), most)
 
     def _put(self, robot: str, key: str, content: Mapping[str, Any]) -> None:
         text = json.dumps(content, separators=(",", ":"), allow_nan=False)
         item = {ROBOT: {"S": robot}, FINDING: {"S": key}, CONTENT: {"S": text}}
         self._client.put_item(TableName=self._name, Item=item)
 
-    def _content(
-        self,
-        robot: str,
-        first: str,
-        last: str,
-        *,
-        newest_first: bool = False,
-        page_items: int | None = None,
-    ) -> Iterator[Mapping[str, Any]]:
-        request: dict[str, Any] = {
-            "TableName": self._name,
-            "ConsistentRead": True,
-            "KeyConditionExpression": "#robot = :robot AND #key BETWEEN :first AND :last",
-            "ExpressionAttributeNames": {"#robot": ROBOT, "#key": FINDING},
-            "ExpressionAttributeValues": {
-                ":robot": {"S": robot},
-                ":first": {"S": first},
-                ":last": {"S": last},
-            },
-            "ScanIndexForward": not newest_first,
-        }
-        if page_items is not None:
-            request["Limit"] = page_items
-        while True:
-            answer = self._client.query(**request)
-            yield from answer["Items"]
-            if "LastEvaluatedKey" not in answer:
-                return
-            request["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
+    def _between(self, robot: str, first: str, last: str, **pages: Any) -> Iterator[Item]:
+        keys = Keys({"S": first}, {"S": last}, first > last)
+        return (item for page in self._rows.pages(robot, keys, **pages) for item in page.items)
 
 
 def _decoded(decode: Callable[[Mapping[str, Any]], T], rows: Iterable[Mapping[str, Any]]) -> Iterator[T]:

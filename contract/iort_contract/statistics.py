@@ -1,4 +1,8 @@
-"""Summarises a second of a stream from its batches. Pure functions."""
+"""Summarises a second of a stream from its batches. Pure functions.
+
+In plain Python: the usual event has a batch of one second, and numpy would cost a Lambda function without it
+more than the whole event does. `iort_analysis.samples.seconds` says the same of hours at a time, by numpy.
+"""
 
 from __future__ import annotations
 

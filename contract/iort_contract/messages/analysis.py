@@ -5,13 +5,13 @@ table of findings: runs of the analysis, its drives, and people's notes.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Mapping, NamedTuple
+from typing import Any, Callable, Mapping, NamedTuple
 
 from iort_contract.checks import checked, integer, shown, text
 from iort_contract.limits import ContractError
-from iort_contract.messages.envelope import mapping, number, read
+from iort_contract.messages.envelope import number, read
 from iort_contract.topics import check_robot, check_stream
 
 # The share of repetitions in which an estimate's interval holds the truth.
@@ -74,11 +74,22 @@ class Finding:
 
 def encode_finding(finding: Finding) -> dict[str, Any]:
     """The finding as an object for JSON."""
-    content = {name: value for name, value in vars(finding).items() if value is not None and name != "drive"}
-    for name in ("effect", "baseline"):
-        if name in content:
-            content[name] = encode_estimate(content[name])
-    return {**content, "fields": list(finding.fields), **vars(finding.drive)}
+    return {name: value for name, value in _flat(finding).items() if value is not None}
+
+
+def _flat(message: Finding | PlannedDrive | AnalysedDrive) -> dict[str, Any]:
+    """The message and its drive as one object."""
+    content = {**vars(message.drive), **vars(message)}
+    del content["drive"]
+    return {name: _plain(value) for name, value in content.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Estimate):
+        return encode_estimate(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(content) for name, content in value.items()}
+    return list(value) if isinstance(value, tuple) else value
 
 
 def decode_finding(content: Mapping[str, Any]) -> Finding:
@@ -153,13 +164,7 @@ class AnalysedDrive:
 
 def encode_request(request: AnalysisRequest) -> dict[str, Any]:
     """The request as the state machine's input."""
-    return {
-        "robots": list(request.robots),
-        "start_us": request.start_us,
-        "end_us": request.end_us,
-        "again": request.again,
-        "most": request.most,
-    }
+    return {**vars(request), "robots": list(request.robots)}
 
 
 def decode_request(content: Mapping[str, Any], now_us: int) -> AnalysisRequest:
@@ -167,32 +172,21 @@ def decode_request(content: Mapping[str, Any], now_us: int) -> AnalysisRequest:
 
     The schedule gives ``last_s`` instead of times, which counts back from now.
     """
-    robots = content.get("robots", [])
-    if not isinstance(robots, list):
-        raise ContractError(f"robots must be a list of names, got {shown(robots)}")
+    times = content
     if "last_s" in content:
-        start_us, end_us = now_us - integer(content, "last_s") * 1_000_000, now_us
-    else:
-        start_us, end_us = integer(content, "start_us"), integer(content, "end_us")
-    if end_us <= start_us:
-        raise ContractError(f"the range must be longer than 0, got {(end_us - start_us) / 1e6:g} s")
-    again = content.get("again", False)
-    if not isinstance(again, bool):
-        raise ContractError(f"again must be true or false, got {shown(again)}")
-    most = integer(content, "most") if "most" in content else 0
-    if most < 0:
-        raise ContractError(f"most must be 0 or more, got {most}")
-    return AnalysisRequest(tuple(map(check_robot, robots)), max(0, start_us), end_us, again, most)
+        times = {"start_us": now_us - integer(content, "last_s") * 1_000_000, "end_us": now_us}
+    request = read(AnalysisRequest, {"robots": [], **content, **times})
+    if request.end_us <= request.start_us:
+        seconds = (request.end_us - request.start_us) / 1e6
+        raise ContractError(f"the range must be longer than 0, got {seconds:g} s")
+    if request.most < 0:
+        raise ContractError(f"most must be 0 or more, got {request.most}")
+    return replace(request, robots=tuple(map(check_robot, request.robots)), start_us=max(0, request.start_us))
 
 
 def encode_planned(planned: PlannedDrive) -> dict[str, Any]:
     """The drive as an object for JSON."""
-    return {
-        **vars(planned.drive),
-        "end_us": planned.end_us,
-        "streams": list(planned.streams),
-        "motion": planned.motion,
-    }
+    return _flat(planned)
 
 
 def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
@@ -205,26 +199,25 @@ def decode_planned(content: Mapping[str, Any]) -> PlannedDrive:
 
 def encode_analysed(analysed: AnalysedDrive) -> dict[str, Any]:
     """The row's content as an object for JSON."""
-    content = {name: value for name, value in vars(analysed).items() if name != "drive"}
-    return {
-        **vars(analysed.drive),
-        **content,
-        "estimates": {name: encode_estimate(one) for name, one in analysed.estimates.items()},
-    }
+    return _flat(analysed)
 
 
 def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
     """Decode a row's content; raises `ContractError`."""
-    return AnalysedDrive(
-        drive=_drive(content),
-        end_us=integer(content, "end_us"),
-        job=text(content, "job"),
-        samples=integer(content, "samples"),
-        estimates={name: decode_estimate(one) for name, one in mapping(content, "estimates").items()},
-        missing={name: str(reason) for name, reason in mapping(content, "missing").items()},
-        repairs={name: integer(mapping(content, "repairs"), name) for name in mapping(content, "repairs")},
-        analysed_us=integer(content, "analysed_us") if "analysed_us" in content else 0,
+    return read(
+        AnalysedDrive,
+        {**content, "drive": content},
+        drive=_drive,
+        estimates=partial(_each, decode_estimate),
+        missing=partial(_each, str),
+        repairs=partial(_each, lambda count: integer({"repairs": count}, "repairs")),
     )
+
+
+def _each(decode: Callable[[Any], Any], content: Any) -> dict[str, Any]:
+    if not isinstance(content, Mapping):
+        raise ContractError(f"an analysed drive's row must have objects, got {shown(content)}")
+    return {name: decode(value) for name, value in content.items()}
 
 
 def _drive(content: Mapping[str, Any]) -> DriveKey:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict, dataclass
 from typing import Any, Mapping
@@ -12,14 +11,13 @@ from iort_contract.checks import (
     FIELD_NAME,
     check_header,
     check_time,
-    check_version,
     checked,
-    json_object,
     offset_entry,
     shown,
+    whole_number,
 )
-from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
-from iort_contract.messages.envelope import entries, read
+from iort_contract.limits import ContractError
+from iort_contract.messages.envelope import codec
 from iort_contract.topics import check_stream
 
 # Upper limits, whatever an operator asks for: a command expires, and a motion must end.
@@ -60,19 +58,6 @@ class Command:
         return (self.started_us, self.session, self.seq)
 
 
-def encode_command(command: Command) -> bytes:
-    """The command as JSON; raises `ContractError` if it is invalid."""
-    _check_command(command)
-    return _message_json({"v": SCHEMA_VERSION, **entries(command)})
-
-
-def decode_command(payload: bytes | str) -> Command:
-    """Decode a command; raises `ContractError` for everything that `encode_command` cannot have written."""
-    command = read(Command, _message_envelope(payload, "command"))
-    _check_command(command)
-    return command
-
-
 @dataclass(frozen=True)
 class FleetMessage:
     """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``.
@@ -85,24 +70,14 @@ class FleetMessage:
     offset_us: int | None = None
 
 
-def encode_fleet(fleet: FleetMessage) -> bytes:
-    """The message as JSON; raises `ContractError` if it is invalid."""
-    _check_fleet(fleet)
-    return _message_json({"v": SCHEMA_VERSION, **entries(fleet)})
-
-
-def decode_fleet(payload: bytes | str) -> FleetMessage:
-    """Decode another robot's message; raises `ContractError` for everything that `encode_fleet` cannot
-    write."""
-    fleet = read(FleetMessage, _message_envelope(payload, "fleet message"))
-    _check_fleet(fleet)
-    return fleet
-
-
 def _check_fleet(fleet: FleetMessage) -> None:
     check_header(fleet.boot, fleet.seq, 0)
     check_time(fleet.sent_us, "sent_us")
     offset_entry(fleet.offset_us)
+    _check_message(fleet.message)
+
+
+encode_fleet, decode_fleet = codec(FleetMessage, "fleet message", _check_fleet)
 
 
 def check_by(by: Any) -> str:
@@ -122,34 +97,18 @@ def _check_command(command: Command) -> None:
         check_by(command.by)
     if check_time(command.started_us, "started_us") > check_time(command.sent_us, "sent_us"):
         raise ContractError("the command was sent before its session started")
-    for name, value, most in (
-        ("valid_ms", command.valid_ms, MAX_VALID_MS),
-        ("lease_ms", command.lease_ms, MAX_LEASE_MS),
-    ):
-        if value is None and name == "lease_ms":
-            continue
-        if type(value) is not int or not 1 <= value <= most:
-            raise ContractError(f"{name} must be an integer from 1 to {most}, got {shown(value)}")
+    whole_number("valid_ms", command.valid_ms, 1, MAX_VALID_MS)
+    if command.lease_ms is not None:
+        whole_number("lease_ms", command.lease_ms, 1, MAX_LEASE_MS)
+    _check_message(command.message)
 
 
-def _message_json(envelope: Mapping[str, Any]) -> bytes:
-    if not isinstance(envelope["message"], dict):
-        raise ContractError(f"message must be an object, got {shown(envelope['message'])}")
-    try:
-        payload = json.dumps(envelope, separators=(",", ":"), allow_nan=False).encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ContractError(f"the message is not JSON: {error}") from error
-    if len(payload) > MAX_MESSAGE_BYTES:
-        raise ContractError(f"message must be at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
-    return payload
+def _check_message(message: Any) -> None:
+    if not isinstance(message, dict):
+        raise ContractError(f"message must be an object, got {shown(message)}")
 
 
-def _message_envelope(payload: bytes | str, what: str) -> dict[str, Any]:
-    envelope = json_object(payload, what)
-    check_version(envelope)
-    if not isinstance(envelope.get("message"), dict):
-        raise ContractError(f"message must be an object, got {shown(envelope.get('message'))}")
-    return envelope
+encode_command, decode_command = codec(Command, "command", _check_command)
 
 
 DRIVE_RATE_HZ = 20.0
@@ -289,10 +248,7 @@ def check_limits(limits: DriveLimits) -> DriveLimits:
         # An integer may be larger than every float.
         if not number or not 0 < value <= sys.float_info.max:
             raise ContractError(f"{name} must be a number above 0, got {shown(value)}")
-    if type(limits.lease_ms) is not int or not 1 <= limits.lease_ms <= MAX_LEASE_MS:
-        raise ContractError(
-            f"lease_ms must be an integer from 1 to {MAX_LEASE_MS}, got {shown(limits.lease_ms)}"
-        )
+    whole_number("lease_ms", limits.lease_ms, 1, MAX_LEASE_MS)
     return limits
 
 

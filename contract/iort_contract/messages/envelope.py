@@ -5,11 +5,12 @@ And a topic rule's event for a function, with the message's bytes and the cloud'
 from __future__ import annotations
 
 import base64
+import json
 from dataclasses import MISSING, fields
-from typing import Any, Callable, Mapping, TypeVar
+from typing import Any, Callable, Mapping, TypeVar, Union
 
-from iort_contract.checks import integer, shown, text
-from iort_contract.limits import ContractError
+from iort_contract.checks import check_version, integer, json_object, shown, text
+from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
 from iort_contract.tables import MESSAGE_BASE64, RECEIVED_MS, T_US, TOPIC
 
 M = TypeVar("M")
@@ -27,7 +28,7 @@ def read(kind: type[M], envelope: Mapping[str, Any], **nested: Callable[[Any], A
         entry = _ENTRIES.get(field.name, field.name)
         if entry in envelope or (field.default is MISSING and field.default_factory is MISSING):
             if field.name in nested:
-                found[field.name] = nested[field.name](envelope[entry])
+                found[field.name] = nested[field.name](envelope.get(entry))
             else:
                 found[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
     return kind(**found)
@@ -40,6 +41,44 @@ def entries(message: Any) -> dict[str, Any]:
         for field in fields(message)
         if field.default is MISSING or getattr(message, field.name) != field.default
     }
+
+
+Wire = Union[bytes, str, Mapping[str, Any]]
+
+
+def codec(
+    kind: type[M], what: str, check: Callable[[M], object], **nested: Callable[[Any], Any]
+) -> tuple[Callable[[M], bytes], Callable[[Wire], M]]:
+    """Two functions: one encodes a message as JSON, the other decodes it. Both raise `ContractError` for a
+    message that ``check`` refuses, and the second for everything that the first cannot have written."""
+
+    def encode(message: M) -> bytes:
+        check(message)
+        try:
+            payload = to_json({"v": SCHEMA_VERSION, **entries(message)})
+        except ContractError as error:
+            raise ContractError(f"{what}: {error}") from error
+        if len(payload) > MAX_MESSAGE_BYTES:
+            raise ContractError(f"{what} must be at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
+        return payload
+
+    def decode(payload: Wire) -> M:
+        envelope = payload if isinstance(payload, Mapping) else json_object(payload, what)
+        check_version(envelope)
+        message = read(kind, envelope, **nested)
+        check(message)
+        return message
+
+    return encode, decode
+
+
+def to_json(value: Mapping[str, Any]) -> bytes:
+    """An object as JSON, with dataclasses as their entries; raises `ContractError` for what JSON does not
+    have."""
+    try:
+        return json.dumps(value, separators=(",", ":"), allow_nan=False, default=entries).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ContractError(f"the message is not JSON: {error}") from error
 
 
 def number(envelope: Mapping[str, Any], key: str) -> float:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import calendar
-import json
 import re
 import time
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from iort_contract.checks import BOOT, check_time, check_version, checked, integer, json_object, shown, text
+from iort_contract.checks import (
+    BOOT,
+    check_time,
+    check_version,
+    checked,
+    integer,
+    json_object,
+    shown,
+    whole_number,
+)
 from iort_contract.limits import SCHEMA_VERSION, ContractError
-from iort_contract.messages.envelope import entries, read
+from iort_contract.messages.envelope import codec, read, to_json
 from iort_contract.topics import check_robot
 
 # Where robots upload to, in the files' bucket.
@@ -143,36 +151,6 @@ def part_range(file: File, part: int) -> tuple[int, int]:
     return first, min(PART_BYTES, file.size - first)
 
 
-def encode_file_request(request: FileRequest) -> bytes:
-    """The request as JSON; raises `ContractError` if it is invalid."""
-    _check_file_request(request)
-    file = request.file
-    envelope: dict[str, Any] = {
-        "v": SCHEMA_VERSION,
-        "id": request.id,
-        "file": entries(file),
-        "parts": {str(part): sha256 for part, sha256 in request.parts.items()},
-    }
-    if request.parts_sha256 is not None:
-        envelope["parts_sha256"] = request.parts_sha256
-    return json.dumps(envelope, separators=(",", ":")).encode()
-
-
-def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest:
-    """Decode a request; raises `ContractError` for everything that `encode_file_request` cannot have
-    written."""
-    envelope = message if isinstance(message, Mapping) else json_object(message, "file request")
-    check_version(envelope)
-    given, parts = envelope.get("file"), envelope.get("parts")
-    if not isinstance(given, Mapping) or not isinstance(parts, Mapping):
-        raise ContractError("file and parts must be an object each")
-    file = read(File, given)
-    numbered = {int(n) if str(n).isdecimal() and len(str(n)) < 6 else -1: sha for n, sha in parts.items()}
-    request = FileRequest(text(envelope, "id"), file, numbered, envelope.get("parts_sha256"))
-    _check_file_request(request)
-    return request
-
-
 def file_request_id(message: Mapping[str, Any]) -> str | None:
     """A request's id, even if the rest is invalid; None if an answer could not repeat it."""
     given = message.get("id")
@@ -189,10 +167,10 @@ def encode_file_answer(answer: FileAnswer) -> bytes:
     else:
         envelope.update(key=answer.key, stored=answer.stored)
     if answer.have:
-        envelope["have"] = [list(one) for one in answer.have]
+        envelope["have"] = answer.have
     if answer.addresses:
-        envelope["addresses"] = [one._asdict() for one in answer.addresses]
-    return json.dumps(envelope, separators=(",", ":")).encode()
+        envelope["addresses"] = [address._asdict() for address in answer.addresses]
+    return to_json(envelope)
 
 
 def decode_file_answer(message: bytes | str) -> FileAnswer:
@@ -227,6 +205,18 @@ def check_sha256(value: object, what: str = "SHA-256") -> str:
     return checked(_SHA256, value, what, "64 of 0-9 a-f")
 
 
+def _file(content: Any) -> File:
+    if not isinstance(content, Mapping):
+        raise ContractError(f"file must be an object, got {shown(content)}")
+    return read(File, content)
+
+
+def _parts(content: Any) -> dict[int, Any]:
+    if not isinstance(content, Mapping):
+        raise ContractError(f"parts must be an object, got {shown(content)}")
+    return {int(n) if str(n).isdecimal() and len(str(n)) < 6 else -1: sha for n, sha in content.items()}
+
+
 def _check_file_request(request: FileRequest) -> None:
     checked(BOOT, request.id, "id", "8 to 32 of 0-9 a-f")
     file = _check_file(request.file)
@@ -239,14 +229,18 @@ def _check_file_request(request: FileRequest) -> None:
         check_sha256(request.parts_sha256, "parts_sha256")
 
 
+encode_file_request, decode_file_request = codec(
+    FileRequest, "file request", _check_file_request, file=_file, parts=_parts
+)
+
+
 def _check_file(file: File) -> File:
     checked(_FILE_NAME, file.name, "file name", "up to 4 levels of A-Z a-z 0-9 . _ -, up to 100 each")
     if file.kind not in KINDS:
         raise ContractError(f"kind must be one of {', '.join(KINDS)}, got {shown(file.kind)}")
     checked(_CONTENT_TYPE, file.content_type, "content type", "type/subtype in lower case")
     check_sha256(file.sha256)
-    if type(file.size) is not int or not 0 <= file.size <= MAX_FILE_BYTES:
-        raise ContractError(f"size must be 0 to {MAX_FILE_BYTES} bytes, got {shown(file.size)}")
+    whole_number("size", file.size, 0, MAX_FILE_BYTES)
     if check_time(file.t_us, "file time") < 0:
         raise ContractError(f"file time must be from 1970 on, got {file.t_us}")
     return file

@@ -4,7 +4,6 @@ and leases of viewers, for whom it sends more.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple
 
@@ -21,6 +20,7 @@ from iort_contract.checks import (
     offset_entry,
     shown,
     text,
+    whole_number,
     wire_column,
     wire_sample,
 )
@@ -33,7 +33,7 @@ from iort_contract.limits import (
     ContractError,
     Value,
 )
-from iort_contract.messages.envelope import entries, read
+from iort_contract.messages.envelope import codec, to_json
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 from iort_contract.topics import VIEW, build_topic, check_robot, check_stream
 
@@ -111,9 +111,7 @@ def silent_s(next_ms: int | None) -> float:
 def _next_entry(next_ms: Any) -> dict[str, int]:
     if next_ms is None:
         return {}
-    if type(next_ms) is not int or not 1 <= next_ms <= MAX_NEXT_MS:
-        raise ContractError(f"next_ms must be an integer from 1 to {MAX_NEXT_MS}, got {shown(next_ms)}")
-    return {"next_ms": next_ms}
+    return {"next_ms": whole_number("next_ms", next_ms, 1, MAX_NEXT_MS)}
 
 
 def live_update(
@@ -177,7 +175,7 @@ def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
     ping["sent_us"] = check_time(sent_us, "sent_us")
     if padding:
         ping["padding"] = padding
-    return json.dumps(ping, separators=(",", ":")).encode()
+    return to_json(ping)
 
 
 class Pong(NamedTuple):
@@ -224,28 +222,13 @@ def lease_topic(robot: str, namespace: str) -> str:
     return build_topic(VIEW, robot, LEASE, namespace)
 
 
-def encode_lease(lease: Lease) -> bytes:
-    """The lease as JSON; raises `ContractError` if it is invalid."""
-    _check(lease)
-    return json.dumps({"v": SCHEMA_VERSION, **entries(lease)}, separators=(",", ":")).encode()
-
-
-def decode_lease(payload: bytes | str) -> Lease:
-    """Decode a lease; raises `ContractError` for everything that `encode_lease` cannot have written."""
-    envelope = json_object(payload, "lease")
-    check_version(envelope)
-    lease = read(Lease, envelope)
-    _check(lease)
-    return lease
-
-
 def _check(lease: Lease) -> None:
     checked(BOOT, lease.viewer, "viewer", "8 to 32 of 0-9 a-f")
     if not LIVE_MIN_RATE_HZ <= lease.rate_hz <= LIVE_MAX_RATE_HZ:
         raise ContractError(
             f"rate_hz must be {LIVE_MIN_RATE_HZ:g} to {LIVE_MAX_RATE_HZ:g}, got {shown(lease.rate_hz)}"
         )
-    if type(lease.lease_ms) is not int or not 0 <= lease.lease_ms <= VIEW_LEASE_MS:
-        raise ContractError(
-            f"lease_ms must be an integer from 0 to {VIEW_LEASE_MS}, got {shown(lease.lease_ms)}"
-        )
+    whole_number("lease_ms", lease.lease_ms, 0, VIEW_LEASE_MS)
+
+
+encode_lease, decode_lease = codec(Lease, "lease", _check)

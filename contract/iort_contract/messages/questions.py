@@ -22,7 +22,7 @@ from iort_contract.checks import (
 )
 from iort_contract.codec import PLAIN_CODEC
 from iort_contract.limits import SCHEMA_VERSION, ContractError, Value
-from iort_contract.messages.envelope import entries, read
+from iort_contract.messages.envelope import entries, read, to_json
 from iort_contract.messages.files import check_sha256, parse_file_key
 from iort_contract.topics import check_robot, check_stream
 
@@ -157,14 +157,6 @@ def decode_answer(message: bytes | str) -> Answer:
     if "refused" in envelope:
         return Answer(_id(envelope), Refusal(text(envelope, "refused"), text(envelope, "text")))
     return Answer(_id(envelope), _body(envelope, "file", "url"))
-
-
-def to_json(value: Mapping[str, Any]) -> bytes:
-    """A body or an envelope as JSON; raises `ContractError` for what JSON does not have."""
-    try:
-        return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ContractError(f"the body is not JSON: {error}") from error
 
 
 def _id(envelope: Mapping[str, Any]) -> str:

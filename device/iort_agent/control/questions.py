@@ -27,6 +27,7 @@ from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_agent.ros1.json_message import decode, encode
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.envelope import to_json
 from iort_contract.messages.questions import (
     ASK_FOLDER,
     INVALID,
@@ -37,7 +38,6 @@ from iort_contract.messages.questions import (
     Refusal,
     decode_answer,
     encode_ask,
-    to_json,
 )
 from iort_contract.topics import ANSWER, ASK
 

@@ -20,17 +20,11 @@ from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
 from iort_contract.expression import (
     ARITHMETIC,
     COMPARISONS,
-    Arithmetic,
-    Comparison,
+    Calculus,
     Constant,
-    Every,
     ExpressionError,
-    Field,
-    IsNull,
-    Magnitude,
     MismatchError,
     Node,
-    Some,
 )
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
@@ -122,7 +116,7 @@ def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
     null = np.full(n, np.nan)
     numbers = {name: null if column is None else column.astype(float) for name, column in fields.items()}
     with np.errstate(all="ignore"):
-        return _truth(_evaluate(node, numbers), n)
+        return _truth(expression.evaluate(node, numbers, _ARRAYS), n)
 
 
 def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
@@ -145,43 +139,36 @@ def _finite(column: Column) -> Column:
 def _has_text(node: Node) -> bool:
     if isinstance(node, Constant):
         return isinstance(node.value, str)
-    if isinstance(node, Field):
-        return False
-    if isinstance(node, (Arithmetic, Comparison)):
-        return _has_text(node.left) or _has_text(node.right)
-    return any(map(_has_text, node.of if isinstance(node, (Every, Some)) else (node.of,)))
+    return any(map(_has_text, expression.children(node)))
 
 
-def _evaluate(node: Node, numbers: Mapping[str, Column]) -> Any:
-    """An array of numbers with NaN for null, or a mask."""
-    if isinstance(node, Field):
-        return numbers[node.name]
-    if isinstance(node, Constant):
-        return float(node.value)
-    if isinstance(node, Arithmetic):
-        left, right = (np.asarray(_evaluate(side, numbers), dtype=float) for side in (node.left, node.right))
-        result = ARITHMETIC[node.symbol](left, right)
-        return np.where(right == 0, np.nan, result) if node.symbol in "/%" else result
-    if isinstance(node, Magnitude):
-        return np.abs(np.asarray(_evaluate(node.of, numbers), dtype=float))
-    if isinstance(node, Comparison):
-        left, right = (np.asarray(_evaluate(side, numbers), dtype=float) for side in (node.left, node.right))
-        # NaN makes all other comparisons false by itself.
-        known = ~(np.isnan(left) | np.isnan(right)) if node.symbol == "!=" else True
-        return COMPARISONS[node.symbol](left, right) & known
-    if isinstance(node, IsNull):
-        return np.isnan(np.asarray(_evaluate(node.of, numbers), dtype=float))
-    if isinstance(node, (Every, Some)):
-        parts = [_truth(_evaluate(part, numbers)) for part in node.of]
-        combine = np.logical_and if isinstance(node, Every) else np.logical_or
-        mask = parts[0]
-        for part in parts[1:]:
-            mask = combine(mask, part)
-        return mask
-    return ~_truth(_evaluate(node.of, numbers))
+# An array of numbers has NaN for null; a mask is an array of truths.
+def _numbers(value: Any) -> Column:
+    return np.asarray(value, dtype=float)
+
+
+def _calculated(symbol: str, left: Any, right: Any) -> Column:
+    result = ARITHMETIC[symbol](_numbers(left), _numbers(right))
+    return np.where(_numbers(right) == 0, np.nan, result) if symbol in "/%" else np.asarray(result)
+
+
+def _compared(symbol: str, left: Any, right: Any) -> Any:
+    left, right = _numbers(left), _numbers(right)
+    # NaN makes all other comparisons false by itself.
+    known = ~(np.isnan(left) | np.isnan(right)) if symbol == "!=" else True
+    return COMPARISONS[symbol](left, right) & known
 
 
 def _truth(value: Any, n: int | None = None) -> NDArray[np.bool_]:
     value = np.asarray(value)
     mask = value if value.dtype == np.bool_ else (value != 0) & ~np.isnan(value)
     return np.asarray(mask if n is None else np.broadcast_to(mask, (n,)), dtype=np.bool_)
+
+
+_ARRAYS = Calculus(
+    _calculated,
+    lambda value: np.abs(_numbers(value)),
+    _compared,
+    lambda value: np.isnan(_numbers(value)),
+    _truth,
+)

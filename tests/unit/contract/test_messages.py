@@ -394,7 +394,7 @@ class OneTable:
 
     def query(self, **query: Any) -> dict[str, Any]:
         robot, first, last = (
-            query["ExpressionAttributeValues"][f":{n}"]["S"] for n in ("robot", "first", "last")
+            query["ExpressionAttributeValues"][f":{n}"]["S"] for n in ("topic", "first", "last")
         )
         keys = sorted(key for key in self.items if key[0] == robot and first <= key[1] <= last)
         return {"Items": [self.items[key] for key in reversed(keys)]}
