@@ -89,21 +89,15 @@ class Sender:
         Raises `UploadError` if ``stop`` is set, the file cannot be read, or the address is not usable.
         """
         try:
-            url = urlsplit(address.url)
-            host, port = url.hostname, url.port
+            connection, path = _https(address.url, self._trust)
         except ValueError as error:
             raise _no_address(error) from error
-        if url.scheme != "https" or not host:
-            raise UploadError(
-                f"the cloud's address must be https with a host, got {url.scheme}", again_s=None
-            )
         if stop.is_set():
             raise UploadError(f"{local.path}: stopped", again_s=0)
-        connection = http.client.HTTPSConnection(host, port, timeout=_TIMEOUT_S, context=self._trust)
         with contextlib.closing(connection):
             try:
                 connection.connect()
-                connection.putrequest("PUT", f"{url.path}?{url.query}", skip_accept_encoding=True)
+                connection.putrequest("PUT", path, skip_accept_encoding=True)
                 for name, value in address.headers.items():
                     connection.putheader(name, value)
                 connection.endheaders()
@@ -118,6 +112,15 @@ class Sender:
                 # The host name or a header has characters that are not allowed.
                 raise _no_address(error) from error
             return _answer(connection) or Put(Outcome.FAILED, "the connection closed without an answer")
+
+
+def _https(address: str, trust: ssl.SSLContext) -> tuple[http.client.HTTPSConnection, str]:
+    """A connection to an address, not open yet, and its path. Raises `ValueError`."""
+    url = urlsplit(address)
+    if url.scheme != "https" or not url.hostname:
+        raise ValueError(f"it must be https with a host, got {url.scheme}")
+    connection = http.client.HTTPSConnection(url.hostname, url.port, timeout=_TIMEOUT_S, context=trust)
+    return connection, f"{url.path}?{url.query}"
 
 
 def _chunks(local: LocalFile, first: int, size: int, stop: threading.Event) -> Iterator[bytes]:
@@ -174,12 +177,9 @@ def downloader(root_ca: Path | None) -> Callable[[str, int], bytes]:
     trust = trusting(root_ca)
 
     def download(address: str, size: int) -> bytes:
-        url = urlsplit(address)
-        if url.scheme != "https" or not url.hostname:
-            raise ValueError(f"the cloud's address must be https with a host, got {url.scheme}")
-        connection = http.client.HTTPSConnection(url.hostname, url.port, timeout=_TIMEOUT_S, context=trust)
+        connection, path = _https(address, trust)
         with contextlib.closing(connection):
-            connection.request("GET", f"{url.path}?{url.query}")
+            connection.request("GET", path)
             response = connection.getresponse()
             if response.status != http.client.OK:
                 raise OSError(f"the server says {response.status} {response.reason}")

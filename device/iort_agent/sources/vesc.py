@@ -108,16 +108,13 @@ class VescConfig(SourceConfig):
     timeout_s: float = setting(number(0.01, 5, unit="s"), 0.2)
 
     def streams(self) -> Sequence[str]:
-        """The one stream."""
         return [self.stream]
 
     def describe(self) -> str:
-        """The source in a few words."""
         behind = "" if self.can_id is None else f", CAN id {self.can_id},"
         return f"VESC on {self.port}{behind} at {self.rate_hz:g} Hz"
 
     def build(self, clock: Clock) -> VescSource:
-        """Make the source; the port is opened when it runs."""
         return VescSource(self, clock)
 
     def check(self, title: str) -> Iterator[Finding]:

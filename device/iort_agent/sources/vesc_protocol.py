@@ -157,10 +157,7 @@ class _Number(NamedTuple):
 
 
 _COUNTERS = (
-    _Number("charge_drawn", "i"),
-    _Number("charge_regen", "i"),
-    _Number("energy_drawn", "i"),
-    _Number("energy_regen", "i"),
+    *(_Number(f"{what}_{way}", "i") for what in ("charge", "energy") for way in ("drawn", "regen")),
     _Number("displacement", "i"),
     _Number("distance_traveled", "i"),
     _Number("fault_code", "B"),
@@ -180,9 +177,7 @@ _NUMBERS = (
     *_COUNTERS,
     _Number("pid_pos_now", "i", 1e6),
     _Number("controller_id", "B"),
-    _Number("ntc_temp_mos1", "h", 10.0),
-    _Number("ntc_temp_mos2", "h", 10.0),
-    _Number("ntc_temp_mos3", "h", 10.0),
+    *(_Number(f"ntc_temp_mos{i}", "h", 10.0) for i in range(1, 4)),
     _Number("avg_vd", "i", 1000.0),
     _Number("avg_vq", "i", 1000.0),
     _Number("status", "B"),

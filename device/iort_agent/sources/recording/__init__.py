@@ -46,15 +46,12 @@ class BagConfig(SourceConfig):
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
     def streams(self) -> Sequence[str]:
-        """The streams of the topics; several topics may share one."""
         return sorted({stream for _, stream in self.topics}) if self.topics else [self.stream]
 
     def describe(self) -> str:
-        """The source in a few words."""
         return f"bag {self.path}"
 
     def recorded(self) -> bool:
-        """It plays a recording."""
         return True
 
     def replayed(self) -> bool:
@@ -62,11 +59,9 @@ class BagConfig(SourceConfig):
         return self.stamps == ORIGINAL and self.speed != 1
 
     def build(self, clock: Clock) -> BagSource:
-        """Make the source; the file is opened when it runs."""
         return BagSource(self, clock)
 
     def uploads_large(self) -> bool:
-        """Whether bytes are sent as files."""
         return self.large == UPLOAD
 
     def check(self, title: str) -> Iterator[Finding]:

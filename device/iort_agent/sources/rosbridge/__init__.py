@@ -1,7 +1,7 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
 JSON has no types, so the server's rosapi is asked for them. Each message is made into the ROS 1 message that
-it was, and goes the way of the ROS 1 source. If rosapi does not answer, the structure is `inferred` from the
+it was, and goes the way of the ROS 1 source. If rosapi does not answer, the structure is inferred from the
 JSON; only the sample is sent then, and counted as ``structure_not_kept``.
 """
 
@@ -20,8 +20,7 @@ from iort_agent.ros1.json_message import Writer
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake, Kind
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
-from iort_agent.sources.rosbridge.inferred import infer
-from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
+from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure, infer
 from iort_contract.limits import MessageError
 
 # A latched message comes with the subscription, or not at all.
@@ -140,15 +139,12 @@ class RosbridgeConfig(SourceConfig):
     )
 
     def streams(self) -> Sequence[str]:
-        """The streams of the topics; several topics may share one."""
         return sorted({topic.stream for _, topic in self.topics})
 
     def describe(self) -> str:
-        """The source in a few words."""
         return f"rosbridge {self.url}, topics {', '.join(topic for topic, _ in self.topics)}"
 
     def build(self, clock: Clock) -> RosbridgeSource:
-        """Make the source; the connection is made when it runs."""
         return RosbridgeSource(self, clock)
 
     def check(self, title: str) -> Iterator[Finding]:
@@ -188,7 +184,6 @@ class RosbridgeSource:
                 hearing.structure(None)
 
     def report(self) -> dict[str, Any]:
-        """The counts of the messages, by topic."""
         return {
             name: {**hearing.report(), **self.connection.report(name)}
             for name, hearing in self._hearings.copy().items()
@@ -214,11 +209,9 @@ class RosbridgeSource:
         return self._hearings[topic].take(message, data, arrival_us)
 
     def answer(self, said: Mapping[str, Any]) -> None:
-        """Take an answer, which may be rosapi's."""
         self._rosapi.answer(said)
 
     def look(self) -> None:
-        """Called about once a second."""
         self._rosapi.look()
 
     def _found(self, topic: str, structure: Structure | None) -> None:
@@ -288,7 +281,6 @@ class _Hearing:
             self._record(message, arrival_us)
 
     def report(self) -> dict[str, Any]:
-        """The counts of the messages."""
         counts = {name: count for name, count in self._intake.report().items() if count}
         if self._numbers.missed:
             counts["missed"] = self._numbers.missed

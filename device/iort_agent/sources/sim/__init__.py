@@ -213,16 +213,13 @@ class SimConfig(SourceConfig):
     faults: tuple[FaultConfig, ...] = setting(items(fault_rule, what="a list of faults"), ())
 
     def streams(self) -> Sequence[str]:
-        """The VESC's stream, and the pose's."""
         return [self.stream, self.pose.stream] if self.pose.rate_hz else [self.stream]
 
     def describe(self) -> str:
-        """The source in a few words."""
         wrong = " and ".join(fault.kind for fault in self.faults)
         return f"simulated car at {self.rate_hz:g} Hz" + (f" with {wrong}" if wrong else "")
 
     def build(self, clock: Clock) -> SimSource:
-        """Make the source."""
         return SimSource(self, clock)
 
 

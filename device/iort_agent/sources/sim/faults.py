@@ -4,9 +4,10 @@ moment to moment."""
 from __future__ import annotations
 
 import math
+import operator
 import random
 from dataclasses import dataclass
-from typing import Any, Mapping, MutableMapping, NamedTuple, Sequence, Tuple
+from typing import Any, Callable, Mapping, MutableMapping, NamedTuple, Sequence, Tuple
 
 from iort_agent.common.schema import Place, choice, number, section, setting
 from iort_contract.limits import Value
@@ -214,28 +215,28 @@ class Damage:
                 sample[fault.field] = self._kept.setdefault(fault.field, value)
 
     def _apply(self, fault: FaultConfig) -> None:
-        kind, value = fault.kind, fault.value
-        if kind == "worn_battery":
-            self.battery_resistance *= 1 + value
-            self.capacity *= max(0.01, 1 - value / 5)
-        elif kind == "added_friction":
-            self.friction_n += value
-        elif kind == "flat_tyre":
-            self.radius *= 1 - value
-            self.rolling *= 1 + 20 * value
-        elif kind == "dragging_brake":
-            self._brake_n += value
-        elif kind == "cell_dropout":
-            self._cell_v += value
-        elif kind == "cooling_lost":
-            self.cooling *= 1 - value
-        elif kind == "loose_pinion":
-            self.pinion_holds_n = min(self.pinion_holds_n, value)
-        elif kind == "motor_resistance":
-            self.motor_resistance_ohm += value
-        elif kind == "payload":
-            self.payload_kg += value
-        elif kind == "intermittent_can":
-            self._can_share = value
-        else:
+        if KINDS[fault.kind].by_field:
             self._sensors.append(fault)
+        for name, changed in _CHANGES.get(fault.kind, {}).items():
+            setattr(self, name, changed(getattr(self, name), fault.value))
+
+
+# What a fault of a value changes, each from what it was before.
+_CHANGES: Mapping[str, Mapping[str, Callable[[float, float], float]]] = {
+    "worn_battery": {
+        "battery_resistance": lambda before, value: before * (1 + value),
+        "capacity": lambda before, value: before * max(0.01, 1 - value / 5),
+    },
+    "added_friction": {"friction_n": operator.add},
+    "flat_tyre": {
+        "radius": lambda before, value: before * (1 - value),
+        "rolling": lambda before, value: before * (1 + 20 * value),
+    },
+    "dragging_brake": {"_brake_n": operator.add},
+    "cell_dropout": {"_cell_v": operator.add},
+    "cooling_lost": {"cooling": lambda before, value: before * (1 - value)},
+    "loose_pinion": {"pinion_holds_n": min},
+    "motor_resistance": {"motor_resistance_ohm": operator.add},
+    "payload": {"payload_kg": operator.add},
+    "intermittent_can": {"_can_share": lambda _, value: value},
+}

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from iort_agent.ros1.json_message import Writer
 from iort_agent.sources.rosbridge import Numbers, Repeats
-from iort_agent.sources.rosbridge.inferred import infer
-from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs
+from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs, infer
 from iort_contract.limits import MessageError
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import Definition, md5sum, parse
