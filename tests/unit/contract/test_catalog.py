@@ -97,12 +97,7 @@ def test_a_message_cannot_overwrite_a_key_that_the_cloud_adds(rule):
     assert (EXPIRES_S in names) == (rule == "record")
     assert (MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload", "ask"))
     for name, part in zip(names, selected.split(", ")):
-        if name in (
-            RECEIVED_MS,
-            TOPIC,
-            EXPIRES_S,
-            ROBOT,
-        ):
+        if name in (RECEIVED_MS, TOPIC, EXPIRES_S, ROBOT):
             assert re.match(r"(timestamp|topic|floor)\(", part), part
 
 
@@ -161,56 +156,23 @@ def test_a_missing_variable_is_named():
 # The table of the VESC's fields and faults.
 
 # The messages of the drivers, in their order.
-ROS1 = [
-    "voltage_input",
-    "temperature_pcb",
-    "current_motor",
-    "current_input",
-    "speed",
-    "duty_cycle",
-    "charge_drawn",
-    "charge_regen",
-    "energy_drawn",
-    "energy_regen",
-    "displacement",
-    "distance_traveled",
-    "fault_code",
-]
-ROS2 = [
-    "temp_fet",
-    "temp_motor",
-    "current_motor",
-    "current_input",
-    "avg_id",
-    "avg_iq",
-    "duty_cycle",
-    "speed",
-    "voltage_input",
-    "charge_drawn",
-    "charge_regen",
-    "energy_drawn",
-    "energy_regen",
-    "displacement",
-    "distance_traveled",
-    "fault_code",
-    "pid_pos_now",
-    "controller_id",
-    "ntc_temp_mos1",
-    "ntc_temp_mos2",
-    "ntc_temp_mos3",
-    "avg_vd",
-    "avg_vq",
-]
+ROS1 = re.findall(
+    r"\w+",
+    """voltage_input temperature_pcb current_motor current_input speed duty_cycle charge_drawn charge_regen
+    energy_drawn energy_regen displacement distance_traveled fault_code""",
+)
+ROS2 = re.findall(
+    r"\w+",
+    """temp_fet temp_motor current_motor current_input avg_id avg_iq duty_cycle speed voltage_input
+    charge_drawn charge_regen energy_drawn energy_regen displacement distance_traveled fault_code
+    pid_pos_now controller_id ntc_temp_mos1 ntc_temp_mos2 ntc_temp_mos3 avg_vd avg_vq""",
+)
 UNITS = {"V", "A", "degC", "1", "erpm", "1e-4 Ah", "1e-4 Wh", "counts", "enum", "deg", "id"}
 
 
 @pytest.mark.parametrize(("version", "expected"), [(1, ROS1), (2, ROS2)])
 def test_the_fields_are_those_of_the_message(version, expected):
     assert {name for name, field in VESC_FIELDS.items() if version in field.ros} == set(expected)
-
-
-def test_ros1_message_has_13_fields():
-    assert len(ROS1) == len(set(ROS1)) == 13
 
 
 @pytest.mark.parametrize("field", VESC_FIELDS.values(), ids=lambda field: field.name)
