@@ -5,6 +5,7 @@ and every kind of finding is one of `KINDS`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from iort_contract.catalog.car import BATTERY, FORCES, HEAT, MOTOR
@@ -62,33 +63,28 @@ _DRIVETRAIN = (
         least_share=0.0,
     ),
 )
+_drift = partial(Parameter, kind="sensor_drift", least_share=0.0)
 _SENSORS = (
-    Parameter(
+    _drift(
         "voltage_drift_v",
         "V",
         "error of the battery's voltage that grew in the drive, against duty cycle, speed and current",
-        kind="sensor_drift",
         fields=("voltage_input", "duty_cycle", "speed"),
         least=0.15,
-        least_share=0.0,
     ),
-    Parameter(
+    _drift(
         "motor_current_drift_a",
         "A",
         "error of the motor's current that grew in the drive, against duty cycle and battery current",
-        kind="sensor_drift",
         fields=("current_motor", "current_input", "duty_cycle"),
         least=0.6,
-        least_share=0.0,
     ),
-    Parameter(
+    _drift(
         "temperature_drift_k",
         "K",
         "error of the controller's temperature that grew in the drive, against how a board warms up",
-        kind="sensor_drift",
         fields=("temperature_pcb", "temp_fet", "current_motor"),
         least=3.5,
-        least_share=0.0,
     ),
     Parameter(
         "controller_lag_s",

@@ -3,6 +3,7 @@ tell of a car."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from iort_contract.catalog.entries import Parameter
@@ -27,6 +28,8 @@ KNOWN = {
 }
 
 _BATTERY = ("voltage_input", "current_input")
+# What the battery has after the drive.
+_left = partial(Parameter, fields=_BATTERY, state=True)
 BATTERY = (
     Parameter(
         "battery_resistance_ohm",
@@ -43,33 +46,19 @@ BATTERY = (
         worse="up",
         fields=_BATTERY,
     ),
-    Parameter(
-        "battery_open_voltage_v",
-        "V",
-        "open-circuit voltage at the drive's end, as after a long rest",
-        fields=_BATTERY,
-        state=True,
-    ),
-    Parameter(
+    _left("battery_open_voltage_v", "V", "open-circuit voltage at the drive's end, as after a long rest"),
+    _left(
         "battery_voltage_per_ah",
         "V/Ah",
         "fall of the open-circuit voltage with the charge drawn; more in a smaller or emptier battery",
-        fields=_BATTERY,
-        state=True,
     ),
-    Parameter(
-        "battery_drawn_share",
-        "1",
-        "charge that the drive drew, as a share of the battery's rated capacity",
-        fields=_BATTERY,
-        state=True,
+    _left(
+        "battery_drawn_share", "1", "charge that the drive drew, as a share of the battery's rated capacity"
     ),
-    Parameter(
+    _left(
         "battery_charge_left",
         "1",
         "charge in the battery at the drive's end, as a share; by the voltage of its cells at rest",
-        fields=_BATTERY,
-        state=True,
     ),
     Parameter(
         "battery_range_left_km",
@@ -128,7 +117,7 @@ MOTOR = (
     ),
 )
 
-_MOTION = ("current_motor", "speed")
+_moved = partial(Parameter, fields=("current_motor", "speed"))
 FORCES = (
     Parameter(
         "speed_to_erpm_gain",
@@ -140,82 +129,57 @@ FORCES = (
         least_share=0.03,
     ),
     Parameter("motor_force_n_per_a", "N/A", "force at the tyres for an ampere of the motor, without losses"),
-    Parameter(
-        "effective_mass_kg", "kg", "mass that the motor moves, with that of what turns", fields=_MOTION
-    ),
-    Parameter(
+    _moved("effective_mass_kg", "kg", "mass that the motor moves, with that of what turns"),
+    _moved(
         "rotating_mass_kg",
         "kg",
         "inertia of motor, gears and wheels, as a mass at the tyres; with the car's known mass",
-        fields=_MOTION,
     ),
-    Parameter("friction_n", "N", "force that rolling takes at any speed", worse="up", fields=_MOTION),
-    Parameter("drag_n_s2_per_m2", "N s2/m2", "force of the air, by the square of the speed", fields=_MOTION),
-    Parameter(
-        "drivetrain_efficiency",
-        "1",
-        "share of the motor's force that the gears pass on",
-        worse="down",
-        fields=_MOTION,
-    ),
-    Parameter(
-        "brake_drag_n",
-        "N",
-        "force of a brake that still holds, just after braking",
-        worse="up",
-        fields=_MOTION,
-    ),
-    Parameter(
+    _moved("friction_n", "N", "force that rolling takes at any speed", worse="up"),
+    _moved("drag_n_s2_per_m2", "N s2/m2", "force of the air, by the square of the speed"),
+    _moved("drivetrain_efficiency", "1", "share of the motor's force that the gears pass on", worse="down"),
+    _moved("brake_drag_n", "N", "force of a brake that still holds, just after braking", worse="up"),
+    _moved(
         "acceleration_per_a_mps2",
         "m/s2/A",
         "acceleration for an ampere of the motor, without friction",
         worse="down",
-        fields=_MOTION,
     ),
-    Parameter(
-        "friction_per_mass_mps2",
-        "m/s2",
-        "how fast the car slows down as it rolls",
-        worse="up",
-        fields=_MOTION,
-    ),
+    _moved("friction_per_mass_mps2", "m/s2", "how fast the car slows down as it rolls", worse="up"),
 )
 
 _BODIES = {"motor": ("temp_motor",), "controller": ("temp_fet", "temperature_pcb")}
 HEAT = tuple(
     parameter
     for name, fields in _BODIES.items()
+    for heated in (partial(Parameter, fields=("current_motor", *fields)),)
     for parameter in (
-        Parameter(
+        heated(
             f"{name}_rise_k_per_a2",
             "K/A2",
             f"warming of the {name} for each A2 of the motor current's mean square, with the drive's wind",
             worse="up",
             kind="cooling_lost",
-            fields=("current_motor", *fields),
             least_share=0.4,
         ),
-        Parameter(
+        heated(
             f"{name}_thermal_resistance_k_per_w",
             "K/W",
             f"warming of the {name} for each watt lost in motor and controller together",
             worse="up",
-            fields=("current_motor", *fields),
         ),
-        Parameter(
+        heated(
             f"{name}_final_degc",
             "degC",
             f"temperature at which the {name} settles, if the load of the drive's last minutes goes on",
             worse="up",
-            fields=("current_motor", *fields),
             state=True,
         ),
-        Parameter(
+        heated(
             f"{name}_time_to_limit_s",
             "s",
             f"time until the {name} reaches 85 degC, if the load of the drive's last minutes goes on",
             worse="down",
-            fields=("current_motor", *fields),
             state=True,
         ),
     )
