@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import secrets
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain, islice
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from iort_contract.catalog.car import GROUPS
 from iort_contract.catalog.derived import Vehicle
@@ -17,6 +17,18 @@ from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, No
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
+
+_T = TypeVar("_T", Finding, AnalysedDrive, Note)
+
+
+def findings_table(cloud: Cloud) -> FindingsTable:
+    """The table of findings."""
+    return FindingsTable(cloud.client("dynamodb"), cloud.output("storage", "FindingsTable"))
+
+
+def robots_of(cloud: Cloud, robot: str | None) -> list[str]:
+    """The robot, or every robot without one."""
+    return sorted(row["robot"] for row in registry.listed(cloud)) if robot is None else [robot]
 
 
 def findings(
@@ -28,12 +40,7 @@ def findings(
     most: int | None = None,
 ) -> list[Finding]:
     """Findings about drives that begin in a range, the newest first; of all robots without one."""
-    newest = [
-        finding
-        for name in robots_of(cloud, robot)
-        for finding in islice(findings_table(cloud).findings(name, start_us, end_us), most)
-    ]
-    return sorted(newest, key=lambda finding: finding.id, reverse=True)[:most]
+    return _newest(cloud, robot, lambda table, name: table.findings(name, start_us, end_us), most)
 
 
 def drives(
@@ -44,26 +51,8 @@ def drives(
     *,
     most: int | None = None,
 ) -> list[AnalysedDrive]:
-    """Analysed drives that begin in a range, the newest first; of all robots without one."""
-    newest = [
-        drive
-        for name in robots_of(cloud, robot)
-        for drive in findings_table(cloud).drives(name, start_us, end_us, most=most)
-    ]
-    return sorted(newest, key=lambda drive: str(drive.drive), reverse=True)[:most]
-
-
-def findings_table(cloud: Cloud) -> FindingsTable:
-    """The table of findings."""
-    return FindingsTable(cloud.client("dynamodb"), cloud.output("storage", "FindingsTable"))
-
-
-def robots_of(cloud: Cloud, robot: str | None) -> Iterator[str]:
-    """The robot, or every robot without one."""
-    if robot is not None:
-        yield robot
-        return
-    yield from sorted(row["robot"] for row in registry.listed(cloud))
+    """As `findings`, analysed drives."""
+    return _newest(cloud, robot, lambda table, name: table.drives(name, start_us, end_us, most=most), most)
 
 
 def notes(
@@ -74,13 +63,20 @@ def notes(
     *,
     most: int | None = None,
 ) -> list[Note]:
-    """Notes about a range, the newest first; of all robots without one."""
-    newest = [
-        note
-        for name in robots_of(cloud, robot)
-        for note in findings_table(cloud).notes(name, start_us, end_us, most=most)
-    ]
-    return sorted(newest, key=lambda note: note.id, reverse=True)[:most]
+    """As `findings`, notes about a range."""
+    return _newest(cloud, robot, lambda table, name: table.notes(name, start_us, end_us, most=most), most)
+
+
+def _newest(
+    cloud: Cloud, robot: str | None, read: Callable[[FindingsTable, str], Iterator[_T]], most: int | None
+) -> list[_T]:
+    table = findings_table(cloud)
+    rows = [row for name in robots_of(cloud, robot) for row in islice(read(table, name), most)]
+    return sorted(rows, key=_key, reverse=True)[:most]
+
+
+def _key(row: Finding | AnalysedDrive | Note) -> str:
+    return str(row.drive) if isinstance(row, AnalysedDrive) else row.id
 
 
 def write_note(cloud: Cloud, robot: str, text: str, *, by: str, t_us: int | None = None) -> Note:

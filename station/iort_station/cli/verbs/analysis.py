@@ -87,7 +87,7 @@ def analyse(
     facts = {"run": name, "drives": done.drives or 0, "failed": len(failed), "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
     if not done.drives:
-        for line in _recorded(cloud, robots or sorted(findings.robots_of(cloud, None)), request):
+        for line in _recorded(cloud, robots or findings.robots_of(cloud, None), request):
             say(line)
     for one in failed:
         say(f"{one.drive.robot}: {one.text}")

@@ -11,59 +11,22 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.commands import Command, DriveLimits, decode_command, encode_command
+from iort_contract.messages.commands import (
+    CLOCK_UNKNOWN,
+    REFUSALS,
+    DriveLimits,
+    decode_command,
+    encode_command,
+)
 from iort_contract.messages.live import LiveSample
 from iort_station.cli.verbs.drive import FIRST_US, NEXT_US, Keys, _Seat, keys_of
 from iort_station.errors import StationError
 from iort_station.fleet import stopping
 from iort_station.fleet.driving import Driver, Phase, Stick
-from iort_station.fleet.driving import Driver as TerminalDriver
 from tests.unit.agent.sources.test_sim import CAR_LIMITS, Commanded
 
 LIMITS = DriveLimits("drive", "drive.speed", "drive.steering_angle", 2.0, 0.4, 500)
-CLOUD_US = 1_700_000_000_000_000
-TICK_US = 50_000
 SENT = LiveSample("0badcafe", 0, 0, 0, {}, offset_us=0)
-
-
-class Rig:
-    """A driver and a car that is ``way_us`` away. This computer's clock is CLOUD_US behind the cloud's."""
-
-    def __init__(self, *, way_us: int = 20_000) -> None:
-        self.now_us, self.way_us = 0, way_us
-        self.driver = Driver(LIMITS, "anna", top_mps=1.0)
-        self.sent: list[Command] = []
-        self.left_us: list[int] = []
-        self.answers = True
-
-    def hear(self, stream: str = "vesc", age_us: int = 0, **sample: Any) -> None:
-        """A sample that the car took and sent so long ago as its way takes."""
-        taken_us = CLOUD_US + self.now_us - self.way_us - age_us
-        self.driver.hear(stream, replace(SENT, t_us=taken_us, sent_us=taken_us, sample=sample), self.now_us)
-
-    def answer(self, command: Command, outcome: str = "accepted", **changes: Any) -> None:
-        mine = {"session": command.session, "seq": command.seq, "outcome": outcome, "lease_left_ms": 400}
-        drives = {"driver": command.session, "driver_by": "anna"} if outcome == "accepted" else {}
-        self.hear("drive", **{**mine, **drives, **changes})
-
-    def step(self, ticks: int = 1) -> None:
-        """Let time pass; the car answers what has had its way there and back."""
-        for _ in range(ticks):
-            self.now_us += TICK_US
-            self.hear()
-            due = [i for i, left_us in enumerate(self.left_us) if left_us + 2 * self.way_us <= self.now_us]
-            if due and self.answers:
-                self.answer(self.sent[due[-1]])
-            command = self.driver.tick(self.now_us)
-            if command is not None:
-                self.sent.append(decode_command(encode_command(command)))
-                self.left_us.append(self.now_us)
-
-    def begin(self) -> None:
-        self.step()
-        self.driver.stick = Stick(1.0, -1.0)
-        self.driver.hold(held=True, now_us=self.now_us)
-        self.step(20)
 
 
 VECTORS = json.loads(Path(__file__).with_name("driving.json").read_text())
@@ -103,13 +66,19 @@ def driven(limits: Mapping[str, Any], steps: list[Any]) -> dict[str, Any]:
             sample: dict[str, Any] = {}
             if came:
                 session = link["driver"] or came[-1].session
-                said = {"session": came[-1].session, "seq": came[-1].seq, "outcome": link["outcome"]}
+                said = {
+                    "session": link.get("session", came[-1].session),
+                    "seq": came[-1].seq,
+                    "outcome": link["outcome"],
+                }
                 sample = {**said, "driver": session, "driver_by": link["by"] or "ada", "lease_left_ms": 300}
             t_us, sent_us = ((now - link["way"] - lay + 3000) * 1000 for lay in (2, 0))
             live = replace(SENT, t_us=t_us, sent_us=sent_us, sample=sample)
+            live = replace(live, offset_us=None) if "clockless" in link else live
             driver.hear("drive" if came else "vesc", live, now * 1000)
     return {
         "phase": driver.phase.value,
+        "reason": driver.reason,
         "sent": sent,
         "rtt_ms": None if driver.rtt_us is None else driver.rtt_us / 1000,
     }
@@ -131,118 +100,51 @@ def test_the_driver_does_what_the_vectors_say(vector: Any) -> None:
     assert told(driven(VECTORS["limits"], vector["steps"])) == vector["expected"]
 
 
-def speeds(rig: Rig) -> list[float]:
-    return [command.message["drive"]["speed"] for command in rig.sent]
+HELD = [[4], [20, {"hold": True, "stick": {"x": 1, "y": 1}}]]
+FORBIDDEN = [
+    ({"session": "bbbbbbbb", "driver": "bbbbbbbb", "by": "bert"}, "bert has taken over"),
+    ({"outcome": "driven_by_another", "driver": "bbbbbbbb", "by": "bert"}, "bert has taken over"),
+    ({"outcome": "emergency_stop"}, "stopped until somebody releases it"),
+    ({"outcome": "no_ros"}, "not in the ROS graph"),
+    ({"outcome": "stopped"}, "the car was stopped"),
+    ({"deaf": True}, "500 ms are allowed"),
+    ({"silent": True}, "500 ms are allowed"),
+    ({"way": 300}, "500 ms are allowed"),
+    ({"clockless": True}, REFUSALS[CLOCK_UNKNOWN]),
+]
 
 
-def test_a_hold_begins_at_a_standstill_and_drives_within_both_limits_once_the_car_answers() -> None:
-    rig = Rig()
-    rig.begin()
-    assert rig.driver.phase is Phase.DRIVING
-    assert speeds(rig)[0] == 0
-    assert rig.sent[-1].message == {"drive": {"speed": 1.0, "steering_angle": -0.4}}
-    assert {(one.by, one.lease_ms, one.takeover) for one in rig.sent} == {("anna", 450, False)}
-    assert len({one.session for one in rig.sent}) == 1
-    assert rig.driver.rtt_us == pytest.approx(2 * rig.way_us, abs=TICK_US)
-    by_the_cloud_us = CLOUD_US + rig.now_us
-    assert rig.sent[-1].sent_us == pytest.approx(by_the_cloud_us, abs=rig.way_us)
-
-
-def test_letting_go_holds_the_car_and_leaving_the_wheel_gives_it_up() -> None:
-    rig = Rig()
-    rig.begin()
-    first = rig.sent[-1].session
-    rig.driver.hold(held=False, now_us=rig.now_us)
-    rig.step(100)
-    assert rig.driver.phase is Phase.HOLDING
-    assert speeds(rig)[-101:] == [1.0] + [0] * 100
-    assert not any(command.ends for command in rig.sent)
-    rig.driver.hold(held=True, now_us=rig.now_us)
-    rig.step(10)
-    assert (rig.sent[-1].session, speeds(rig)[-1]) == (first, 1.0)
-    rig.driver.leave()
-    rig.step(10)
-    assert speeds(rig)[-4:] == [1.0, 0, 0, 0]
-    assert [command.ends for command in rig.sent][-4:] == [False, True, True, True]
-    rig.driver.hold(held=True, now_us=rig.now_us)
-    rig.step(5)
-    assert rig.sent[-1].session != first
+@pytest.mark.parametrize(("link", "reason"), FORBIDDEN)
+def test_a_hold_that_ends_says_why_and_moves_nothing_until_the_driver_lets_go(link: Any, reason: str) -> None:
+    steps = [*HELD, [30, {"link": link}]]
+    done = driven(VECTORS["limits"], steps)
+    assert done["phase"] == "over"
+    assert reason in done["reason"]
+    count = len(done["sent"])
+    later = driven(VECTORS["limits"], [*steps, [40, {"link": LINK}]])
+    assert later["phase"] == "over"
+    assert not any(one.message["drive"]["speed"] for _, one in later["sent"][count:])
 
 
 @pytest.mark.parametrize(
-    ("outcome", "changes", "reason"),
+    ("steps", "reason"),
     [
-        ("driven_by_another", {"driver": "bbbbbbbb", "driver_by": "bert"}, "bert has taken over"),
-        ("emergency_stop", {}, "stopped until somebody releases it"),
-        ("no_ros", {}, "not in the ROS graph"),
+        ([*HELD, [10, {"pause": 2000}]], "stood still for 20"),
+        ([*HELD, [2, {"hold": False}], [30, {"link": {"silent": True}}], [2, {"hold": True}]], "1000 ms are"),
+        ([[2, {"hold": True}]], "nothing has been heard of the car yet"),
+        ([[4], [60, {"hold": True, "link": {"deaf": True}}]], "the car does not answer"),
     ],
 )
-def test_a_refusal_ends_the_hold_until_the_driver_lets_go(outcome: str, changes: Any, reason: str) -> None:
-    rig = Rig()
-    rig.begin()
-    rig.answer(rig.sent[-1], outcome, **changes)
-    assert rig.driver.phase is Phase.OVER
-    assert reason in rig.driver.reason
-    count = len(rig.sent)
-    rig.step(40)
-    assert not any(speeds(rig)[count:]), "still held, and nothing moves"
+def test_no_hold_goes_on_by_old_keys_or_samples(steps: Any, reason: str) -> None:
+    done = driven(VECTORS["limits"], steps)
+    assert done["phase"] == "over"
+    assert reason in done["reason"]
 
 
-def test_another_who_takes_over_ends_the_hold_and_is_named() -> None:
-    rig = Rig()
-    rig.begin()
-    rig.hear("drive", session="bbbbbbbb", seq=0, outcome="accepted", driver="bbbbbbbb", driver_by="bert",
-             lease_left_ms=400)  # fmt: skip
-    assert (rig.driver.phase, rig.driver.reason) == (Phase.OVER, "bert has taken over")
-    rig.driver.hold(held=False, now_us=rig.now_us)
-    rig.driver.takeover = True
-    rig.driver.hold(held=True, now_us=rig.now_us)
-    rig.answers = False
-    rig.step(2)
-    assert rig.sent[-1].takeover
-
-
-def test_a_car_that_no_longer_answers_is_not_driven_on() -> None:
-    rig = Rig()
-    rig.begin()
-    rig.answers = False
-    rig.step(20)
-    assert rig.driver.phase is Phase.OVER
-    assert "500 ms are allowed" in rig.driver.reason
-
-
-def test_a_program_that_stood_still_does_not_drive_on_by_the_keys_of_that_time() -> None:
-    rig = Rig()
-    rig.begin()
-    rig.answer(rig.sent[-1])
-    rig.now_us += 2_000_000
-    rig.step(10)
-    assert rig.driver.phase is Phase.OVER
-    assert "stood still for 20" in rig.driver.reason
-    assert speeds(rig)[-11:] == [1] + [0] * 10
-
-
-def test_a_car_that_has_stopped_meanwhile_does_not_go_on() -> None:
-    rig = Rig()
-    rig.begin()
-    rig.answer(rig.sent[-1], "stopped")
-    rig.step(10)
-    assert (rig.driver.phase, rig.driver.reason) == (Phase.OVER, "the car was stopped")
-    assert speeds(rig)[-11:] == [1] + [0] * 10
-
-
-def test_old_samples_and_a_long_round_trip_are_refused() -> None:
-    rig = Rig()
-    rig.begin()
-    rig.driver.hold(held=False, now_us=rig.now_us)
-    rig.now_us += 1_200_000
-    rig.driver.hold(held=True, now_us=rig.now_us)
-    assert (rig.driver.phase, rig.sent[-1].message["drive"]["speed"]) == (Phase.OVER, 1.0)
-    assert "1000 ms are allowed" in rig.driver.reason
-    far = Rig(way_us=300_000)
-    far.begin()
-    assert far.driver.phase is Phase.OVER
-    assert set(speeds(far)) == {0}
+def test_a_command_is_the_drivers_own_within_both_limits() -> None:
+    sent = [one for _, one in driven(VECTORS["limits"], HELD)["sent"]]
+    assert sent[-1].message == {"drive": {"speed": 1.0, "steering_angle": -0.4}}
+    assert {(one.by, one.lease_ms, one.takeover) for one in sent} == {("ada", 350, False)}
 
 
 def test_a_terminals_arrows_and_letters_are_keys() -> None:
@@ -318,7 +220,7 @@ def test_the_emergency_stop_ends_the_hold_at_once_and_is_not_taken_for_done_if_i
 
 
 def test_a_driver_who_has_let_go_holds_the_car_and_leaves_it_to_its_own_driver_with_the_wheel() -> None:
-    car, driver = Commanded(), TerminalDriver(CAR_LIMITS, "anna", 1.0)
+    car, driver = Commanded(), Driver(CAR_LIMITS, "anna", 1.0)
     speeds: list[float] = []
 
     def drive(seconds: float) -> list[float]:
