@@ -22,14 +22,19 @@ from iort_contract import dynamodb, expression, tables
 from iort_contract.archive import ArchiveTable, Hour
 from iort_contract.catalog.derived import SOURCES
 from iort_contract.catalog.streams import ACCOUNT_STREAM
+from iort_contract.checks import integer
 from iort_contract.codec import flat_second
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.batch import BatchId, batch_id
+from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
+from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_batch
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection, derive, holds
 from iort_station.errors import unknown
 from iort_station.fleet import registry
+
+# A run that has been silent for this long has ended.
+SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
 
 
 def telemetry_table(cloud: Cloud) -> dynamodb.TelemetryTable:
@@ -93,6 +98,58 @@ def last_reports(cloud: Cloud, robot: str) -> Iterator[Item]:
         keys = dynamodb.starting_between(report.t_us - MAX_BATCH_SPAN_US, report.t_us)
         for items in recorded.items(keys, (*ATTRIBUTES, tables.RECEIVED_MS)):
             yield from items
+
+
+@dataclass
+class Account:
+    """The last account of a run's streams and sources, and the time at which the cloud received it."""
+
+    streams: dict[str, StreamAccount] = field(default_factory=dict)
+    sources: dict[str, SourceAccount] = field(default_factory=dict)
+    received_us: int = 0
+
+    def not_recorded(self) -> dict[str, dict[str, int]]:
+        """What each source did not record, as counts by cause."""
+        causes = {name: lost(source.counts) for name, source in self.sources.items()}
+        return {name: counts for name, counts in causes.items() if counts}
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run ended in good order."""
+        return any(stream.ended for stream in self.streams.values())
+
+    @property
+    def lost(self) -> int:
+        """How many samples the run did not record."""
+        refused = sum(stream.refused for stream in self.streams.values())
+        return refused + sum(sum(counts.values()) for counts in self.not_recorded().values())
+
+
+def accounts(cloud: Cloud, robot: str) -> dict[str, Account]:
+    """The last account of each run, by the run's name."""
+    return last_of(map(dynamodb.plain, last_reports(cloud, robot)))
+
+
+def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
+    """The last account of each run among stored items. The batch numbers decide which one is last, since the
+    car's clock may be set back."""
+    batches: list[tuple[Batch, int]] = []
+    for item in stored:
+        with suppress(ContractError):  # the stream's own audit counts these
+            received_ms = integer(item, tables.RECEIVED_MS) if tables.RECEIVED_MS in item else 0
+            batches.append((decode_batch(item), received_ms * 1000))
+    runs: dict[str, Account] = {}
+    for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
+        run = runs.setdefault(batch.boot, Account())
+        run.received_us = max(run.received_us, received_us)
+        for i in range(len(batch.times_us)):
+            with suppress(ContractError):
+                one = account({name: column[i] for name, column in batch.columns.items()})
+                if isinstance(one, StreamAccount):
+                    run.streams[one.stream] = one
+                else:
+                    run.sources[one.source] = one
+    return runs
 
 
 _SECOND_US = 1_000_000

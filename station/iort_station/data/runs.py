@@ -11,9 +11,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from typing import NamedTuple
 
 from iort_analysis.archive.stored import Origin, PageProgress
@@ -28,22 +27,19 @@ from iort_analysis.samples.positions import position_fields
 from iort_contract.catalog.derived import registered_vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.dynamodb import plain, starting_between, whole
-from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
-from iort_contract.messages.account import ACCOUNT_EVERY_S, StreamAccount, account, lost
+from iort_contract.dynamodb import plain, starting_between
+from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.messages.analysis import DriveKey
-from iort_contract.messages.batch import BatchId, decode_batch
+from iort_contract.messages.batch import BatchId
 from iort_contract.messages.insights import Extent
 from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.queries import has_fraction, query
-from iort_station.data.recorded import Recorded
+from iort_station.data.recorded import SILENT_US, Account, Recorded, last_of
 from iort_station.fleet import registry
 
-# A run that has been silent for this long has ended.
-_SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
 _READERS = 8
 # The runs that an overview counts.
 _MOST_RUNS = 100
@@ -61,20 +57,18 @@ class Part(NamedTuple):
         return {"from_us": self.first.t_us, "to_us": self.to_us}
 
 
-class _Account(NamedTuple):
-    """The last report of a run: its streams, what it did not record, and when the cloud received it."""
+class _Report(NamedTuple):
+    """The last report of a run, and the batches that have it."""
 
     part: Part
-    streams: dict[str, StreamAccount]
-    lost: int
-    received_us: int
+    account: Account
 
     @property
     def state(self) -> RunState:
         """How the run went on."""
-        if any(stream.ended for stream in self.streams.values()):
+        if self.account.ended:
             return "ended"
-        return "running" if time.time() * 1e6 - self.received_us < _SILENT_US else "cut off"
+        return "running" if time.time() * 1e6 - self.account.received_us < SILENT_US else "cut off"
 
 
 def runs(
@@ -104,7 +98,7 @@ def runs(
     with ThreadPoolExecutor(_READERS) as pool:
         wholes = pool.map(_Reader.whole, readers)
         reported, *recorded = pool.map(parts, [reports, *readers])
-        accounts = {last.part.last.boot: last for last in pool.map(reports.account, reversed(reported))}
+        accounts = {last.part.last.boot: last for last in pool.map(reports.report, reversed(reported))}
     extents = {stream: whole.extent for stream, whole in zip(streams, wholes, strict=True) if whole}
     entries = _by_run(dict(zip(streams, recorded, strict=True)), accounts)
     entries.sort(key=lambda run: run["to_us"], reverse=True)
@@ -158,13 +152,13 @@ def overview(cloud: Cloud, robot: str, *, origin: Origin | None = None) -> list[
     return [described(stream) for stream in streams if stream in answer["streams"]]
 
 
-def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Account]) -> list[Run]:
+def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Report]) -> list[Run]:
     """The runs with what each recorded of every stream, in no order."""
     entries = {
-        boot: _run(boot, account.part, account)
-        for boot, account in accounts.items()
+        boot: _run(boot, report.part, report)
+        for boot, report in accounts.items()
         # A run with samples is shown for its samples' times, which may be those of a recording.
-        if not any(stream.stored for stream in account.streams.values())
+        if not any(stream.stored for stream in report.account.streams.values())
     }
     for stream, parts in recorded.items():
         for part in parts:
@@ -173,7 +167,7 @@ def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Account]
             run = entries.setdefault(boot, _run(boot, part, reported))
             run["from_us"] = min(run["from_us"], part.first.t_us)
             run["to_us"] = max(run["to_us"], part.to_us)
-            counted = None if reported is None else reported.streams.get(stream)
+            counted = None if reported is None else reported.account.streams.get(stream)
             entry: RunPart = {
                 **part.extent,
                 "batches": part.last.seq - part.first.seq + 1,
@@ -183,13 +177,13 @@ def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Account]
     return list(entries.values())
 
 
-def _run(boot: str, part: Part, reported: _Account | None) -> Run:
-    young = time.time() * 1e6 - part.to_us < _SILENT_US
+def _run(boot: str, part: Part, reported: _Report | None) -> Run:
+    young = time.time() * 1e6 - part.to_us < SILENT_US
     return {
         **part.extent,
         "run": boot,
         "state": ("running" if young else "unknown") if reported is None else reported.state,
-        "lost": 0 if reported is None else reported.lost,
+        "lost": 0 if reported is None else reported.account.lost,
         "streams": {},
     }
 
@@ -210,28 +204,12 @@ class _Reader(Recorded):
             yield Part(first, last, self._end_us(last))
             last = before
 
-    def account(self, part: Part) -> _Account:
+    def report(self, part: Part) -> _Report:
         """The last report of a run."""
-        streams: dict[str, StreamAccount] = {}
-        losses: dict[str, int] = {}
-        received_us = 0
         # An agent that does not batch sends a report in several messages.
         keys = starting_between(part.last.t_us - MAX_BATCH_SPAN_US, part.last.t_us)
-        for items in self.items(keys, (*ATTRIBUTES, RECEIVED_MS)):
-            for item in items:
-                with suppress(ContractError):
-                    batch = decode_batch(plain(item))
-                    if batch.boot != part.last.boot:
-                        continue
-                    received_us = (whole(item, RECEIVED_MS) or 0) * 1000
-                    for i in range(len(batch.times_us)):
-                        row = account({name: column[i] for name, column in batch.columns.items()})
-                        if isinstance(row, StreamAccount):
-                            streams[row.stream] = row
-                        else:
-                            losses[row.source] = sum(lost(row.counts).values())
-        refused = sum(stream.refused for stream in streams.values())
-        return _Account(part, streams, refused + sum(losses.values()), received_us)
+        items = chain.from_iterable(self.items(keys, (*ATTRIBUTES, RECEIVED_MS)))
+        return _Report(part, last_of(map(plain, items)).get(part.last.boot, Account()))
 
     def _first_of(self, last: BatchId) -> tuple[BatchId, BatchId | None]:
         """The first batch of the run of ``last``, and the one before it, of another run."""

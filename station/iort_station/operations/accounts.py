@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
-from iort_contract.checks import integer
-from iort_contract.dynamodb import plain
-from iort_contract.limits import ContractError
-from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
-from iort_contract.messages.batch import Batch, decode_batch
-from iort_contract.tables import RECEIVED_MS
-from iort_station.cloud import Cloud
-from iort_station.data.recorded import last_reports
+from iort_contract.messages.account import StreamAccount
+from iort_station.data.recorded import SILENT_US, Account, accounts, last_of
 from iort_station.operations.audit import Audit, RunAudit, Shortfall
 
-# A run that has been silent for this long has ended.
-_SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
+__all__ = ["accounts", "held_against", "in_car", "last_of", "without_lateness"]
+
 # What is lost with a run that did not end properly, by whether its queue was durable; None is not known.
 _OPEN = "were in open batches, at most one second"
 _NOT_ENDED = {
@@ -26,47 +18,6 @@ _NOT_ENDED = {
     False: f"{_OPEN}, or waited in the queue, which was in memory: the run did not end properly",
     None: f"{_OPEN}, or in the queue if it was in memory: the run did not end properly",
 }
-
-
-@dataclass
-class Account:
-    """The last account of a run's streams and sources, and the time at which the cloud received it."""
-
-    streams: dict[str, StreamAccount] = field(default_factory=dict)
-    sources: dict[str, SourceAccount] = field(default_factory=dict)
-    received_us: int = 0
-
-    def not_recorded(self) -> dict[str, dict[str, int]]:
-        """What each source did not record, as counts by cause."""
-        found = {name: lost(source.counts) for name, source in self.sources.items()}
-        return {name: counts for name, counts in found.items() if counts}
-
-
-def accounts(cloud: Cloud, robot: str) -> dict[str, Account]:
-    """The last account of each run, by the run's name."""
-    return last_of(map(plain, last_reports(cloud, robot)))
-
-
-def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
-    """The last account of each run among stored items. The batch numbers decide which one is last, since the
-    car's clock may be set back."""
-    batches: list[tuple[Batch, int]] = []
-    for item in stored:
-        with suppress(ContractError):  # the stream's own audit counts these
-            received_ms = integer(item, RECEIVED_MS) if RECEIVED_MS in item else 0
-            batches.append((decode_batch(item), received_ms * 1000))
-    found: dict[str, Account] = {}
-    for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
-        run = found.setdefault(batch.boot, Account())
-        run.received_us = max(run.received_us, received_us)
-        for i in range(len(batch.times_us)):
-            with suppress(ContractError):
-                one = account({name: column[i] for name, column in batch.columns.items()})
-                if isinstance(one, StreamAccount):
-                    run.streams[one.stream] = one
-                else:
-                    run.sources[one.source] = one
-    return found
 
 
 def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit:
@@ -77,7 +28,7 @@ def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit
     shortfalls: list[Shortfall] = []
     for boot, run in accounted.items():
         stream = run.streams[one.stream]
-        is_last = run.received_us == newest_us and now_us - run.received_us < _SILENT_US
+        is_last = run.received_us == newest_us and now_us - run.received_us < SILENT_US
         running = is_last and not stream.ended
         shortfalls += _shortfalls(boot, stream, stored.get(boot), running=running)
     taken = sum(run.streams[one.stream].taken for run in accounted.values()) if accounted else None
