@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import Result, Selection, bags, export, inventory, tabular
+from iort_station.data import Selection, bags, export, inventory, tabular
 from iort_station.data.bags import Recording, Write
 from iort_station.data.runs import runs
 from iort_station.data.selection import derive
@@ -167,39 +167,25 @@ def downloads(cloud: Cloud) -> dict[str, Download]:
     """Every download, by the name that is requested: the samples of ``robot`` and ``stream`` from ``from_us``
     to ``to_us``, as recorded."""
     return {
-        "history.csv": partial(_table, cloud, _csv, ".csv"),
-        "history.parquet": partial(_table, cloud, _parquet, ".parquet"),
+        "history.csv": partial(_table, cloud, ".csv"),
+        "history.parquet": partial(_table, cloud, ".parquet"),
         "history.mcap": partial(_mcap, cloud),
     }
 
 
-def _table(
-    cloud: Cloud, write: Callable[[Result, Path], None], suffix: str, request: Mapping[str, str], folder: Path
-) -> Path:
-    selection = _selection(request)
-    result = data.query(
-        cloud,
-        selection.robot,
-        selection.stream,
-        selection.start_us,
-        selection.end_us,
-        most=MOST_VALUES,
-    )
+def _table(cloud: Cloud, suffix: str, request: Mapping[str, str], folder: Path) -> Path:
+    asked = _selection(request)
+    result = data.query(cloud, asked.robot, asked.stream, asked.start_us, asked.end_us, most=MOST_VALUES)
     if not len(result):
         raise StationError("no samples in this range")
-    path = folder / _name(selection, suffix, result.refused)
-    write(result, path)
+    path = folder / _name(asked, suffix, result.refused)
+    if suffix == ".csv":
+        with path.open("w", encoding="utf-8", newline="") as file:
+            tabular.to_csv(result, file)
+    else:
+        with path.open("wb") as binary:
+            tabular.to_parquet(result, binary)
     return path
-
-
-def _csv(result: Result, path: Path) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        tabular.to_csv(result, file)
-
-
-def _parquet(result: Result, path: Path) -> None:
-    with path.open("wb") as file:
-        tabular.to_parquet(result, file)
 
 
 def _mcap(cloud: Cloud, request: Mapping[str, str], folder: Path) -> Path:

@@ -19,26 +19,23 @@ import ssl
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import ExitStack, asynccontextmanager, suppress
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any
 from urllib.parse import urlsplit
 
 from aiohttp import ETag, web
 from typing_extensions import Self
 
 from iort_contract.cloud import PUBNUB
-from iort_contract.messages.page import Admitted, Identity
+from iort_contract.messages.page import Admitted, Config
 from iort_contract.page import (
     HEADERS,
     INVITATION,
     KEY_HEADER,
-    PUBNUB_ORIGIN,
     pubnub_address,
     security_policy,
 )
-from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.invitations import COMMAND, answer, listening
@@ -80,28 +77,20 @@ class PageServer(BackgroundServer):
     the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server
     accepts a Host that is localhost, an address or one of ``names``, and no other. In the folder
     ``invitations`` it gives its own user an `invitation` when asked. A body must come within ``body_s``.
-    With a ``context`` it speaks HTTPS. Raises `StationError` if the page is not built, if the port is in use,
-    and for a configuration that it must not serve.
+    With a ``context`` it speaks HTTPS. The other arguments are those of `config`. Raises `StationError` if
+    the page is not built, if the port is in use, and for a configuration that it must not serve.
     """
 
     def __init__(
         self,
         *,
-        namespace: str,
-        live: Literal["pubnub", "iot"] = "pubnub",
-        broker: str = "",
-        identity: Identity | None = None,
-        subscribe_key: str = "",
-        origin: str = PUBNUB_ORIGIN,
-        tls: bool = True,
         vehicles: Vehicles | Callable[[], Vehicles] | None = None,
-        token: str = "",
+        broker: str = "",
         answers: Mapping[str, Handler] | None = None,
         actions: Mapping[str, Handler] | None = None,
         open_actions: Mapping[str, Handler] | None = None,
-        admitted: Callable[[str], None] | None = None,
         downloads: Mapping[str, Download] | None = None,
-        track: Track | None = None,
+        admitted: Callable[[str], None] = lambda _address: None,
         host: str = "127.0.0.1",
         port: int = 0,
         names: Iterable[str] = (),
@@ -109,6 +98,7 @@ class PageServer(BackgroundServer):
         invitations: Path | None = None,
         body_s: float = BODY_S,
         context: ssl.SSLContext | None = None,
+        **told: Any,
     ) -> None:
         super().__init__(host, port, tls=context, idle_s=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
@@ -121,27 +111,20 @@ class PageServer(BackgroundServer):
         self._tokens: deque[str] = deque(maxlen=_MOST_TOKENS)
         self._invitations = invitations if keyed else None
         self._body_s = body_s
-        self._admitted = admitted or (lambda _: None)
+        self._admitted = admitted
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
-        configured = partial(
-            config,
-            namespace=namespace,
-            live=live,
-            identity=identity,
-            subscribe_key=subscribe_key,
-            origin=origin,
-            tls=tls,
-            token=token,
-            answers=bool(answers),
-            actions=[*free, *keyed],
-            keyed=keyed,
-            invite=COMMAND if keyed and invitations else "",
-            track=track,
-        )
-        pubnub = [pubnub_address(origin, tls=tls)] if live == PUBNUB else []
+        own: dict[str, Any] = {"answers": bool(answers), "actions": [*free, *keyed], "keyed": keyed}
+        own["invite"] = COMMAND if keyed and invitations else ""
+
+        def configured(vehicles: Vehicles | None) -> Config:
+            return config(**told, **own, vehicles=vehicles)
+
+        known = configured(None if callable(vehicles) else vehicles)
         elsewhere = [broker] if broker else []
-        if identity:
-            elsewhere.append(identity["endpoint"])
+        if known["live"] == PUBNUB:
+            elsewhere.insert(0, pubnub_address(known["origin"], tls=known["tls"]))
+        if known["identity"]:
+            elsewhere.append(known["identity"]["endpoint"])
         # Only these can be requested: no path reaches the file system.
         self._files = {
             f"/{name}": packed(TYPES[Path(name).suffix], content)
@@ -151,15 +134,15 @@ class PageServer(BackgroundServer):
         self._work: Work
         self._fresh: asyncio.Future[tuple[int, Body]] | None
         self._known: Body | None = None
-        self._read_config: Callable[[], Body]
+        self._read_config: Callable[[], Body] = lambda: as_json(known)
         if callable(vehicles):
-            self._read_config = lambda: as_json(configured(vehicles=vehicles()))
+            self._read_config = lambda: as_json(configured(vehicles()))
         else:
-            self._files[CONFIG] = as_json(configured(vehicles=vehicles))
+            self._files[CONFIG] = as_json(known)
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",
-            "Content-Security-Policy": security_policy(*pubnub, *elsewhere),
+            "Content-Security-Policy": security_policy(*elsewhere),
             "Server": "iort",
             "Vary": "Accept-Encoding",
         }
