@@ -336,15 +336,6 @@ def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> N
     assert rig.runtime.run(drain_s=10) == 0
 
 
-def test_too_many_columns_are_a_logged_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "ride.csv"
-    names = [f"x{i}" for i in range(754)]
-    path.write_text("\n".join([";".join(["ms_today", *names]), ";".join(["1000", *["1"] * 754])]) + "\n")
-    rig = Rig(sources=(BagConfig(path=path),))
-    assert rig.runtime.run(drain_s=10) == 1
-    assert "754 of its columns hold numbers" in caplog.text
-
-
 def test_round_trips_are_recorded_like_any_stream() -> None:
     enough = threading.Event()
 

@@ -217,6 +217,8 @@ def test_a_lease_is_decoded_as_it_was_encoded(lease: Lease) -> None:
 def test_an_invalid_lease_is_refused(changed: dict[str, object], named: str) -> None:
     with pytest.raises(ContractError, match=named):
         encode_lease(replace(GOOD, **changed))  # type: ignore[arg-type]  # invalid on purpose
+    with pytest.raises(ContractError):
+        decode_lease(json.dumps({**json.loads(encode_lease(GOOD)), **changed}))
 
 
 @given(st.dictionaries(st.sampled_from(["v", "viewer", "rate_hz", "lease_ms", "broker"]), json_values))

@@ -96,6 +96,22 @@ def test_an_invalid_command_is_refused(change: dict[str, Any]) -> None:
     good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
     with pytest.raises(ContractError):
         encode_command(replace(good, **change))
+    if not isinstance(change.get("message"), dict):
+        with pytest.raises(ContractError):
+            decode_command(json.dumps({**json.loads(encode_command(good)), **change}))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"boot": "x"}, {"seq": -1}, {"sent_us": 2**60}, {"offset_us": 2**60}, {"message": []}, {"v": 2}],
+)
+def test_an_invalid_fleet_message_is_refused(change: dict[str, Any]) -> None:
+    good = FleetMessage("0badcafe", 0, T0, {})
+    with pytest.raises(ContractError):
+        decode_fleet(json.dumps({**json.loads(encode_fleet(good)), **change}))
+    if "v" not in change:
+        with pytest.raises(ContractError):
+            encode_fleet(replace(good, **change))
 
 
 ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.text(max_size=9) | st.just({})

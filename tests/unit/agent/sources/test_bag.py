@@ -235,10 +235,6 @@ def test_a_loop_goes_on_in_time(tmp_path: Path, stamps: str) -> None:
     assert [t - times[0] for t in times] == [i * 100_000 for i in range(12)]
 
 
-def test_duration_cuts(tmp_path: Path) -> None:
-    assert len(play(write_ros1(tmp_path / "a.bag"), duration_s=0.35)) == 4
-
-
 def test_stops_when_asked(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag")
     stop = threading.Event()

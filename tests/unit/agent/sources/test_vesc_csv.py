@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording import BagConfig
 from iort_contract.catalog.vesc import VESC_FIELDS, absent
-from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from testkit.agent import ManualClock
 from tests.recordings import recording
 
@@ -87,21 +86,6 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     counters = ("charge_drawn", "charge_regen", "energy_drawn", "energy_regen")
     assert {type(values[name]) for _, _, values in samples for name in counters} == {int}
     assert log.text == ""
-
-
-def test_it_goes_through_the_contract() -> None:
-    samples = play(recording("vesc-tool-ride.csv"))[:10]
-    columns = {name: [values[name] for _, _, values in samples] for name in samples[0][2]}
-    batch = Batch("0123456789abcdef", 0, [t_us for _, t_us, _ in samples], columns)
-    assert decode_batch(encode_batch(batch)).columns["charge_drawn"] == [281] * 10
-
-
-@pytest.mark.parametrize(("speed", "seconds"), [(1.0, 0.4), (4.0, 0.1), (0.0, 0.0)])
-def test_the_pace_is_the_logs(tmp_path: Path, speed: float, seconds: float) -> None:
-    clock = ManualClock(now_us=NOW)
-    samples = play(write(tmp_path, *(row(1000 + i * 100) for i in range(5))), clock, speed=speed)
-    assert clock.now_us() - NOW == pytest.approx(seconds * 1e6, abs=10)
-    assert samples[-1][1] - NOW == pytest.approx(seconds * 1e6, abs=10)
 
 
 def test_loop_and_duration(tmp_path: Path) -> None:
@@ -313,11 +297,6 @@ def test_faults_by_name(tmp_path: Path, log: pytest.LogCaptureFixture, text: str
     samples = play(write(tmp_path, row(1000, fault=text), row(1100, fault=text)))
     assert [values["fault_code"] for _, _, values in samples] == [code, code]
     assert log.text.count("GREMLINS") == (1 if code is None else 0)
-
-
-@pytest.mark.parametrize(("motor", "value"), [("-273.15", -273.15), ("-50", -50), ("31", 31)])
-def test_what_is_recorded_is_what_the_controller_said(tmp_path: Path, motor: str, value: float) -> None:
-    assert play(write(tmp_path, row(1000, motor=motor)))[0][2]["temp_motor"] == value
 
 
 def test_columns_that_are_no_fields(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:

@@ -202,13 +202,6 @@ def test_another_commands_answer_is_refused() -> None:
         decode_values(b"\x05" + values()[1:])
 
 
-@pytest.mark.parametrize(("tenths", "degc"), [(-500, -50), (-2730, -273), (-499, -49.9), (0, 0), (250, 25)])
-def test_a_motors_temperature_is_what_the_controller_says(tenths: int, degc: float) -> None:
-    payload = values()
-    payload = payload[:3] + struct.pack(">h", tenths) + payload[5:]
-    assert decode_values(payload)["temp_motor"] == degc
-
-
 @pytest.mark.parametrize(
     ("payload", "text"),
     [
