@@ -13,6 +13,7 @@ from iort_contract.limits import ContractError, Value
 
 # The interval of reports while nothing is lost. Batches are numbered, so a long interval is enough.
 ACCOUNT_EVERY_S = 30.0
+_NUMBERS = ("taken", "stored", "refused", "nulled", "first_seq", "next_seq")
 # The size limit of a text in a sample.
 _MAX_TEXT = 4096
 
@@ -91,14 +92,15 @@ def account(sample: Mapping[str, Value]) -> Account:
         except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
             raise ContractError(f"a source's account cannot be decoded: {error}") from error
     try:
-        names = ("taken", "stored", "refused", "nulled", "first_seq", "next_seq")
-        taken, stored, refused, nulled, first_seq, next_seq = (int(sample[name] or 0) for name in names)
-        ended, durable = bool(sample["ended"]), sample.get("durable")
+        numbers = {name: int(sample[name] or 0) for name in _NUMBERS}
+        durable = sample.get("durable")
         return StreamAccount(
-            str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, ended,
+            str(sample["stream"]),
+            **numbers,
+            ended=bool(sample["ended"]),
             durable=None if durable is None else bool(durable),
             replayed=bool(sample.get("replayed")),
-        )  # fmt: skip
+        )
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ContractError(f"a stream's account cannot be decoded: {error}") from error
 

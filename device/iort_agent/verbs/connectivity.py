@@ -32,7 +32,8 @@ from iort_contract.topics import FILE, PING, PONG, RULE, build_topic
 
 TIMEOUT_S = 5.0
 SET_CLOCK = "set the clock: `timedatectl set-ntp true`, or `sudo date -s ...`"
-_TLS_PORT_WITH_ALPN = 443
+# The port of HTTPS, on which AWS' broker wants ALPN.
+_HTTPS_PORT = 443
 # OpenSSL's codes for certificates (X509_V_ERR_...).
 _NOT_YET_VALID, _EXPIRED, _WRONG_NAMES = 9, 10, (62, 64)
 # A certificate that ends sooner should have been replaced by now.
@@ -42,7 +43,7 @@ _EARLIEST_S = 1_767_225_600
 _CLOCK_OFF_S = 5.0
 # A function that was not used for long starts first.
 _FILE_ANSWER_S = 15.0
-_TLS_PORT = 443
+_HANGS = "the cloud hangs, or something between holds the bytes back: `iort doctor` at the cloud"
 
 
 class BlockedError(Exception):
@@ -63,7 +64,7 @@ def secured(config: Config, raw: socket.socket, address: str) -> ssl.SSLSocket:
     with suppress(IdentityError):
         check_pair(config.certificate, config.private_key)
         context.load_cert_chain(config.certificate, config.private_key)
-    if config.port == _TLS_PORT_WITH_ALPN:
+    if config.port == _HTTPS_PORT:
         context.set_alpn_protocols(["x-amzn-mqtt-ca"])
     try:
         return context.wrap_socket(raw, server_hostname=config.endpoint)
@@ -84,12 +85,9 @@ def _distrusted(config: Config, address: str, error: ssl.SSLCertVerificationErro
         text = f"{verb} {utc(at)}, and this machine's clock says {now}"
         return text, f"if {now} is wrong, {SET_CLOCK}; if it is right, restart the cloud, which renews it"
     if shown is not None and error.verify_code in _WRONG_NAMES:
+        start = f"`make up LISTEN=ADDRESS,{config.endpoint}`"
         text = f"is for {', '.join(shown.names()) or 'no name'}, and not for {config.endpoint}"
-        todo = (
-            "set `endpoint` to one of these, or start the cloud with "
-            f"`make up LISTEN=ADDRESS,{config.endpoint}`"
-        )
-        return text, todo
+        return text, f"set `endpoint` to one of these, or start the cloud with {start}"
     signer = f"is signed by {shown.issuer()}, " if shown is not None else ""
     if config.root_ca is None:
         trusted = "which this machine does not trust"
@@ -122,18 +120,12 @@ def no_tls(config: Config, error: Exception) -> tuple[str, str]:
     if (refused := refused_ours(config, reason)) is not None:
         return refused
     if isinstance(error, socket.timeout):
-        text = f"{config.port} takes the connection, and then says nothing for {TIMEOUT_S:g} s"
-        return text, "the cloud hangs, or something between holds the bytes back: `iort doctor` at the cloud"
-    if "WRONG_VERSION" in reason or "HTTP_REQUEST" in reason or "RECORD_LAYER" in reason:
-        return (
-            f"{config.port} answers, but not with TLS",
-            "`port` is another service's: a broker has 8883 usually",
-        )
-    text = f"the connection ends before TLS: {reason}"
-    todo = (
-        "is a proxy or a tunnel between, whose broker is down? `iort doctor` at the cloud; is `port` right?"
-    )
-    return text, todo
+        return f"{config.port} takes the connection, and then says nothing for {TIMEOUT_S:g} s", _HANGS
+    if any(sign in reason for sign in ("WRONG_VERSION", "HTTP_REQUEST", "RECORD_LAYER")):
+        todo = "`port` is another service's: a broker has 8883 usually"
+        return f"{config.port} answers, but not with TLS", todo
+    todo = "is a proxy or a tunnel between, whose broker is down? `iort doctor` there; is `port` right?"
+    return f"the connection ends before TLS: {reason}", todo
 
 
 def refused_ours(config: Config, reason: str) -> tuple[str, str] | None:
@@ -145,10 +137,8 @@ def refused_ours(config: Config, reason: str) -> tuple[str, str] | None:
         todo = "the bundle is another cloud's, or of one that was not kept: `iort robots add` makes a new one"
         return f"the cloud does not know who signed {config.certificate} ({words})", todo
     if "expired" in words:
-        return (
-            "the cloud says that our certificate is expired",
-            "`iort-agent renew`; is the cloud's clock right?",
-        )
+        todo = "`iort-agent renew`; is the cloud's clock right?"
+        return "the cloud says that our certificate is expired", todo
     todo = "see certificate and private key above; `iort robots show` tells what the cloud knows of them"
     return f"the cloud refuses our certificate: {words}", todo
 
@@ -210,7 +200,8 @@ def _route(addresses: list[str]) -> str:
     """From which address of ours to which of theirs. To connect a UDP socket sends nothing."""
     problem: OSError = OSError()
     for address in addresses:
-        with socket.socket(_family(address), socket.SOCK_DGRAM) as probe:
+        family = socket.AF_INET6 if ":" in address else socket.AF_INET
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
             try:
                 probe.connect((address, 9))
             except OSError as error:
@@ -221,10 +212,6 @@ def _route(addresses: list[str]) -> str:
             return f"from {probe.getsockname()[0]} to {address}"
     todo = "is the Wi-Fi or the cable connected, in the cloud's network? `ip address`, `ip route` show it"
     raise BlockedError("route", f"none to {', '.join(addresses)}: {problem.strerror}", todo) from problem
-
-
-def _family(address: str) -> int:
-    return socket.AF_INET6 if ":" in address else socket.AF_INET
 
 
 def _connected(config: Config, addresses: list[str]) -> tuple[socket.socket, str]:
@@ -312,9 +299,8 @@ def _ping(config: Config, session: Session) -> _Offset:
     received_ms = None if answer is None else decode_pong(answer).received_ms
     if received_ms is None:
         raise OSError(f"nothing in {TIMEOUT_S:g} s")
-    return _Offset(
-        received_ms / 1000 - sent_us / 1e6 - trip_s / 2, f"by a round trip of {trip_s * 1000:.0f} ms"
-    )
+    by = f"by a round trip of {trip_s * 1000:.0f} ms"
+    return _Offset(received_ms / 1000 - sent_us / 1e6 - trip_s / 2, by)
 
 
 def _files(config: Config, session: Session) -> Finding:
@@ -329,11 +315,10 @@ def _files(config: Config, session: Session) -> Finding:
         return Finding("files", WARN, f"the cloud names no address in {_FILE_ANSWER_S:g} s", todo)
     answer = decode_file_answer(payload)
     if not answer.addresses:
-        return Finding(
-            "files", WARN, f"refused: {answer.refused}", "is the robot registered? `iort robots list`"
-        )
+        todo = "is the robot registered? `iort robots list`"
+        return Finding("files", WARN, f"refused: {answer.refused}", todo)
     url = urlsplit(answer.addresses[0].url)
-    host, port = url.hostname or "", url.port or _TLS_PORT
+    host, port = url.hostname or "", url.port or _HTTPS_PORT
     try:
         with socket.create_connection((host, port), TIMEOUT_S) as raw:
             trusting(config.root_ca).wrap_socket(raw, server_hostname=host).close()
@@ -349,11 +334,10 @@ def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
     if refused is not None:
         return refused
     if isinstance(error, ForeignError):
-        text = "answers, but not in MQTT 5"
-        return text, "is `port` right? The cloud's broker speaks MQTT 5, older ones do not"
+        todo = "is `port` right? The cloud's broker speaks MQTT 5, older ones do not"
+        return "answers, but not in MQTT 5", todo
     if isinstance(error, socket.timeout):
-        text = f"gives {config.robot} no answer in {TIMEOUT_S:g} s"
-        return text, "the cloud hangs, or something between holds the bytes back: `iort doctor` at the cloud"
+        return f"gives {config.robot} no answer in {TIMEOUT_S:g} s", _HANGS
     todo = (
         "the certificate is unknown there, not active or revoked (`iort robots list`), or the broker is "
         "being restarted: try again"
@@ -368,13 +352,12 @@ def _other_offset(config: Config, running: Status | None) -> _Offset | None:
     if not config.endpoint.endswith(".amazonaws.com"):
         return None
     # To the second; nothing without a valid answer.
-    connection = http.client.HTTPSConnection(config.endpoint, 443, timeout=TIMEOUT_S)
+    connection = http.client.HTTPSConnection(config.endpoint, _HTTPS_PORT, timeout=TIMEOUT_S)
     with suppress(OSError, http.client.HTTPException, TypeError, ValueError), closing(connection):
         connection.request("HEAD", "/")
         date = connection.getresponse().getheader("Date", "")
-        return _Offset(
-            parsedate_to_datetime(date).timestamp() + 0.5 - time.time(), "by AWS' answer over HTTPS"
-        )
+        cloud_s = parsedate_to_datetime(date).timestamp() + 0.5
+        return _Offset(cloud_s - time.time(), "by AWS' answer over HTTPS")
     return None
 
 
