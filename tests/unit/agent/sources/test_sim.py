@@ -403,9 +403,9 @@ def test_faults_have_the_physical_size_that_they_name() -> None:
             pass
         return vehicle
 
-    def force_n(car: Vehicle) -> float:
+    def force_n(car: Vehicle, radius: float = 1.0) -> float:
         drag_n = 0.5 * 1.2 * CAR.drag_area_m2 * car.speed_mps**2
-        return car.motor_a * CAR.newtons_per_amp * CAR.drivetrain_efficiency - drag_n
+        return car.motor_a * CAR.newtons_per_amp * CAR.drivetrain_efficiency / radius - drag_n
 
     healthy = cruise()
     assert force_n(cruise(FaultConfig("added_friction", 1.0))) - force_n(healthy) == pytest.approx(
@@ -415,6 +415,8 @@ def test_faults_have_the_physical_size_that_they_name() -> None:
     assert force_n(heavy) - force_n(healthy) == pytest.approx(CAR.rolling_resistance * G_MPS2, abs=0.01)
     flat = cruise(FaultConfig("flat_tyre", 0.1))
     assert flat.wheel_mps / flat.speed_mps == pytest.approx(1 / 0.9, rel=0.01)
+    rolling_n = CAR.rolling_resistance * CAR.mass_kg * G_MPS2
+    assert force_n(flat, 0.9) - force_n(healthy) == pytest.approx(20 * 0.1 * rolling_n, rel=0.01)
     joint = cruise(FaultConfig("motor_resistance", 0.01))
     assert joint.motor_resistance_ohm - healthy.motor_resistance_ohm == pytest.approx(0.01, abs=2e-4)
     for kind in ("worn_battery", "cooling_lost", "motor_resistance", "cell_dropout"):
