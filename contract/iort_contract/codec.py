@@ -97,9 +97,9 @@ def packed(column: Sequence[Value]) -> list[Value]:
         if max(whole) < EXACT and min(whole) > -EXACT:
             return [decimals, whole[0], *map(sub, whole[1:], whole)]
     elif kinds <= {int, float}:
-        found = _whole(cast("Sequence[float]", column))
-        if found is not None:
-            decimals, whole = found
+        scaled = _whole(cast("Sequence[float]", column))
+        if scaled is not None:
+            decimals, whole = scaled
             return [decimals, whole[0], *map(sub, whole[1:], whole)]
     return [None, *column]
 
@@ -240,7 +240,7 @@ def packed_second(counts: Mapping[str, Value], fields: Mapping[str, Statistics])
     packed: dict[str, Statistics] = dict(fields)
     taken = _TAKEN.union(counts)
     flat: dict[str, Statistics] = dict(counts)
-    while odd := [name for name, found in packed.items() if name in taken or type(found) is not list]:
+    while odd := [name for name, value in packed.items() if name in taken or type(value) is not list]:
         for name in odd:
             flat.update(_flat(name, packed.pop(name)))
         # A field may have the name of another field's statistic.

@@ -195,8 +195,8 @@ class TelemetryTable(TopicTable):
             request["ExpressionAttributeNames"] = names
         key = {TOPIC: {"S": topic}, BATCH: {"S": batch}}
         answer = self._client.get_item(TableName=self.name, Key=key, ConsistentRead=True, **request)
-        found: Item | None = answer.get("Item")
-        return found
+        item: Item | None = answer.get("Item")
+        return item
 
 
 class SummaryTable(TopicTable):

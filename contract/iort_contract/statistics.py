@@ -75,15 +75,15 @@ def summarize_second(
     without, absences = without_absent(columns)
     if absences:
         counts[ABSENT] = sum(absences.values())
-    found = {name: statistics_of(column) for name, column in {**without, **derive(without, vehicle)}.items()}
-    return packed_second(counts, {name: known for name, known in found.items() if known is not None})
+    fields = {name: statistics_of(column) for name, column in {**without, **derive(without, vehicle)}.items()}
+    return packed_second(counts, {name: known for name, known in fields.items() if known is not None})
 
 
 def without_absent(
     columns: Mapping[str, Sequence[Value]],
 ) -> tuple[Mapping[str, Sequence[Value]], dict[str, int]]:
     """The columns with None for values of sensors that are not fitted, and the count of those by field."""
-    found: dict[str, Sequence[Value]] = {}
+    replaced: dict[str, Sequence[Value]] = {}
     absences: dict[str, int] = {}
     for name in columns.keys() & ABSENT_FROM.keys():
         column = columns[name]
@@ -93,8 +93,8 @@ def without_absent(
         known = [None if absent(name, value) else value for value in column]
         count = sum(value is None for value in known) - sum(value is None for value in column)
         if count:
-            found[name], absences[name] = known, count
-    return ({**columns, **found} if found else columns), absences
+            replaced[name], absences[name] = known, count
+    return ({**columns, **replaced} if replaced else columns), absences
 
 
 def missing_before(batch: BatchId, near: Sequence[BatchId], previous: Sequence[RunEnd] | None = None) -> int:

@@ -80,9 +80,9 @@ def parse_topic(topic: str) -> Topic:
 # Each message names its topic, and most of them the same.
 @lru_cache(maxsize=4096)
 def _parsed(topic: str) -> Topic:
-    found = Topic(*topic.split("/"))
-    build_topic(found.lane, found.robot, found.name, found.namespace)
-    return found
+    parsed = Topic(*topic.split("/"))
+    build_topic(parsed.lane, parsed.robot, parsed.name, parsed.namespace)
+    return parsed
 
 
 def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:

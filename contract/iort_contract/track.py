@@ -56,7 +56,7 @@ def track_of(columns: Mapping[str, Any]) -> Track:
     if set(columns) != set(_COLUMNS) or len(lists) != len(_COLUMNS):
         raise ContractError(f"a track must be the four lists {', '.join(_COLUMNS)}, got {shown(columns)}")
     if len(set(map(len, lists))) != 1:
-        raise ContractError(f"the lists of a track must be equally long, got {[len(one) for one in lists]}")
+        raise ContractError(f"the lists of a track must be equally long, got {list(map(len, lists))}")
     return parse_track("\n".join(", ".join(map(repr, row)) for row in zip(*lists)))
 
 

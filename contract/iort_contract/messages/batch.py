@@ -92,10 +92,10 @@ def _parsed_id(text: str) -> BatchId:
     match = _BATCH_ID.fullmatch(text)
     if match is None:
         raise _not_an_id(text)
-    found = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
-    check_time(found.t_us, BATCH)
-    check_header(found.boot, found.seq, 0)
-    return found
+    parsed = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
+    check_time(parsed.t_us, BATCH)
+    check_header(parsed.boot, parsed.seq, 0)
+    return parsed
 
 
 def _not_an_id(text: Any) -> ContractError:
@@ -221,9 +221,9 @@ def _packed_messages(
     if len(messages.raw) != n:
         raise ContractError(f"batch of {n} samples must have as many messages, got {len(messages.raw)}")
     _check_values(n, len(beside) + values_a_message(messages))
-    found = None if beside else as_columns(messages, times)
-    if found is not None:
-        columns, about = found
+    numbers = None if beside else as_columns(messages, times)
+    if numbers is not None:
+        columns, about = numbers
         return CODEC, packed_samples(dt, columns, about.encode())
     return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
 

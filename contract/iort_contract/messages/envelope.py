@@ -23,15 +23,15 @@ def read(kind: type[M], envelope: Mapping[str, Any], **nested: Callable[[Any], A
 
     ``nested`` has the decoders of the fields that are messages themselves.
     """
-    found = {}
+    values = {}
     for field in fields(kind):  # type: ignore[arg-type]  # a dataclass
         entry = _ENTRIES.get(field.name, field.name)
         if entry in envelope or (field.default is MISSING and field.default_factory is MISSING):
             if field.name in nested:
-                found[field.name] = nested[field.name](envelope.get(entry))
+                values[field.name] = nested[field.name](envelope.get(entry))
             else:
-                found[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
-    return kind(**found)
+                values[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
+    return kind(**values)
 
 
 def entries(message: Any) -> dict[str, Any]:

@@ -153,8 +153,8 @@ def part_range(file: File, part: int) -> tuple[int, int]:
 
 def file_request_id(message: Mapping[str, Any]) -> str | None:
     """A request's id, even if the rest is invalid; None if an answer could not repeat it."""
-    given = message.get("id")
-    return given if isinstance(given, str) and BOOT.fullmatch(given) else None
+    request_id = message.get("id")
+    return request_id if isinstance(request_id, str) and BOOT.fullmatch(request_id) else None
 
 
 def encode_file_answer(answer: FileAnswer) -> bytes:
@@ -190,8 +190,8 @@ def decode_file_answer(message: bytes | str) -> FileAnswer:
     try:
         have = tuple((int(first), int(last)) for first, last in envelope.get("have", ()))
         addresses = tuple(
-            Address(int(one["part"]), str(one["url"]), {str(k): str(v) for k, v in one["headers"].items()})
-            for one in envelope.get("addresses", ())
+            Address(int(to["part"]), str(to["url"]), {str(k): str(v) for k, v in to["headers"].items()})
+            for to in envelope.get("addresses", ())
         )
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ContractError(f"have or addresses are invalid: {error}") from error

@@ -253,10 +253,10 @@ def decode_query_answer(message: bytes | str) -> QueryAnswer:
         return QueryAnswer(error=text(answer, "error"))
     if answer.get("codec") != PLAIN_CODEC:
         raise ContractError(f"codec must be {PLAIN_CODEC}, got {shown(answer.get('codec'))}")
-    given = {name: value for name, value in answer.items() if value is not None}
-    if ("samples" in given) == ("url" in given):
+    present = {name: value for name, value in answer.items() if value is not None}
+    if ("samples" in present) == ("url" in present):
         raise ContractError("an answer must have either samples or url")
-    return read(QueryAnswer, given)
+    return read(QueryAnswer, present)
 
 
 def packed_samples(times_us: Sequence[int], columns: Mapping[str, Sequence[Value]]) -> bytes:

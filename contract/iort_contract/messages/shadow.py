@@ -148,7 +148,7 @@ class StopNotes(NamedTuple):
     @property
     def newest(self) -> Pressed | None:
         """The newest of the stops."""
-        return max(filter(None, (self.robot, self.fleet)), key=lambda one: one.t_ms, default=None)
+        return max(filter(None, (self.robot, self.fleet)), key=lambda pressed: pressed.t_ms, default=None)
 
 
 @dataclass(frozen=True)
@@ -183,13 +183,13 @@ class Reported:
 
 def decode_desired(document: Any) -> Desired:
     """The desired part of a shadow."""
-    found = dict(_mapping(document))
-    notice = _mapping(found.pop(OVER_SHARE, None))
+    sections = dict(_mapping(document))
+    notice = _mapping(sections.pop(OVER_SHARE, None))
     counts = [notice.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
     valid = [count for count in counts if type(count) is int and 0 <= count < _MOST]
-    notes = _mapping(found.pop(STOPS, None))
+    notes = _mapping(sections.pop(STOPS, None))
     return Desired(
-        dict(_flat(found)),
+        dict(_flat(sections)),
         OverShare(*valid) if len(valid) == len(counts) else None,
         StopNotes(*(_pressed(notes.get(name)) for name in StopNotes._fields)),
     )
@@ -198,7 +198,7 @@ def decode_desired(document: Any) -> Desired:
 def encode_stop(by: Pressed, *, fleet: bool) -> dict[str, Any]:
     """The change of the desired part that stops a robot, alone or with the fleet."""
     note = StopNotes(fleet=by) if fleet else StopNotes(robot=by)
-    written = {name: one._asdict() for name, one in note._asdict().items() if one is not None}
+    written = {name: pressed._asdict() for name, pressed in note._asdict().items() if pressed is not None}
     return {**nested({MOTION_STOPPED: True}), STOPS: written}
 
 
@@ -215,23 +215,25 @@ def encode_fleet_released() -> dict[str, Any]:
 
 def decode_reported(document: Any) -> Reported:
     """The reported part of a shadow."""
-    found = dict(_mapping(document))
-    rejected = _mapping(found.pop(REJECTED, None))
-    commands = _mapping(found.pop(COMMANDS, None))
-    version = found.pop(AGENT_VERSION, "")
-    drive = decode_limits(found.pop(DRIVE, None))
-    moves = found.pop(MOVES, None)
+    sections = dict(_mapping(document))
+    rejected = _mapping(sections.pop(REJECTED, None))
+    commands = _mapping(sections.pop(COMMANDS, None))
+    version = sections.pop(AGENT_VERSION, "")
+    drive = decode_limits(sections.pop(DRIVE, None))
+    moves = sections.pop(MOVES, None)
     return Reported(
-        dict(sorted(_flat(found))),
+        dict(sorted(_flat(sections))),
         {
-            name: Rejection(one.get("value"), str(one.get("reason", "")))
-            for name, one in sorted(rejected.items())
-            if isinstance(one, dict)
+            name: Rejection(rejection.get("value"), str(rejection.get("reason", "")))
+            for name, rejection in sorted(rejected.items())
+            if isinstance(rejection, dict)
         },
         {
-            name: Outcome(one["session"], one["seq"], str(one.get("outcome")))
-            for name, one in commands.items()
-            if isinstance(one, dict) and isinstance(one.get("session"), str) and type(one.get("seq")) is int
+            name: Outcome(outcome["session"], outcome["seq"], str(outcome.get("outcome")))
+            for name, outcome in commands.items()
+            if isinstance(outcome, dict)
+            and isinstance(outcome.get("session"), str)
+            and type(outcome.get("seq")) is int
         },
         version if isinstance(version, str) else "",
         drive,
@@ -244,8 +246,8 @@ def encode_reported(reported: Reported) -> dict[str, Any]:
     return {
         **{section: {} for section in _SECTIONS},
         **nested(reported.settings),
-        REJECTED: {name: one._asdict() for name, one in reported.rejected.items()},
-        COMMANDS: {name: one._asdict() for name, one in reported.commands.items()},
+        REJECTED: {name: rejection._asdict() for name, rejection in reported.rejected.items()},
+        COMMANDS: {name: outcome._asdict() for name, outcome in reported.commands.items()},
         AGENT_VERSION: reported.agent_version,
         DRIVE: encode_limits(reported.drive),
         MOVES: reported.moves,
@@ -265,8 +267,8 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _pressed(note: Any) -> Pressed | None:
-    found = _mapping(note)
-    by, t_ms = found.get("by"), found.get("t_ms")
+    entry = _mapping(note)
+    by, t_ms = entry.get("by"), entry.get("t_ms")
     return Pressed(by, t_ms) if isinstance(by, str) and type(t_ms) is int and 0 <= t_ms < _MOST else None
 
 

@@ -143,7 +143,7 @@ class Types:
         if kind not in self._extents:
             extents = [self.extent_of(field) for field in self.fields[kind]]
             fixed = [extent for extent in extents if extent is not None]
-            whole = Extent(sum(one.size for one in fixed), sum(one.numbers for one in fixed))
+            whole = Extent(sum(extent.size for extent in fixed), sum(extent.numbers for extent in fixed))
             self._extents[kind] = whole if len(fixed) == len(extents) else None
         return self._extents[kind]
 

@@ -112,15 +112,15 @@ def md5sum(definition: Definition, text: str) -> str:
 
 
 def _constants(body: str) -> list[str]:
-    found = []
+    constants = []
     for line in body.splitlines():
         clean = line.split("#", 1)[0].strip()
         if "=" in clean:
             kind, name = clean.split("=", 1)[0].split()
             # A text has no comment behind it: all of the line is the text.
             value = (line if kind == STRING else clean).split("=", 1)[1].strip()
-            found.append(f"{kind} {name}={value}")
-    return found
+            constants.append(f"{kind} {name}={value}")
+    return constants
 
 
 def _sections(kind: str, text: str) -> Iterator[tuple[str, str]]:
