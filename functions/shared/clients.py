@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import botocore.session
 from botocore.config import Config
+from botocore.credentials import Credentials
 
 from iort_contract.catalog.environments import E
 
@@ -34,6 +35,13 @@ else:
 @cache
 def _session() -> botocore.session.Session:
     return botocore.session.get_session()
+
+
+def credentials() -> Credentials:
+    """The function's own credentials."""
+    given: Credentials | None = _session().get_credentials()
+    assert given is not None
+    return given
 
 
 @cache

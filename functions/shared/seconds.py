@@ -7,7 +7,7 @@ leaves the same item.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -33,6 +33,23 @@ _NUMBERS = SECOND_BATCHES * (2 * ASIDE_US // _SECOND_US + 1)
 _BESIDE = 3
 # An undecodable neighbour is skipped; this many of them end the search.
 _NEIGHBOURS = 10
+
+
+# A stream's last two decoded batches with their items, unless they are large: the next event needs one of
+# them as the one before its own. The table may have changed meanwhile, so the item is compared.
+_decoded: dict[str, deque[tuple[Mapping[str, Any], Batch]]] = {}
+_TOPICS, _VALUES = 300, 2000
+
+
+def keep_decoded(topic: str, item: Mapping[str, Any], batch: Batch) -> None:
+    """Keep an item's decoded batch for the topic's next event."""
+    if len(batch.times_us) * len(batch.columns) > _VALUES:
+        return
+    if len(_decoded) >= _TOPICS:
+        _decoded.clear()
+    kept = _decoded.setdefault(topic, deque(maxlen=2))
+    if all(stored != item for stored, _ in kept):
+        kept.append((item, batch))
 
 
 class Stored(NamedTuple):
@@ -147,8 +164,13 @@ class Reader:
             yield Stored(batch, expires_s, _bytes(batch))
 
     def _decoded(self, item: Mapping[str, Any]) -> Batch:
+        for stored, batch in _decoded.get(self.topic, ()):
+            if stored == item:
+                return batch
         self.check()
-        return decode_item(item)[1]
+        batch = decode_item(item)[1]
+        keep_decoded(self.topic, item, batch)
+        return batch
 
 
 def _time_of(item: Mapping[str, Any], otherwise: int) -> int:

@@ -19,9 +19,10 @@ from botocore.config import Config
 
 from functions.shared import clients
 from functions.shared.clients import connect, variables
+from functions.shared.direct import Direct
 from functions.shared.metrics import MOST_VALUES, emit
 from functions.shared.queues import DeadLetterQueue, Refused
-from functions.shared.seconds import SECOND_BATCHES, Summaries, summarize_topic
+from functions.shared.seconds import SECOND_BATCHES, Summaries, keep_decoded, summarize_topic
 from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
@@ -89,12 +90,14 @@ def decode_records(records: Iterable[Mapping[str, Any]], share: Share | None = N
             continue
         meter = share.meter(robot, at_s)
         try:
-            topic, batch = decode_item(plain(image))
+            item = plain(image)
+            topic, batch = decode_item(item)
         except ContractError as error:
             _log.warning("refused %s of %s: %s", change["Keys"], record["eventID"], error)
             decoded.refused.append(Refused(change["SequenceNumber"], str(error), image))
             meter.charge(REQUESTS_S)
         else:
+            keep_decoded(str(topic), item, batch)
             decoded.batches[str(topic)].append(batch)
             decoded.records[str(topic), batch.id] = change
             meter.charge()
@@ -331,7 +334,7 @@ def stored_tables() -> Tables:
     # made anew for each request, a fifth of it for a driving car.
     client = quick(connect("dynamodb", config=Config(parameter_validation=False, user_agent="iort")))
     tables = Tables(
-        client,
+        Direct(client, clients.credentials()),
         telemetry=given.telemetry_table,
         summary=given.summary_table,
         robots=given.robots_table,

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from functions.shared import seconds
 from functions.shared.seconds import SECOND_BATCHES, Reader
 from functions.shared.summary import process
 from functions.shared.tables import attribute
 from iort_contract import tables
 from iort_contract.codec import flat_second
 from iort_contract.dynamodb import plain
-from iort_contract.messages.batch import Batch, split_batch
+from iort_contract.messages.batch import Batch, decode_item, split_batch
 from iort_contract.statistics import missing_before, summarize_second
 from iort_contract.tables import EXPIRES_S, OMITTED, STATS, TOPIC
 from testkit.dynamodb import ROBOTS, TOPIC_OF_CAR, FakeDynamoDB
@@ -28,6 +29,19 @@ AWKWARD = [*COUNTS, "a", "a_last", "a_min", "a_last_last"]
 names = st.sampled_from(AWKWARD) | st.from_regex(r"[a-z]{1,3}(_(min|mean|max|last)){0,2}", fullmatch=True)
 numbers = st.integers(-5, 5) | st.floats(-1e9, 1e9) | st.sampled_from([1e300, -1e-200])
 values = numbers | st.none() | st.booleans() | st.text(max_size=3)
+
+
+def test_the_batch_before_is_decoded_once_unless_the_table_has_changed(monkeypatch):
+    decoded = []
+    monkeypatch.setattr(seconds, "decode_item", lambda item: decoded.append(item) or decode_item(item))
+    stream = Stream()
+    stream.deliver(batch(T0 + 500_000, 40, speed=[1] * 40))
+    stream.deliver(batch(T0 + 1_300_000, 20, seq=1, speed=[3] * 20))
+    assert (decoded, stream.column("speed_min")[1]) == ([], 1)
+    # Sent again with other values; its record comes later.
+    stream.store(batch(T0 + 500_000, 40, speed=[2] * 40))
+    stream.deliver(batch(T0 + 1_300_000, 20, seq=1, speed=[3] * 20))
+    assert (len(decoded), stream.column("speed_min")[1]) == (1, 2)
 
 
 three = {"min_size": 3, "max_size": 3}
