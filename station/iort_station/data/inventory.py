@@ -9,15 +9,8 @@ from functools import lru_cache
 
 from iort_analysis.samples.batches import RefusedItems, in_order, part
 from iort_analysis.samples.blocks import EMPTY, Block, join, values
+from iort_contract.catalog import streams
 from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
-from iort_contract.catalog.streams import (
-    ACCOUNT_STREAM,
-    CATALOG,
-    OWN_STREAMS,
-    ROS_UNITS,
-    TYPE_UNITS,
-    TYPES_STREAM,
-)
 from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError, MessageError
@@ -49,7 +42,11 @@ def unit(stream: str, name: str, *, ros2: bool = False, kind: MessageType | None
 def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> str:
     if field in DERIVED:
         return DERIVED[field].unit
-    if kind is None and stream in CATALOG and (found := CATALOG[stream].unit(field, ros2=ros2)):
+    if (
+        kind is None
+        and stream in streams.CATALOG
+        and (found := streams.CATALOG[stream].unit(field, ros2=ros2))
+    ):
         return found
     if kind is not None and (found := _by_type(kind, field, ros2=ros2)):
         return found
@@ -61,8 +58,8 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
     if kind is not None and kind.kind.startswith("vesc_msgs/"):
         return ""
     within, _, axis = field.rpartition(".")
-    known_as = (of for of in ROS_UNITS if within == of or within.endswith(f".{of}"))
-    return next((ROS_UNITS[of] for of in known_as), "") if axis in {"x", "y", "z"} else ""
+    known_as = (of for of in streams.ROS_UNITS if within == of or within.endswith(f".{of}"))
+    return next((streams.ROS_UNITS[of] for of in known_as), "") if axis in {"x", "y", "z"} else ""
 
 
 def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
@@ -81,8 +78,8 @@ def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool
             continue
         if kind.startswith(VESC_KIND) and (known := VESC.unit(name, ros2=ros2)):
             return known
-        if name in TYPE_UNITS.get(kind, {}):
-            return TYPE_UNITS[kind][name]
+        if name in streams.TYPE_UNITS.get(kind, {}):
+            return streams.TYPE_UNITS[kind][name]
         kind = next((field.kind for field in types.get(kind, ()) if field.name == name), "")
     return ""
 
@@ -144,7 +141,7 @@ def kind_of(cloud: Cloud, selection: Selection) -> MessageType | None:
     It is the type that the robot published last before the range ends, or else its first. A stream without a
     published type, such as a VESC's log, has a VESC's type if it has a VESC's fields.
     """
-    if selection.stream in {VESC_STREAM, *OWN_STREAMS}:
+    if selection.stream in {VESC_STREAM, *streams.OWN_STREAMS}:
         return None
     kinds = [
         (t_us, kind) for t_us, kind in types_of(cloud, selection.robot) if kind.stream == selection.stream
@@ -162,7 +159,7 @@ def assumed_kind(stream: str, fields: AbstractSet[str]) -> MessageType | None:
 
 def types_of(cloud: Cloud, robot: str) -> Iterator[tuple[int, MessageType]]:
     """The message types that a robot has published, with the time of each, in order of time."""
-    for block in _blocks(cloud, robot, TYPES_STREAM):
+    for block in _blocks(cloud, robot, streams.TYPES_STREAM):
         columns = {name: values(column) for name, column in block.columns.items()}
         for i, t_us in enumerate(block.times_us.tolist()):
             with suppress(ContractError):
@@ -175,13 +172,17 @@ def streams_of(cloud: Cloud, robot: str) -> list[str]:
     # The agent's reports of a year take seconds to read. The newest one names what Lambda 2 may not have
     # seen yet; the registry has forgotten a removed robot.
     names = {*seen, *_announced(cloud, robot, newest=True)} if seen else known(cloud, robot)
-    return [name for name in sorted({VESC_STREAM, *OWN_STREAMS, *names}) if _has_batches(cloud, robot, name)]
+    return [
+        name
+        for name in sorted({VESC_STREAM, *streams.OWN_STREAMS, *names})
+        if _has_batches(cloud, robot, name)
+    ]
 
 
 def known(cloud: Cloud, robot: str) -> list[str]:
     """The streams that the robot's agent has announced, that Lambda 2 has seen, or that every robot has."""
     announced = _announced(cloud, robot, newest=False)
-    return sorted({VESC_STREAM, *OWN_STREAMS, *_seen(cloud, robot), *announced})
+    return sorted({VESC_STREAM, *streams.OWN_STREAMS, *_seen(cloud, robot), *announced})
 
 
 def _seen(cloud: Cloud, robot: str) -> set[str]:
@@ -192,10 +193,10 @@ def _seen(cloud: Cloud, robot: str) -> set[str]:
 def _announced(cloud: Cloud, robot: str, *, newest: bool) -> set[str]:
     """The streams that the agent has named in its types and accounts, or in the newest second of each."""
     if newest:
-        blocks = [_newest_second(cloud, robot, own) for own in (TYPES_STREAM, ACCOUNT_STREAM)]
+        blocks = [_newest_second(cloud, robot, own) for own in (streams.TYPES_STREAM, streams.ACCOUNT_STREAM)]
     else:
         reports = part(list(last_reports(cloud, robot)), RefusedItems()).block
-        blocks = [*_blocks(cloud, robot, TYPES_STREAM), reports]
+        blocks = [*_blocks(cloud, robot, streams.TYPES_STREAM), reports]
     return {name for block in blocks for name in block.columns.get("stream", ()) if isinstance(name, str)}
 
 

@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 from iort_analysis.samples.blocks import Column, values
 from iort_contract import expression
 from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
-from iort_contract.expression import (
-    ARITHMETIC,
-    COMPARISONS,
-    Calculus,
-    Constant,
-    ExpressionError,
-    MismatchError,
-    Node,
-)
+from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
 from iort_station.errors import StationError, UsageError
@@ -137,7 +129,7 @@ def _finite(column: Column) -> Column:
 
 
 def _has_text(node: Node) -> bool:
-    if isinstance(node, Constant):
+    if isinstance(node, expression.Constant):
         return isinstance(node.value, str)
     return any(map(_has_text, expression.children(node)))
 
@@ -148,7 +140,7 @@ def _numbers(value: Any) -> Column:
 
 
 def _calculated(symbol: str, left: Any, right: Any) -> Column:
-    result = ARITHMETIC[symbol](_numbers(left), _numbers(right))
+    result = expression.ARITHMETIC[symbol](_numbers(left), _numbers(right))
     return np.where(_numbers(right) == 0, np.nan, result) if symbol in "/%" else np.asarray(result)
 
 
@@ -156,7 +148,7 @@ def _compared(symbol: str, left: Any, right: Any) -> Any:
     left, right = _numbers(left), _numbers(right)
     # NaN makes all other comparisons false by itself.
     known = ~(np.isnan(left) | np.isnan(right)) if symbol == "!=" else True
-    return COMPARISONS[symbol](left, right) & known
+    return expression.COMPARISONS[symbol](left, right) & known
 
 
 def _truth(value: Any, n: int | None = None) -> NDArray[np.bool_]:
@@ -165,7 +157,7 @@ def _truth(value: Any, n: int | None = None) -> NDArray[np.bool_]:
     return np.asarray(mask if n is None else np.broadcast_to(mask, (n,)), dtype=np.bool_)
 
 
-_ARRAYS = Calculus(
+_ARRAYS = expression.Calculus(
     _calculated,
     lambda value: np.abs(_numbers(value)),
     _compared,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import islice
@@ -15,18 +15,8 @@ from iort_analysis.mining.laps import compare
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
 from iort_contract.catalog.analysis import ANALYSIS_FAILED, GROUPS, KINDS, LAPS_TABLE, PLACES_TABLE
+from iort_contract.messages import insights as messages
 from iort_contract.messages.analysis import AnalysedDrive, AnalysisRequest, Estimate, Finding
-from iort_contract.messages.insights import (
-    AnalysisAnswer,
-    AnalysisStarted,
-    DeltaAnswer,
-    DriveEntry,
-    EstimateEntry,
-    FindingEntry,
-    InsightsAnswer,
-    LapsAnswer,
-    NotesAnswer,
-)
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored
@@ -45,7 +35,7 @@ _READERS = 8
 _LONGEST_S = 366 * 86_400
 
 
-def insights(cloud: Cloud, request: Mapping[str, str]) -> InsightsAnswer:
+def insights(cloud: Cloud, request: Mapping[str, str]) -> messages.InsightsAnswer:
     """The newest findings and drives of ``robot``; without one, of all robots."""
     robots = [check_robot(request["robot"])] if request.get("robot") else sorted(registry.presence(cloud))
     drives, findings = (_DRIVES, _FINDINGS) if request.get("robot") else (_FLEET_DRIVES, _FLEET_FINDINGS)
@@ -70,7 +60,7 @@ def insights(cloud: Cloud, request: Mapping[str, str]) -> InsightsAnswer:
     }
 
 
-def analyse(cloud: Cloud, request: Mapping[str, str]) -> AnalysisStarted:
+def analyse(cloud: Cloud, request: Mapping[str, str]) -> messages.AnalysisStarted:
     """Start an analysis of the drives of the last ``last_s``: of ``robot``, or of all robots without one."""
     last_us = whole(request, "last_s", 1, _LONGEST_S) * 1_000_000
     robots = (check_robot(request["robot"]),) if request.get("robot") else ()
@@ -79,13 +69,13 @@ def analyse(cloud: Cloud, request: Mapping[str, str]) -> AnalysisStarted:
     return {"run": run.rpartition(":")[2]}
 
 
-def progress(cloud: Cloud, request: Mapping[str, str]) -> AnalysisAnswer:
+def progress(cloud: Cloud, request: Mapping[str, str]) -> messages.AnalysisAnswer:
     """How far the ``run`` of an analysis is; raises `StationError` if it has failed."""
     run = analysis.look(cloud, analysis.named(cloud, text(request, "run")))
     return {"running": run.state == analysis.RUNNING, "drives": run.drives, "done": run.done}
 
 
-def estimate(of: Estimate) -> EstimateEntry:
+def estimate(of: Estimate) -> messages.EstimateEntry:
     """An estimate as the page has it."""
     return {"value": of.value, "low": of.low, "high": of.high, "unit": of.unit}
 
@@ -94,7 +84,7 @@ def _newest(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: -finding.from_us)
 
 
-def _finding(finding: Finding) -> FindingEntry:
+def _finding(finding: Finding) -> messages.FindingEntry:
     kind = KINDS.get(finding.kind)
     return {
         "id": finding.id,
@@ -117,7 +107,7 @@ def _finding(finding: Finding) -> FindingEntry:
     }
 
 
-def _drive(drive: AnalysedDrive) -> DriveEntry:
+def _drive(drive: AnalysedDrive) -> messages.DriveEntry:
     return {
         "robot": drive.drive.robot,
         "from_us": drive.drive.start_us,
@@ -130,22 +120,13 @@ def _drive(drive: AnalysedDrive) -> DriveEntry:
     }
 
 
-def _failed(findings: Iterable[Finding]) -> list[DriveEntry]:
+def _failed(findings: Iterable[Finding]) -> Iterator[messages.DriveEntry]:
     """The drives that could not be analysed, which are findings."""
-    return [
-        {
-            "robot": finding.drive.robot,
-            "from_us": finding.drive.start_us,
-            "to_us": max(finding.to_us, finding.drive.start_us + 1),
-            "samples": 0,
-            "failed": finding.text,
-            "repairs": {},
-            "estimates": {},
-            "missing": {},
-        }
-        for finding in findings
-        if finding.kind == ANALYSIS_FAILED
-    ]
+    for finding in findings:
+        if finding.kind == ANALYSIS_FAILED:
+            end_us = max(finding.to_us - 1, finding.drive.start_us)
+            drive = _drive(AnalysedDrive(finding.drive, end_us, "", 0, {}, {}, {}))
+            yield {**drive, "failed": finding.text}
 
 
 # An hour of a VESC at 100 Hz and of its pose.
@@ -164,7 +145,7 @@ def _mined_of(cloud: Cloud, request: Mapping[str, str]) -> Mined:
     return _mined(cloud, robot_of(request), start_us, end_us)
 
 
-def laps(cloud: Cloud, request: Mapping[str, str]) -> LapsAnswer:
+def laps(cloud: Cloud, request: Mapping[str, str]) -> messages.LapsAnswer:
     """The laps of ``robot`` from ``from_us`` to ``to_us``."""
     mined = _mined_of(cloud, request)
     table = mined.tables.get(LAPS_TABLE)
@@ -197,7 +178,7 @@ def laps(cloud: Cloud, request: Mapping[str, str]) -> LapsAnswer:
     }
 
 
-def delta(cloud: Cloud, request: Mapping[str, str]) -> DeltaAnswer:
+def delta(cloud: Cloud, request: Mapping[str, str]) -> messages.DeltaAnswer:
     """How far the lap ``other`` is behind the lap ``one``, at each place of the track."""
     mined = _mined_of(cloud, request)
     one, other = (whole(request, name, 1, 10**6) for name in ("one", "other"))
@@ -225,7 +206,7 @@ def _known(column: Column) -> list[float | None]:
 _NOTES = 200
 
 
-def notes(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
+def notes(cloud: Cloud, request: Mapping[str, str]) -> messages.NotesAnswer:
     """The newest notes about ``robot``, or about the fleet; those from ``from_us`` to ``to_us``, if given."""
     robot = check_robot(request["robot"]) if request.get("robot") else None
     start_us, end_us = (
@@ -240,7 +221,7 @@ def notes(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
     }
 
 
-def write_note(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
+def write_note(cloud: Cloud, request: Mapping[str, str]) -> messages.NotesAnswer:
     """Write a note with ``text`` about ``robot`` at ``t_us``, or about now."""
     robot = text(request, "robot")
     t_us = whole(request, "t_us", 0, 2**53) if "t_us" in request else None
@@ -248,7 +229,7 @@ def write_note(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
     return notes(cloud, {"robot": robot})
 
 
-def remove_note(cloud: Cloud, request: Mapping[str, str]) -> NotesAnswer:
+def remove_note(cloud: Cloud, request: Mapping[str, str]) -> messages.NotesAnswer:
     """Delete the note ``id`` of ``robot``."""
     robot = text(request, "robot")
     stored.remove_note(cloud, robot, text(request, "id"))

@@ -27,15 +27,9 @@ from urllib.parse import urlsplit
 from aiohttp import ETag, web
 from typing_extensions import Self
 
+from iort_contract import page
 from iort_contract.cloud import PUBNUB
 from iort_contract.messages.page import Admitted, Config
-from iort_contract.page import (
-    HEADERS,
-    INVITATION,
-    KEY_HEADER,
-    pubnub_address,
-    security_policy,
-)
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.invitations import COMMAND, answer, listening
@@ -122,7 +116,7 @@ class PageServer(BackgroundServer):
         known = configured(None if callable(vehicles) else vehicles)
         elsewhere = [broker] if broker else []
         if known["live"] == PUBNUB:
-            elsewhere.insert(0, pubnub_address(known["origin"], tls=known["tls"]))
+            elsewhere.insert(0, page.pubnub_address(known["origin"], tls=known["tls"]))
         if known["identity"]:
             elsewhere.append(known["identity"]["endpoint"])
         # Only these can be requested: no path reaches the file system.
@@ -140,9 +134,9 @@ class PageServer(BackgroundServer):
         else:
             self._files[CONFIG] = as_json(known)
         self._headers = {
-            **HEADERS,
+            **page.HEADERS,
             "Cache-Control": "no-cache",
-            "Content-Security-Policy": security_policy(*elsewhere),
+            "Content-Security-Policy": page.security_policy(*elsewhere),
             "Server": "iort",
             "Vary": "Accept-Encoding",
         }
@@ -160,7 +154,7 @@ class PageServer(BackgroundServer):
         token = secrets.token_urlsafe(32)
         self._tokens.append(token)
         # What follows the # stays in the browser; it is in no log.
-        return f"{self.url}{view}?{INVITATION}={token}"
+        return f"{self.url}{view}?{page.INVITATION}={token}"
 
     def start(self) -> Self:
         """Listen, and return once the page can be requested."""
@@ -324,7 +318,7 @@ class PageServer(BackgroundServer):
         origin = urlsplit(request.headers.get("Origin", "")).netloc
         if origin.lower() != request.headers["Host"].lower():
             return self._refusal(request, 403, "an action needs this page's own origin")
-        if keyed and not self._is_key(request.headers.get(KEY_HEADER, "")):
+        if keyed and not self._is_key(request.headers.get(page.KEY_HEADER, "")):
             return self._refusal(request, 403, f"this browser may only look: {self._another()}")
         # A browser sends this type to another origin only after a question that is never answered here.
         if request.content_type != TYPES[".json"]:

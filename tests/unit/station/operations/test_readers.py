@@ -11,15 +11,8 @@ import pytest
 from iort_analysis.samples.batches import RefusedItems, blocks
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
+from iort_contract.messages import commands
 from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
-from iort_contract.messages.commands import (
-    Command,
-    FleetMessage,
-    decode_command,
-    decode_fleet,
-    encode_command,
-    encode_fleet,
-)
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
 from iort_station.operations.audit import audit
 from testkit.dynamodb import item_of, serialize
@@ -96,16 +89,16 @@ def saying(message, **changes):
 
 def test_every_lane_and_the_page_accept_the_same_run_names():
     live = encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
-    fleet = encode_fleet(FleetMessage(RUN, 1, T_US, {}))
-    command = encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
+    fleet = commands.encode_fleet(commands.FleetMessage(RUN, 1, T_US, {}))
+    command = commands.encode_command(commands.Command(RUN, T_US, 1, T_US, 100, {}))
     page = re.search(r"^export const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
     assert page is not None
     for name, allowed in [(RUN, True), ("0" * 32, True)] + [(one, False) for one in NO_RUNS]:
         said = {
             "record": by_contract(decode_batch)(stored(batch=f"{T_US}-{name}-3")),
             "live": read(decode_live, saying(live, boot=name)),
-            "fleet": read(decode_fleet, saying(fleet, boot=name)),
-            "cmd": read(decode_command, saying(command, session=name)),
+            "fleet": read(commands.decode_fleet, saying(fleet, boot=name)),
+            "cmd": read(commands.decode_command, saying(command, session=name)),
             "page": re.fullmatch(page[1], name) is not None,
         }
         assert set(said.values()) == {allowed}, (name, said)
