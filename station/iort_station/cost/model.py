@@ -206,15 +206,15 @@ def _own(usage: Usage) -> Table:
 def _live(usage: Usage) -> Table:
     by_pubnub = usage.live_per_s * _HOUR_S if usage.live_transport == PUBNUB else 0.0
     logged = live_lines_per_s(usage) * _HOUR_S / usage.robots * _LIVE_LINE + by_pubnub * _LIVE_VALUES
-    # By AWS IoT each viewer receives each message, and is connected.
-    receivers = usage.viewers if usage.live_transport == IOT else 0
+    # By AWS IoT each viewer is connected while somebody looks, and receives each message then.
+    receivers = usage.watched * (usage.viewers if usage.live_transport == IOT else 0)
     passing, leases = usage.live_at_broker_per_s * _HOUR_S, usage.leases_per_s * _HOUR_S
     return {
         # A lease is sent and received.
-        "message": 2 * leases + passing * (1 + receivers),
+        "message": 2 * leases + passing + receivers * usage.live_hz * _HOUR_S,
         # Two more rules, for faults and a low battery, evaluate each that passes the broker.
         **dict.fromkeys(("rule", "action"), 2 * passing + by_pubnub),
-        "connection": 60 * usage.watched * receivers / usage.robots,
+        "connection": 60 * receivers / usage.robots,
         **_function(usage, by_pubnub, usage.live_memory_mb, usage.live_ms, logged),
     }
 

@@ -75,6 +75,9 @@ CASES = [
             "connection": 3 * 60,
         },
     ),
+    # Nobody receives what a car sends while nobody looks.
+    ({**_IOT, "watched_hours": 0.0}, "live", {"message": 360, "rule": 720, "connection": 0}),
+    ({**_IOT, "hours_per_day": 4.0}, "live", {"message": 18_000 * 2 + 180 + 720, "connection": 30}),
     # A ping and a pong for the clock's offset; those of the path rule tell it, too.
     ({}, "ping", {"message": 2 * 120, "rule": 120, "action": 120, "invocation": 0}),
     ({"ping_hz": 1.0}, "ping", {"message": 6 * _HOUR, "rule": 2 * _HOUR, "invocation": _HOUR}),
