@@ -28,6 +28,7 @@ from testkit.ports import free_port
 from testkit.waiting import until
 from tests.device.running import Running
 from tests.rosbridge_standin import RosbridgeStandin
+from tests.unit.agent.test_agent import config_file
 
 CORE = "/sensors/core"
 VESC = "vesc_msgs/VescStateStamped"
@@ -379,26 +380,19 @@ def test_an_error_names_the_missing_websocket_package(
         config(server).build(SystemClock()).run(lambda *_: None, threading.Event())
 
 
-CAR = "robot: car1\nendpoint: a.example\ncertificate: x\nprivate_key: x\nroot_ca: x\nsources:\n"
-
-
 def test_the_configuration_is_validated(tmp_path: Path) -> None:
-    (tmp_path / "x").touch()
-    (tmp_path / "car.yaml").write_text(
-        CAR + "  - type: rosbridge\n    url: wss://robot.local:9090/\n    topics:\n"
-        "      /sensors/core: {stream: vesc, time: header, type: vesc_msgs/VescStateStamped}\n"
-        "      /imu: {stream: imu, time: arrival, fields: [a.x], throttle_ms: 100}\n"
-    )
-    (source,) = load_config(tmp_path / "car.yaml").sources
+    core = "/sensors/core: {stream: vesc, time: header, type: vesc_msgs/VescStateStamped}"
+    imu = "/imu: {stream: imu, time: arrival, fields: [a.x], throttle_ms: 100}"
+    topics = f"{{{core}, {imu}}}"
+    file = config_file(tmp_path, f"{{type: rosbridge, url: 'wss://robot.local:9090/', topics: {topics}}}")
+    (source,) = load_config(file).sources
     assert list(source.streams()) == ["imu", "vesc"]
     assert source.describe() == "rosbridge wss://robot.local:9090/, topics /sensors/core, /imu"
 
 
 @pytest.mark.parametrize("url", ["http://a:9090", "localhost:9090", "ws://", "ws://a:x", "ws://[", "7"])
 def test_a_wrong_address_is_rejected(tmp_path: Path, url: str) -> None:
-    (tmp_path / "x").touch()
-    (tmp_path / "car.yaml").write_text(
-        CAR + f"  - {{type: rosbridge, url: '{url}', topics: {{/a: {{stream: a, time: arrival}}}}}}\n"
-    )
+    topics = "{/a: {stream: a, time: arrival}}"
+    file = config_file(tmp_path, f"{{type: rosbridge, url: '{url}', topics: {topics}}}")
     with pytest.raises(ConfigError, match=r"sources\[0\]\.url: .*such as ws://localhost:9090"):
-        load_config(tmp_path / "car.yaml")
+        load_config(file)

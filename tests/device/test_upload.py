@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
+from pathlib import PurePath
 
 import pytest
 
@@ -30,6 +31,7 @@ from iort_contract.topics import FILE, PING, build_topic
 from testkit.agent import Loopback, ManualClock, link_of
 from testkit.waiting import GUARD_S
 from tests.store_standin import store
+from tests.unit.agent.test_agent import config_file
 
 
 class Rig:
@@ -130,9 +132,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
         ("x" * 150 + ".bag", "x" * 96 + ".bag"),
     ],
 )
-def test_each_name_becomes_an_allowed_name(path, name, tmp_path):
-    from pathlib import PurePath
-
+def test_each_name_becomes_an_allowed_name(path, name):
     assert wire_name(PurePath(path)) == name
     assert kind_of(PurePath("a.MCAP")) == ("recording", "application/x-mcap")
 
@@ -457,13 +457,7 @@ def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
 
 
 def test_the_command_gives_advice_while_an_agent_runs(tmp_path, bags):
-    file = tmp_path / "car.yaml"
-    for name in ("certificate.pem", "private.key"):
-        (tmp_path / name).write_text("")
-    file.write_text(
-        "robot: car\nendpoint: localhost\ncertificate: certificate.pem\nprivate_key: private.key\n"
-        f"sources: [{{type: sim, stream: vesc, rate_hz: 1}}]\nfiles: {{folder: {bags}}}\n"
-    )
+    file = config_file(tmp_path, "{type: sim, stream: vesc, rate_hz: 1}", f"files: {{folder: {bags}}}")
     server = StatusServer(tmp_path / SOCKET, lambda: {"pid": 7})
     server.start()
     try:

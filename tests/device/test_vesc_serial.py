@@ -19,6 +19,7 @@ from iort_agent.errors import SourceError
 from iort_agent.sources.vesc import VescConfig, why
 from testkit.waiting import until
 from tests.device.running import Running
+from tests.unit.agent.test_agent import config_file
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
 
 
@@ -256,14 +257,9 @@ def test_an_error_names_the_missing_pyserial_package(
 
 
 def test_the_configuration_is_validated(tmp_path: Path) -> None:
-    for name in ("cert.pem", "key.pem", "ca.pem"):
-        (tmp_path / name).touch()
-    (tmp_path / "car.yaml").write_text(
-        "robot: car1\nendpoint: a.example\ncertificate: cert.pem\nprivate_key: key.pem\nroot_ca: ca.pem\n"
-        "sources:\n  - {type: vesc, port: /dev/vesc}\n"
-        "  - {type: vesc, port: /dev/vesc2, baudrate: 57600, rate_hz: 20, stream: rear, can_id: 3}\n"
-    )
-    front, rear = load_config(tmp_path / "car.yaml").sources
+    rear_yaml = "port: /dev/vesc2, baudrate: 57600, rate_hz: 20, stream: rear, can_id: 3"
+    file = config_file(tmp_path, f"{{type: vesc, port: /dev/vesc}}, {{type: vesc, {rear_yaml}}}")
+    front, rear = load_config(file).sources
     assert front == VescConfig(port="/dev/vesc")
     assert rear.describe() == "VESC on /dev/vesc2, CAN id 3, at 20 Hz"
     assert (list(front.streams()), list(rear.streams())) == (["vesc"], ["rear"])
