@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Iterator
 
 from iort_contract.catalog.alarms import OF_ONE_RESOURCE, OF_RESOURCES, OF_THE_ACCOUNT, Alarm
 from iort_contract.tables import ALERT_FAULT, ALERT_LOW_VOLTAGE
@@ -74,6 +75,11 @@ class Metric:
 
 _delay = partial(Metric, unit="Milliseconds", statistic="p95")
 
+
+def _counts(function: str, chart: Chart, *names: str, right: bool = False) -> Iterator[Metric]:
+    return (Metric(name, function, chart, right=right) for name in names)
+
+
 METRICS = {
     metric.name: metric
     for metric in (
@@ -103,13 +109,10 @@ METRICS = {
             ),
         ),
         # Without PubNub's keys there is nothing to be alarmed at.
-        Metric("LiveNotConfigured", "live", LIVE_CHART, right=True),
-        Metric("LiveStale", "live", LIVE_CHART, right=True),
-        Metric("LiveRefused", "live", LIVE_CHART, right=True),
-        Metric("LiveCutOff", "live", LIVE_CHART, right=True),
-        _delay("InCarMs", "live", HOPS_CHART),
-        _delay("UplinkMs", "live", HOPS_CHART),
-        _delay("ToLambdaMs", "live", HOPS_CHART),
+        *_counts(
+            "live", LIVE_CHART, "LiveNotConfigured", "LiveStale", "LiveRefused", "LiveCutOff", right=True
+        ),
+        *(_delay(name, "live", HOPS_CHART) for name in ("InCarMs", "UplinkMs", "ToLambdaMs")),
         _delay(
             "CarToLambdaMs",
             "live",
@@ -158,8 +161,7 @@ METRICS = {
                 "(`record` in car.yaml), raise `record_gb_a_day`, or `iort robots remove`",
             ),
         ),
-        Metric("SamplesSummarized", "summarize", BATCHES_CHART),
-        Metric("BatchesSummarized", "summarize", BATCHES_CHART),
+        *_counts("summarize", BATCHES_CHART, "SamplesSummarized", "BatchesSummarized"),
         Metric("AgentReports", "health", REPORTS_CHART),
         Metric(
             "ThreadErrors",
@@ -218,23 +220,17 @@ METRICS = {
             ),
         ),
         Metric("BacklogBatches", "health", BACKLOG_CHART, statistic="Maximum", of_a_robot=True),
-        _delay("RoundTripBrokerMs", "health", ROUND_TRIPS_CHART),
-        _delay("RoundTripRuleMs", "health", ROUND_TRIPS_CHART),
-        _delay("RoundTripLambdaMs", "health", ROUND_TRIPS_CHART),
-        Metric("AlertsSent", "alert", FAULTS_CHART, right=True),
-        Metric("AlertsHeld", "alert", FAULTS_CHART, right=True),
-        Metric("RobotsConnected", "presence", PRESENCE_CHART),
-        Metric("RobotsDisconnected", "presence", PRESENCE_CHART),
-        Metric("PresenceIgnored", "presence", PRESENCE_CHART),
-        Metric("RobotsAdmitted", "admit", ADMISSION_CHART),
-        Metric("RobotsRefused", "admit", ADMISSION_CHART),
+        *(
+            _delay(name, "health", ROUND_TRIPS_CHART)
+            for name in ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
+        ),
+        *_counts("alert", FAULTS_CHART, "AlertsSent", "AlertsHeld", right=True),
+        *_counts("presence", PRESENCE_CHART, "RobotsConnected", "RobotsDisconnected", "PresenceIgnored"),
+        *_counts("admit", ADMISSION_CHART, "RobotsAdmitted", "RobotsRefused"),
         Metric("PongsSent", "echo", ADMISSION_CHART, right=True),
-        Metric("FilesAsked", "upload", FILES_CHART),
-        Metric("FilesStored", "upload", FILES_CHART),
-        Metric("FilesRefused", "upload", FILES_CHART),
+        *_counts("upload", FILES_CHART, "FilesAsked", "FilesStored", "FilesRefused"),
         Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
-        Metric("HoursArchived", "archive", ARCHIVE_CHART),
-        Metric("DaysJoined", "archive", ARCHIVE_CHART),
+        *_counts("archive", ARCHIVE_CHART, "HoursArchived", "DaysJoined"),
         Metric("SamplesArchived", "archive", ARCHIVE_CHART, right=True),
         Metric("BytesArchived", "archive", ARCHIVE_CHART, right=True, unit="Bytes"),
         Metric("ItemsSetAside", "archive", ARCHIVE_CHART),
@@ -259,8 +255,7 @@ METRICS = {
                 "then `iort archive run`",
             ),
         ),
-        Metric("QuestionsAnswered", "answer", ASKS_CHART),
-        Metric("QuestionsRefused", "answer", ASKS_CHART),
+        *_counts("answer", ASKS_CHART, "QuestionsAnswered", "QuestionsRefused"),
         # From the rule's receipt to the answer's publish.
         _delay("AnswerMs", "answer", ASKS_CHART, right=True),
     )

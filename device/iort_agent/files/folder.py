@@ -85,10 +85,17 @@ class Folder:
             look = look_at(self.path, name)
         except (OSError, UploadError):
             return False
-        seen, done, held = self._seen.get(name), self._done.get(str(name)), self._held.get(name)
+        seen = self._seen.get(name)
         unchanged = seen is not None and seen[0] == look
-        uploaded = done is not None and tuple(done["look"]) == look
-        return unchanged and not uploaded and (held is None or held.look != look or now >= held.until)
+        return unchanged and not self._is_uploaded(name, look) and not self._is_held(name, look, now)
+
+    def _is_uploaded(self, name: Path, look: Look) -> bool:
+        done = self._done.get(str(name))
+        return done is not None and tuple(done["look"]) == look
+
+    def _is_held(self, name: Path, look: Look, now: float) -> bool:
+        held = self._held.get(name)
+        return held is not None and held.look == look and now < held.until
 
     def _look(self, now: float) -> None:
         ready: list[tuple[int, Path]] = []
@@ -99,13 +106,11 @@ class Folder:
             seen = self._seen.get(name)
             if seen is None or seen[0] != look:
                 seen = self._seen[name] = (look, now)
-            done = self._done.get(str(name))
-            if done is not None and tuple(done["look"]) == look:
-                self._remove_if_due(name, done)
+            if self._is_uploaded(name, look):
+                self._remove_if_due(name, self._done[str(name)])
                 continue
             waiting += 1
-            held = self._held.get(name)
-            if now - seen[1] >= self._settle_s and (held is None or held.look != look or now >= held.until):
+            if now - seen[1] >= self._settle_s and not self._is_held(name, look, now):
                 ready.append((look.mtime_ns, name))
         self.waiting, self._looked = waiting, now
         self._ready = deque(name for _, name in sorted(ready))

@@ -42,27 +42,19 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
 
 
-class Library:
-    """pyserial, and the errors of a port that is not there, goes away or misbehaves."""
-
-    def __init__(self) -> None:
+def load_pyserial() -> tuple[Any, tuple[type[Exception], ...]]:
+    """The port of pyserial, and the errors of one that is not there, goes away or misbehaves. Raises
+    `SourceError` if it is not installed."""
+    try:
+        # Only a robot that reads its VESC by itself needs it: pip install iort-agent[serial].
         import termios  # noqa: PLC0415 - only where there is a port
 
         import serial  # noqa: PLC0415 - optional
-
-        self.Serial = serial.Serial
-        self.errors = (OSError, termios.error)
-
-
-def load_pyserial() -> Library:
-    """The library. Raises `SourceError` if it is not installed."""
-    try:
-        # Only a robot that reads its VESC by itself needs it: pip install iort-agent[serial].
-        return Library()
     except ImportError as error:
         raise SourceError(
             "reading a VESC needs the package pyserial: pip install 'iort-agent[serial]'"
         ) from error
+    return serial.Serial, (OSError, termios.error)
 
 
 def why(error: Exception, *, was_open: bool) -> str:
@@ -169,15 +161,15 @@ class VescSource:
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Poll until ``stop`` is set. Raises `SourceError` without pyserial."""
-        library = load_pyserial()
+        serial_port, errors = load_pyserial()
         backoff_s = _BACKOFF_S[0]
         while not stop.is_set():
             samples, opened = self.counts.samples, self.counts.opened
             try:
-                with self._open(library) as port:
+                with self._open(serial_port) as port:
                     self.counts.opened += 1
                     _Session(self._config, self._clock, self, port).run(emit, stop)
-            except library.errors as error:
+            except errors as error:
                 self.trouble(why(error, was_open=self.counts.opened > opened))
             if self.counts.samples > samples:
                 backoff_s = _BACKOFF_S[0]
@@ -206,9 +198,9 @@ class VescSource:
             self._unknown.add(len(payload))
             _log.error("%s: the answer is dropped: %s", self._config.port, error)
 
-    def _open(self, library: Library) -> Any:
+    def _open(self, serial_port: Any) -> Any:
         config = self._config
-        port = library.Serial(
+        port = serial_port(
             config.port,
             config.baudrate,
             timeout=min(_READ_S, config.timeout_s),
