@@ -8,7 +8,8 @@ import { PubNubLink } from "./link/pubnub_link";
 import { parseLive, parseUpdate, type Update } from "./link/update";
 import type { Arrival, FromWorker, LinkState, Listening, Refused, ToWorker } from "./link/worker_messages";
 
-// Messages of this time are handed over together, because each handover wakes the page.
+// Each handover wakes the page, so there is this time between two. A message after a pause is handed over at once,
+// together with those that came with it.
 const TOGETHER_MS = 25;
 // The most messages that wait for a busy page; beyond that the oldest is dropped.
 const MOST_WAITING = 2_000;
@@ -20,6 +21,7 @@ let arrivals: Arrival[] = [];
 const refused = new Map<string, Refused>();
 let timer: number | undefined;
 let taking = false;
+let handedAt = -Infinity;
 
 const tell = (message: FromWorker): void => self.postMessage(message);
 
@@ -27,13 +29,15 @@ function hand(): void {
   timer = undefined;
   if (taking) return;
   taking = true;
+  handedAt = now();
   tell({ kind: "arrivals", arrivals, refused: [...refused.values()] });
   arrivals = [];
   refused.clear();
 }
 
 function handSoon(): void {
-  if (timer === undefined) timer = self.setTimeout(hand, TOGETHER_MS);
+  if (timer !== undefined) return;
+  timer = self.setTimeout(hand, Math.max(0, TOGETHER_MS - 1000 * (now() - handedAt)));
 }
 
 function refuse(robot: string, reason: string): void {
