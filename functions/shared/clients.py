@@ -44,6 +44,11 @@ def credentials() -> Credentials:
     return given
 
 
+def authorities() -> str | None:
+    """The file of the authorities that botocore trusts, too; None for the system's."""
+    return os.environ.get("AWS_CA_BUNDLE")
+
+
 @cache
 def dynamodb() -> DynamoDBClient:
     """A client for the tables."""

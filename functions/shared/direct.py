@@ -16,7 +16,6 @@ import hmac
 import http.client
 import json
 import logging
-import os
 import ssl
 import time
 import zlib
@@ -39,17 +38,18 @@ _ENDED = (OSError, http.client.HTTPException)
 
 
 class Direct:
-    """All of ``client``, with two operations of its own. May be used from several threads."""
+    """All of ``client``, with two operations of its own. May be used from several threads.
 
-    def __init__(self, client: DynamoDBClient, credentials: Credentials) -> None:
+    ``authorities`` is the file of the certificate authorities to trust; None for the system's.
+    """
+
+    def __init__(
+        self, client: DynamoDBClient, credentials: Credentials, authorities: str | None = None
+    ) -> None:
         self._client, self._credentials = client, credentials
         url = urlsplit(client.meta.endpoint_url)
         self._host, self._region = url.netloc, client.meta.region_name
-        self._context = (
-            ssl.create_default_context(cafile=os.environ.get("AWS_CA_BUNDLE"))
-            if url.scheme == "https"
-            else None
-        )
+        self._context = ssl.create_default_context(cafile=authorities) if url.scheme == "https" else None
         self._idle: list[http.client.HTTPConnection] = []
         self._key: tuple[tuple[str, str], bytes] = (("", ""), b"")
 

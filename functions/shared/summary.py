@@ -334,7 +334,7 @@ def stored_tables() -> Tables:
     # made anew for each request, a fifth of it for a driving car.
     client = quick(connect("dynamodb", config=Config(parameter_validation=False, user_agent="iort")))
     tables = Tables(
-        Direct(client, clients.credentials()),
+        Direct(client, clients.credentials(), clients.authorities()),
         telemetry=given.telemetry_table,
         summary=given.summary_table,
         robots=given.robots_table,
