@@ -281,7 +281,7 @@ def by_lane(items):
     return dict(sums)
 
 
-@pytest.mark.parametrize("name", SETTINGS.keys() | FIGURES.keys())
+@pytest.mark.parametrize("name", sorted(SETTINGS.keys() | FIGURES.keys()))
 def test_the_figures_stay_as_they_were_first_computed(name):
     usage = SETTINGS[name]
     figures = {
