@@ -76,7 +76,7 @@ LOST = frozenset(
         "skipped",
         "unread",
         "bad_cells",
-        "structure_not_kept",
+        "type_unknown",
         "not_a_number",
         "others",
     }

@@ -55,15 +55,12 @@ class TopicConfig:
 
 
 class Kind(NamedTuple):
-    """A type of the topic's messages.
+    """A type of the topic's messages. ``decoder`` is for selected fields, and for bytes that are stored
+    elsewhere."""
 
-    ``whole`` is None if the messages are not recorded as published. ``decoder`` is for selected fields, and
-    for bytes that are stored elsewhere.
-    """
-
-    whole: Optional[RosType]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+    whole: RosType
     text: str
-    decoder: Optional[Decoder]  # noqa: UP045 - as above
+    decoder: Optional[Decoder]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
     stamped: bool
 
 
@@ -108,10 +105,6 @@ class Intake:
                 self._turn_to(header, arrival_us)
             kind = self._kind
         assert kind is not None
-        self.record(kind, data, arrival_us)
-
-    def record(self, kind: Kind, data: bytes, arrival_us: int) -> None:
-        """Emit a message of a type."""
         t_us = None
         if kind.stamped and self._config.time == HEADER:
             t_ns = stamp_ns(data)
@@ -152,8 +145,7 @@ class Intake:
         counts = {"messages": self._messages, "silent": self._silent, "left_out": left_out}
         return {**counts, **self.throttled.counts()}
 
-    def decoder(self, kind: str, definition: Definition) -> Decoder:
-        """The decoder of a type, for the selected fields."""
+    def _decoder(self, kind: str, definition: Definition) -> Decoder:
         decoder = Decoder(definition, select=self._config.fields, large=self._large)
         if decoder.unknown:
             _log.warning("topic %s: %s has no field %s", self._topic, kind, ", ".join(decoder.unknown))
@@ -167,11 +159,11 @@ class Intake:
             try:
                 values = kind.decoder.decode(data)
             except MessageError as error:
-                if kind.whole is None or self._config.fields:
+                if self._config.fields:
                     self.warn("malformed", str(error))
                     return None
                 self.warn("undecodable", f"kept as it is: {error}")
-        if kind.whole is not None and (kind.decoder is None or not self._config.fields):
+        if kind.decoder is None or not self._config.fields:
             contents = {name: value for name, value in values.items() if isinstance(value, Large) and value}
             return RosMessage(data, kind.whole, large=contents)
         if not values:
@@ -227,7 +219,7 @@ class Intake:
             definition = parse(kind, text)
             stamped = definition.stamped()
             if self._config.fields or self._large:
-                decoder = self.decoder(kind, definition)
+                decoder = self._decoder(kind, definition)
         except (MessageError, SourceError) as error:
             why = str(error)
         whole = RosType(self._topic, kind, md5sum, text)

@@ -1,8 +1,7 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
 JSON has no types, so the server's rosapi is asked for them. Each message is made into the ROS 1 message that
-it was, and goes the way of the ROS 1 source. If rosapi does not answer, the structure is inferred from the
-JSON; only the sample is sent then, and counted as ``structure_not_kept``.
+it was, and goes the way of the ROS 1 source. Until rosapi answers, the newest messages of a topic are held.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from iort_agent.common.schema import Place, number, pairs, section, setting, tex
 from iort_agent.common.threads import Clock
 from iort_agent.ros1.json_message import Writer
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
-from iort_agent.sources.intake import Intake, Kind
+from iort_agent.sources.intake import Intake
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
-from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure, infer
+from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
 from iort_contract.limits import MessageError
 
 # A latched message comes with the subscription, or not at all.
@@ -100,9 +99,8 @@ class Numbers:
         del last[:-_MAX_PUBLISHERS]
 
 
-# Messages of a topic that are kept until its type is known.
+# Messages of a topic that are held until its type is known.
 _MAX_HELD, _MAX_HELD_BYTES = 2_000, 8_000_000
-_MAX_INFERRED = 16
 _CHECK_S = 5.0
 
 
@@ -177,11 +175,7 @@ class RosbridgeSource:
         for name, topic in self._config.topics:
             taken = Intake(name, topic, emit=emit, clock=self._clock)
             self._hearings[name] = _Hearing(topic, taken, self._clock)
-        try:
-            self.connection.run(stop)
-        finally:
-            for hearing in self._hearings.values():
-                hearing.structure(None)
+        self.connection.run(stop)
 
     def report(self) -> dict[str, Any]:
         return {
@@ -232,17 +226,17 @@ class _Hearing:
         self._clock = clock
         self._numbers = Numbers()
         self._messages = 0
-        # The messages that came before the structure is known; None if none are held.
-        self._held: deque[tuple[Any, int]] | None = None
+        # The messages that wait for the structure, with the sizes of their texts.
+        self._held: deque[tuple[dict[str, Any], int, int]] = deque()
         self._held_bytes = 0
+        # None until the server that is connected now has told the structure.
         self._writer: Writer | None = None
         self._structure: Structure | None = None
         self._header: Mapping[str, str] = {}
-        self._inferred: dict[str, tuple[Kind, Writer]] = {}
 
     def hold(self) -> None:
-        """Keep the messages until `structure` is called."""
-        self._held = deque() if self._held is None else self._held
+        """Hold the messages until `structure` is called."""
+        self._writer = None
 
     def take(self, message: Any, data: bytes, arrival_us: int) -> bool:
         """Take a message and its text; whether it is a new one. Never raises."""
@@ -260,60 +254,49 @@ class _Hearing:
         seq = header.get("seq")
         if type(seq) is int and not self._config.throttle_ms:
             self._numbers.take(seq)
-        if self._held is None:
-            self._record(message, arrival_us)
+        if self._writer is not None:
+            self._record(self._writer, message, arrival_us)
             return True
-        self._held.append((message, arrival_us))
+        self._held.append((message, arrival_us, len(data)))
         self._held_bytes += len(data)
-        if len(self._held) > _MAX_HELD or self._held_bytes > _MAX_HELD_BYTES:
-            self.structure(None)
+        while len(self._held) > _MAX_HELD or self._held_bytes > _MAX_HELD_BYTES:
+            self._held_bytes -= self._held.popleft()[2]
+            self._intake.warn("type_unknown", "rosapi, which runs beside the server, does not tell its type")
         return True
 
     def structure(self, structure: Structure | None) -> None:
-        """Set the structure of the messages; None if it is not known, and the one known before stays."""
-        if structure is not None and structure != self._structure:
-            self._structure, self._writer = structure, Writer(structure.definition)
+        """Record the messages that were held, and those to come. None if rosapi does not tell the structure:
+        the one of the connection before stays."""
+        structure = structure or self._structure
+        if structure is None:
+            return
+        if structure != self._structure:
+            self._structure = structure
             self._header = {
                 "type": structure.kind, "md5sum": structure.md5sum, "message_definition": structure.text,
             }  # fmt: skip
-        held, self._held, self._held_bytes = self._held, None, 0
-        for message, arrival_us in held or ():
-            self._record(message, arrival_us)
+        self._writer = writer = Writer(structure.definition)
+        while self._held:
+            message, arrival_us, _ = self._held.popleft()
+            self._record(writer, message, arrival_us)
+        self._held_bytes = 0
 
     def report(self) -> dict[str, Any]:
         counts = {name: count for name, count in self._intake.report().items() if count}
         if self._numbers.missed:
             counts["missed"] = self._numbers.missed
+        if self._held:
+            counts["type_unknown"] = counts.get("type_unknown", 0) + len(self._held)
         return {**counts, "messages": self._messages}
 
-    def _record(self, message: dict[str, Any], arrival_us: int) -> None:
-        why = "the server does not tell the structure of its messages"
-        if self._writer is not None:
-            try:
-                data = self._write(self._writer, message)
-            except MessageError as error:
-                why = str(error)
-            else:
-                self._intake.take(self._header, data, arrival_us)
-                return
-        self._intake.warn("structure_not_kept", f"{why}; only single values are stored")
-        try:
-            definition, normal, stamped = infer(message)
-            key = repr(definition.fields()) + repr(definition.types) + str(stamped)
-            if key not in self._inferred:
-                if len(self._inferred) >= _MAX_INFERRED:
-                    self._inferred.clear()
-                decoder = self._intake.decoder(definition.kind, definition)
-                self._inferred[key] = Kind(None, "", decoder, stamped), Writer(definition)
-            kind, writer = self._inferred[key]
-            self._intake.record(kind, self._write(writer, normal), arrival_us)
-        except (MessageError, RecursionError) as error:
-            self._intake.warn("refused", str(error))
-
-    def _write(self, writer: Writer, message: dict[str, Any]) -> bytes:
+    def _record(self, writer: Writer, message: dict[str, Any], arrival_us: int) -> None:
         nulls = writer.nulls
-        data = writer.write(message)
+        try:
+            data = writer.write(message)
+        except MessageError as error:
+            self._intake.warn("malformed", str(error))
+            return
         if writer.nulls != nulls:
             why = "the server sends null for NaN and the infinities; NaN is stored"
             self._intake.warn("not_a_number", why)
-        return data
+        self._intake.take(self._header, data, arrival_us)
