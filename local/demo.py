@@ -291,7 +291,7 @@ class _Demo:
             samples_sent=sent,
             samples_stored=stored,
             samples_summarized=summarized,
-            live_published=report["live_published"],
+            live_published=report["lanes"]["live"]["published"],
             live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
             rtt_ms=round_trips(audit.batches(embedded.cloud, ROBOT, RTT_STREAM)),
             car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),

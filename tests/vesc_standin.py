@@ -48,7 +48,7 @@ Answer = Callable[[bytes, int], List[bytes]]
 
 
 class VescStandin:
-    """Answers COMM_GET_VALUES and COMM_FW_VERSION; ``answer`` may be changed at any time.
+    """Answers COMM_GET_VALUES; ``answer`` may be changed at any time.
 
     ``answer`` gets the correct frame and its number, and returns the frames to send instead.
     """
@@ -133,12 +133,9 @@ class VescStandin:
             assert one == framed(payload), one
             self.asked.append(payload)
             controller = payload[1] if payload[0] == 34 else 1
-            if payload[-1] == 0:
-                answers = [framed(FIRMWARE)]
-            else:
-                intact = framed(values(self.sent, length=self.length, controller=controller))
-                answers = self.answer(intact, self.sent)
-                self.sent += 1
+            intact = framed(values(self.sent, length=self.length, controller=controller))
+            answers = self.answer(intact, self.sent)
+            self.sent += 1
             for chunk in answers:
                 self._write(chunk)
         return received

@@ -7,21 +7,17 @@ import os
 import uuid
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Callable, Mapping
+from typing import Callable, Mapping
 
 from iort_agent.common.logs import Troubles, set_level
 from iort_agent.common.state import (
     Files,
     Lanes,
-    LiveReport,
     LiveState,
     PingState,
     Queue,
-    QueueReport,
     RecordState,
-    Report,
     Status,
-    StreamReport,
     StreamState,
 )
 from iort_agent.common.threads import WATCH, Clock
@@ -179,7 +175,7 @@ class Agent:
 
 
 def make_status(agent: Agent) -> Status:
-    """The agent now."""
+    """The agent now, and at its end the whole run."""
     settings, live = agent.streams.settings, agent.live
     backlog, dropped = agent.spool.backlog(), agent.spool.dropped()
     return Status(
@@ -202,7 +198,8 @@ def make_status(agent: Agent) -> Status:
             ),
             ping=PingState(settings.ping_rate_hz, agent.pings.held_back),
         ),
-        sources=_sources(agent),
+        sources=[{"source": source.description, **source.report()} for source in agent.sources],
+        failed_sources=[source.description for source in agent.sources if source.failed],
         streams=_streams(agent),
         spool=Queue(
             *backlog,
@@ -210,33 +207,13 @@ def make_status(agent: Agent) -> Status:
             dropped_batches=dropped.batches,
             dropped_samples=dropped.samples,
         ),
+        downlink=agent.downlink.report() if agent.downlink is not None else None,
         files=_files(agent),
         clock=agent.offset.estimate(),
         pings=agent.pings.report(),
         over_share=agent.shadow.over_share,
         alarms=_alarms(agent),
         troubles=agent.troubles.last() if agent.troubles is not None else [],
-    )
-
-
-def make_report(agent: Agent) -> Report:
-    """The whole run, at its end."""
-    left, dropped = agent.spool.backlog(), agent.spool.dropped()
-    return Report(
-        robot=agent.config.robot,
-        boot=agent.boot,
-        streams={
-            name: StreamReport(**vars(counts)) for name, counts in sorted(agent.streams.counts().items())
-        },
-        live_published=agent.live.published,
-        live_refused=agent.live.refused,
-        live=LiveReport(*agent.live.tempo, streams_hz=agent.live.rates_hz()),
-        spool=QueueReport(left.batches, left.samples, dropped.batches, dropped.samples),
-        pings=agent.pings.report() if agent.streams.settings.ping_rate_hz else {},
-        failed_sources=[source.description for source in agent.sources if source.failed],
-        sources=_sources(agent),
-        downlink=agent.downlink.report() if agent.downlink is not None else None,
-        files=_files(agent),
     )
 
 
@@ -252,10 +229,6 @@ def _streams(agent: Agent) -> dict[str, StreamState]:
         )
         for name, counts in sorted(agent.streams.counts().items())
     }
-
-
-def _sources(agent: Agent) -> list[dict[str, Any]]:
-    return [{"source": source.description, **source.report()} for source in agent.sources]
 
 
 def _files(agent: Agent) -> Files | None:

@@ -14,10 +14,9 @@ import time
 from pathlib import Path
 from typing import Any, Callable, NoReturn, Sequence
 
-from iort_agent.agent import Agent, agent_version, make_report, make_status
+from iort_agent.agent import Agent, agent_version, make_status
 from iort_agent.common.logs import Troubles, neutral, set_up
 from iort_agent.common.schema import did_you_mean
-from iort_agent.common.state import document
 from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config, load_config, without_sources
 from iort_agent.errors import AgentError, ConfigError
@@ -94,7 +93,7 @@ def command_line() -> argparse.ArgumentParser:
     running = command("run", run, "run the agent until its sources end or a signal comes")
     running.add_argument("--check-config", action="store_true", help="check the file and exit")
     running.add_argument(
-        "--report", type=Path, metavar="FILE", help="write a report of the run as JSON at the end"
+        "--report", type=Path, metavar="FILE", help="write the last status as JSON at the end"
     )
     running.add_argument(
         "--drain-s",
@@ -161,11 +160,11 @@ def run(options: argparse.Namespace) -> int:
         _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
                      options.config)  # fmt: skip
     status, agent = _run(config, options, troubles)
-    report = make_report(agent)
+    report = make_status(agent)
     if options.report is not None:
-        options.report.write_text(json.dumps(document(report), indent=2) + "\n", encoding="utf-8")
-    samples = sum(counts.samples for counts in report.streams.values())
-    _log.info("ended: %d samples, %d live messages", samples, report.live_published)
+        options.report.write_text(json.dumps(dataclasses.asdict(report), indent=2) + "\n", encoding="utf-8")
+    samples = sum(stream.samples for stream in report.streams.values())
+    _log.info("ended: %d samples, %d live messages", samples, report.lanes.live.published)
     return status
 
 
@@ -184,7 +183,7 @@ def _run(config: Config, options: argparse.Namespace, troubles: Troubles) -> tup
     spool = make_spool(config.queue, clock)
     try:
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
-        server = StatusServer(_socket(options, config), lambda: document(make_status(agent)))
+        server = StatusServer(_socket(options, config), lambda: dataclasses.asdict(make_status(agent)))
         server.start()
         runtime = Runtime(agent)
         _end_on_signals(runtime)

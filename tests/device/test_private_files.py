@@ -14,7 +14,7 @@ import pytest
 from iort_agent.cli import main
 from iort_agent.common.private_files import make_private, open_below, write_below
 from iort_agent.errors import UploadError
-from iort_agent.files.file import from_json, read, to_json
+from iort_agent.files.file import read
 from iort_agent.files.folder import STATE, FilesConfig, Folder
 from iort_agent.lanes.attachment import Attachments
 from iort_agent.spool import PROCESS
@@ -69,7 +69,7 @@ def test_a_link_in_place_of_a_written_file_is_replaced(folder, secret):
     (folder / "a.bag").write_bytes(b"1")
     files = watched(folder)
     name = files.next()
-    files.uploaded(name, files.local(name, threading.Event()), "key")
+    files.uploaded(name, files.local(name, threading.Event()))
     assert not (folder / STATE).is_symlink()
     # The state was kept and is read again.
     assert watched(folder).next() is None
@@ -85,7 +85,7 @@ def test_a_folder_is_looked_through_once_for_many_files(folder):
     (folder / "a.jpg").write_bytes(b"1")
     os.utime(folder / "a.jpg", (1, 1))
     assert files.next() == first
-    files.uploaded(first, files.local(first, threading.Event()), "key")
+    files.uploaded(first, files.local(first, threading.Event()))
     second = files.next()
     assert second not in {None, first, PurePath("a.jpg")}
     (folder / second).write_bytes(b"changed since the look")
@@ -103,7 +103,7 @@ def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
     inodes, sizes = set(), [0]
     for _ in range(count):
         name = files.next()
-        files.uploaded(name, files.local(name, threading.Event()), "files/iort/car1/image/0123456789abcdef")
+        files.uploaded(name, files.local(name, threading.Event()))
         written = (folder / STATE).stat()
         inodes.add(written.st_ino)
         sizes.append(written.st_size)
@@ -119,7 +119,7 @@ def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
     again = watched(folder)
     name = again.next()
     assert str(name) == "more.jpg"
-    again.uploaded(name, again.local(name, threading.Event()), "key")
+    again.uploaded(name, again.local(name, threading.Event()))
     assert watched(folder).next() is None
     # Lines of files that are gone do not stay for ever.
     for _ in range(4):
@@ -130,7 +130,7 @@ def test_the_state_of_a_folder_costs_the_same_for_every_file(folder):
             (folder / f"{number:04d}.jpg").write_bytes(b"1")
         for _ in range(count):
             name = again.next()
-            again.uploaded(name, again.local(name, threading.Event()), "key")
+            again.uploaded(name, again.local(name, threading.Event()))
     assert len((folder / STATE).read_text().splitlines()) <= 1000 + 2 * count
 
 
@@ -140,14 +140,12 @@ def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
     path.parent.mkdir()
     path.write_bytes(b"1")
     local = read(folder, name, stop=stop)
-    saved = to_json(local)
     path.unlink()
     path.symlink_to(secret)
     with pytest.raises(UploadError, match=r"a\.bag"):
         read(folder, name, stop=stop)
     with pytest.raises(OSError, match="symbolic"):
         local.open()
-    assert from_json(folder, name, saved) is None
     # The same for a file whose folder became a link.
     path.unlink()
     path.parent.rmdir()
@@ -181,7 +179,7 @@ def test_nothing_is_removed_through_a_link(folder, secret):
     path.unlink()
     path.parent.rmdir()
     path.parent.symlink_to(secret.parent)
-    files.uploaded(name, local, "key")
+    files.uploaded(name, local)
     assert secret.exists()
 
 
@@ -209,7 +207,7 @@ def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask
     (folder / "uploads" / "a.bag").chmod(0o600)
     files = watched(folder / "uploads")
     name = files.next()
-    files.uploaded(name, files.local(name, threading.Event()), "key")
+    files.uploaded(name, files.local(name, threading.Event()))
     assert (folder / "uploads" / STATE).exists()
     attachments = Attachments("car", folder, LARGE, clock, stored=lambda: None, thumbnail=lambda *_: None)
     attachments.attach_to_fields("lidar", 1, {"scan": b"x"})

@@ -55,15 +55,13 @@ def test_values_arrive_at_the_configured_rate(vesc: VescStandin, log: pytest.Log
     assert started < times[0] < times[-1] < ended
     # Deadlines are 5 ms apart; a busy machine may skip some, and the first may be late.
     assert times[199] - times[0] > 199 * 5_000 / 2
-    assert vesc.asked[0] == b"\x00"
-    assert "VESC with firmware 6.02 on 60_MK6" in log.text
     assert "WARNING" not in log.text
 
 
 def test_a_controller_behind_the_can_bus_is_read(vesc: VescStandin) -> None:
     with Running(config(vesc, can_id=17, stream="rear")) as running:
         running.wait_for(5)
-    assert set(vesc.asked) == {b"\x22\x11\x00", b"\x22\x11\x04"}
+    assert set(vesc.asked) == {b"\x22\x11\x04"}
     assert (running.samples[0][0], running.samples[0][2]["controller_id"]) == ("rear", 17)
 
 

@@ -1,6 +1,6 @@
-"""The types of the agent's status (`iort-agent status`) and of its report (`iort-agent run --report`).
+"""The types of the agent's status: of `iort-agent status`, and at the end of a run of its report.
 
-Both are written as JSON, with the fields' names as keys. The rooms fill in the parts that describe them.
+It is written as JSON, with the fields' names as keys. The rooms fill in the parts that describe them.
 """
 
 import dataclasses
@@ -68,20 +68,15 @@ class Lanes:
 
 
 @dataclass(frozen=True)
-class StreamReport:
-    """The counts of a stream, as in `iort_agent.lanes.streams.StreamCounts`."""
+class StreamState:
+    """A stream's counts, as in `iort_agent.lanes.streams.StreamCounts`, and its rates now. ``fields`` are
+    those that the settings keep; empty if they keep all."""
 
     samples: int
     stored: int
     batches: int
     refused: int
     nulled: int
-
-
-@dataclass(frozen=True)
-class StreamState(StreamReport):
-    """A stream now. ``fields`` are those that the settings keep; empty if they keep all."""
-
     per_s: float
     live_hz: float
     silent_s: float
@@ -143,60 +138,16 @@ class Status:
     connection: Connection
     lanes: Lanes
     sources: List[Counts]
+    failed_sources: List[str]
     streams: Dict[str, StreamState]
     spool: Queue
+    downlink: Optional[Counts]
     files: Optional[Files]
     clock: Optional[ClockOffset]
     pings: Dict[str, RoundTrips]
     over_share: Optional[OverShare]
     alarms: List[str]
     troubles: List[Trouble]
-
-
-@dataclass(frozen=True)
-class LiveReport:
-    """The rates of the live lane at the end."""
-
-    asked_hz: float
-    effective_hz: float
-    slowed: bool
-    streams_hz: Dict[str, float]
-
-
-@dataclass(frozen=True)
-class QueueReport:
-    """The batches that were left at the end, and those that were dropped."""
-
-    left_batches: int
-    left_samples: int
-    dropped_batches: int
-    dropped_samples: int
-
-
-@dataclass(frozen=True)
-class Report:
-    """One run of the agent, at its end."""
-
-    robot: str
-    boot: str
-    streams: Dict[str, StreamReport]
-    live_published: int
-    live_refused: int
-    live: LiveReport
-    spool: QueueReport
-    pings: Dict[str, RoundTrips]
-    failed_sources: List[str]
-    sources: List[Counts]
-    downlink: Optional[Counts]
-    files: Optional[Files]
-
-
-def document(state: Union[Status, Report]) -> Dict[str, Any]:
-    """The JSON document. A report has no key for a part that the agent does not have."""
-    values = dataclasses.asdict(state)
-    if isinstance(state, Report):
-        values = {name: value for name, value in values.items() if value is not None}
-    return values
 
 
 def read(cls: Type[T], values: Mapping[str, Any]) -> T:

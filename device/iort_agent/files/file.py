@@ -8,7 +8,7 @@ import re
 import stat
 import threading
 from pathlib import Path, PurePath
-from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
+from typing import BinaryIO, NamedTuple, Sequence
 
 from iort_agent.common.private_files import folder_of, open_below
 from iort_agent.errors import UploadError
@@ -17,7 +17,6 @@ from iort_contract.messages.files import MAX_FILE_BYTES, PART_BYTES, File
 _CHUNK_BYTES = 256 * 1024
 _AGAIN_S = 10.0
 _LEVELS, _LEVEL_CHARACTERS = 4, 100
-_PART = re.compile(r"[0-9a-f]{64}")
 
 # Kind and content type by suffix.
 _SUFFIXES = {
@@ -147,20 +146,3 @@ def read(root: Path, name: PurePath, *, stop: threading.Event) -> LocalFile:
         t_us=max(0, look.mtime_ns // 1000),
     )
     return LocalFile(root, name, look, file_, parts)
-
-
-def to_json(local: LocalFile) -> dict[str, Any]:
-    """The file without its path, for `from_json`."""
-    return {"look": list(local.look), "file": vars(local.file), "parts": "".join(local.parts)}
-
-
-def from_json(root: Path, name: PurePath, saved: Mapping[str, Any]) -> LocalFile | None:
-    """The file as it was read before; None if it has changed since, or if nothing usable was saved."""
-    try:
-        look = Look(*saved["look"])
-        parts = [saved["parts"][i : i + 64] for i in range(0, len(saved["parts"]), 64)]
-        local = LocalFile(root, name, look, File(**saved["file"]), parts)
-        complete = len(parts) == local.file.parts and all(map(_PART.fullmatch, parts))
-        return local if complete and look_at(root, name) == look else None
-    except (KeyError, TypeError, UploadError):
-        return None

@@ -1,8 +1,8 @@
 """Folders whose finished files are uploaded in the background, one after the other, the oldest first.
 
-A file in the folder keeps which files were uploaded, and the hashes of large ones that were read, so that a
-restart neither uploads nor reads them twice. Each line is a file's newest state, null once it is gone. Lines
-are appended, and written anew when most are out of force: a file costs the same, however many there are.
+A file in the folder keeps which files were uploaded, a line each, so that a restart does not read them again.
+Lines are appended, and written anew when most are out of force: a file costs the same, however many there
+are.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Iterable, Iterator, NamedTuple
+from typing import Any, Iterator, NamedTuple
 
 from iort_agent.common.private_files import folder_of, open_below, write_below
 from iort_agent.common.schema import Place, any_path, number, setting
 from iort_agent.common.state import Files
 from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
-from iort_agent.files.file import LocalFile, Look, from_json, look_at, read, to_json, unreadable
+from iort_agent.files.file import LocalFile, Look, look_at, read, unreadable
 from iort_agent.files.upload import Uploader
 
 _log = logging.getLogger(__name__)
@@ -49,6 +49,13 @@ class _Held(NamedTuple):
     times: int
 
 
+class _Done(NamedTuple):
+    """An uploaded file, and when that was, in seconds since the epoch."""
+
+    look: Look
+    at_s: int
+
+
 class Folder:
     """One folder. Only the upload's thread calls it; any thread may read `waiting`."""
 
@@ -58,9 +65,10 @@ class Folder:
         # By path below the folder: its look, and since when, on the monotonic clock.
         self._seen: dict[Path, tuple[Look, float]] = {}
         self._held: dict[Path, _Held] = {}
-        # In the file of the state, by path below the folder.
-        self._read: dict[str, Any] = {}
-        self._done: dict[str, Any] = {}
+        # The files that wait and were read.
+        self._read: dict[Path, LocalFile] = {}
+        # The uploaded files, and how many lines the file of the state has for them.
+        self._done: dict[Path, _Done] = {}
         self._lines = 0
         self.waiting = 0
         # What the newest look through the folder found ready, the oldest first.
@@ -90,8 +98,8 @@ class Folder:
         return unchanged and not self._is_uploaded(name, look) and not self._is_held(name, look, now)
 
     def _is_uploaded(self, name: Path, look: Look) -> bool:
-        done = self._done.get(str(name))
-        return done is not None and tuple(done["look"]) == look
+        done = self._done.get(name)
+        return done is not None and done.look == look
 
     def _is_held(self, name: Path, look: Look, now: float) -> bool:
         held = self._held.get(name)
@@ -100,14 +108,16 @@ class Folder:
     def _look(self, now: float) -> None:
         ready: list[tuple[int, Path]] = []
         waiting = 0
-        found = dict(self._files())
-        self._forget_missing(found)
-        for name, look in found.items():
+        files = dict(self._files())
+        for known in (self._seen, self._held, self._read, self._done):
+            for name in known.keys() - files.keys():
+                del known[name]
+        for name, look in files.items():
             seen = self._seen.get(name)
             if seen is None or seen[0] != look:
                 seen = self._seen[name] = (look, now)
             if self._is_uploaded(name, look):
-                self._remove_if_due(name, self._done[str(name)])
+                self._remove_if_due(name, self._done[name])
                 continue
             waiting += 1
             if now - seen[1] >= self._settle_s and not self._is_held(name, look, now):
@@ -117,21 +127,17 @@ class Folder:
 
     def local(self, name: Path, stop: threading.Event) -> LocalFile:
         """The file with its hashes, read now or before. Raises `UploadError`."""
-        local = from_json(self.path, name, self._read.get(str(name), {}))
-        if local is None:
-            local = read(self.path, name, stop=stop)
-            # A file of one part is read again sooner than it is noted.
-            if len(local.parts) > 1:
-                self._read[str(name)] = to_json(local)
-                self._note(str(name))
+        local = self._read.get(name)
+        if local is None or look_at(self.path, name) != local.look:
+            local = self._read[name] = read(self.path, name, stop=stop)
         return local
 
-    def uploaded(self, name: Path, local: LocalFile, key: str) -> None:
+    def uploaded(self, name: Path, local: LocalFile) -> None:
         """Note that the bucket has the file."""
-        self._read.pop(str(name), None)
-        done = self._done[str(name)] = _done(local.look, key, self._clock.now_us() // 1_000_000)
+        self._read.pop(name, None)
+        done = self._done[name] = _Done(local.look, self._clock.now_us() // 1_000_000)
         self.waiting = max(0, self.waiting - 1)
-        self._note(str(name))
+        self._note(name, done)
         self._remove_if_due(name, done)
 
     def hold(self, name: Path, again_s: float | None) -> None:
@@ -172,96 +178,69 @@ class Folder:
                 except OSError:
                     continue  # removed since the folder was listed
 
-    def _forget_missing(self, found: dict[Path, Look]) -> None:
-        for names in (self._seen, self._held):
-            for name in names.keys() - found.keys():
-                del names[name]
-        kept = {str(name) for name in found}
-        for missing in (self._read.keys() | self._done.keys()) - kept:
-            self._read.pop(missing, None)
-            self._done.pop(missing, None)
-            self._note(missing)
-
-    def _remove_if_due(self, name: Path, done: dict[str, Any]) -> None:
+    def _remove_if_due(self, name: Path, done: _Done) -> None:
         if self._remove_after_s is None:
             return
-        if self._clock.now_us() / 1e6 - done["at_s"] < self._remove_after_s:
+        if self._clock.now_us() / 1e6 - done.at_s < self._remove_after_s:
             return
         try:
-            if look_at(self.path, name) == tuple(done["look"]):
+            if look_at(self.path, name) == done.look:
                 with folder_of(self.path, name) as folder:
                     os.unlink(name.name, dir_fd=folder)
         except (OSError, UploadError) as error:
             _log.warning("files: %s cannot be removed: %s", self.path / name, error)
 
     def _load(self) -> None:
-        try:
-            for line in self._saved().splitlines():
-                name, read_, done = json.loads(line)
-                self._take(str(name), read_, done)
-                self._lines += 1
-        except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
-            self._read, self._done = {}, {}
-            # The cloud knows which files it has, so the agent only reads them again.
-            _log.warning("files: %s cannot be used and is replaced: %s", self.path / STATE, error)
-            self._write()
-
-    def _saved(self) -> str:
-        """The complete lines of the state."""
+        """Take the saved state. The agent may have been killed in the middle of a line. The cloud knows which
+        files it has, so the file of a damaged line is only read again."""
         try:
             with open_below(self.path, PurePath(STATE)) as file:
-                text = file.read().decode()
+                lines = file.read().splitlines()
         except FileNotFoundError:
-            return ""
-        # The agent may have been killed in the middle of the last line.
-        lines, newline, rest = text.rpartition("\n")
-        if rest:
-            _log.info("files: %s: its last line is not complete", self.path / STATE)
-            with folder_of(self.path, PurePath(STATE)) as folder:
-                file_ = os.open(STATE, _APPEND, dir_fd=folder)
-            os.ftruncate(file_, len((lines + newline).encode()))
-            os.close(file_)
-        return lines
+            return
+        except OSError as error:
+            _log.warning("files: %s cannot be used and is replaced: %s", self.path / STATE, error)
+            lines = [b""]
+        self._done = dict(filter(None, map(_saved, lines)))
+        self._lines = len(self._done)
+        if len(lines) > len(self._done):
+            self._write()
 
-    def _take(self, name: str, read_: Any, done: Any) -> None:
-        """Take a file's state as it was saved."""
-        self._read.pop(name, None)
-        self._done.pop(name, None)
-        if read_ is not None:
-            self._read[name] = dict(read_)
-        if done is not None:
-            self._done[name] = _done(**done)
-
-    def _line(self, name: str) -> bytes:
-        return json.dumps([name, self._read.get(name), self._done.get(name)]).encode() + b"\n"
-
-    def _note(self, name: str) -> None:
-        """Append a file's state."""
+    def _note(self, name: Path, done: _Done) -> None:
+        """Append an uploaded file."""
         self._lines += 1
-        if self._lines > _SPARE_LINES + 2 * len(self._read.keys() | self._done.keys()):
+        if self._lines > _SPARE_LINES + 2 * len(self._done):
             self._write()
             return
         try:
             with folder_of(self.path, PurePath(STATE)) as folder:
                 file = os.open(STATE, _APPEND, 0o600, dir_fd=folder)
             with os.fdopen(file, "ab") as lines:
-                lines.write(self._line(name))
+                lines.write(_line(name, done))
         except OSError as error:
             _log.warning("files: %s: %s", self.path / STATE, error.strerror or error)
 
     def _write(self) -> None:
         """Write the state anew, without the lines that are no longer in force."""
-        names = self._read.keys() | self._done.keys()
-        self._lines = len(names)
+        self._lines = len(self._done)
         try:
-            write_below(self.path, PurePath(STATE), b"".join(map(self._line, names)))
+            content = b"".join(_line(name, done) for name, done in self._done.items())
+            write_below(self.path, PurePath(STATE), content)
         except OSError as error:
             _log.warning("files: %s: %s", self.path / STATE, error.strerror or error)
 
 
-def _done(look: Iterable[int], key: str, at_s: float) -> dict[str, Any]:
-    """The saved state of an uploaded file."""
-    return {"look": [int(number) for number in look], "key": str(key), "at_s": int(at_s)}
+def _line(name: Path, done: _Done) -> bytes:
+    return json.dumps([str(name), *done.look, done.at_s]).encode() + b"\n"
+
+
+def _saved(line: bytes) -> tuple[Path, _Done] | None:
+    """What a line of the state says; None if it is damaged."""
+    try:
+        name, size, mtime_ns, at_s = json.loads(line)
+        return Path(name), _Done(Look(int(size), int(mtime_ns)), int(at_s))
+    except (ValueError, TypeError, ArithmeticError, RecursionError):
+        return None
 
 
 def _folder(value: Any, place: Place) -> Path:
@@ -357,7 +336,7 @@ class Uploads:
         else:
             self._uploaded += 1
             _log.info("files: %s is uploaded as %s", folder.path / name, key)
-            folder.uploaded(name, local, key)
+            folder.uploaded(name, local)
         finally:
             self._current, self._current_bytes = None, 0
 

@@ -29,11 +29,9 @@ from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc_protocol import (
-    COMM_FW_VERSION,
     COMM_GET_VALUES,
     FrameParser,
     ProtocolError,
-    decode_firmware,
     decode_values,
     frame,
     request,
@@ -76,7 +74,6 @@ _log = logging.getLogger(__name__)
 
 # A read returns after this at the latest, so that a stop is noticed.
 _READ_S = 0.05
-_FIRMWARE_TRIES = 3
 # After this long without an answer a warning is logged, and after `_REOPEN_S` the port is opened again.
 _SILENT_S = 1.0
 _REOPEN_S = 3.0
@@ -229,7 +226,7 @@ class _Session:
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         config, clock = self._config, self._clock
-        self._log_firmware(stop)
+        _log.info("%s: open", config.port)
         ask = request(COMM_GET_VALUES, config.can_id)
         self._answered = start = clock.monotonic()
         tick = 0
@@ -239,7 +236,7 @@ class _Session:
                 return
             sent = clock.monotonic()
             self._drop_late()
-            payload = self._ask(ask, COMM_GET_VALUES, stop)
+            payload = self._ask(ask, stop)
             if payload is not None:
                 self._take(payload, sent, emit)
             elif not stop.is_set() and not self._is_worth_waiting():
@@ -276,28 +273,14 @@ class _Session:
             self._source.trouble(f"open, but no answer: is it a VESC{behind}, powered, UART enabled?{heard}")
         return silent_s < max(_REOPEN_S, 3 * self._config.timeout_s)
 
-    def _log_firmware(self, stop: threading.Event) -> None:
-        """Ask for the version, only for the log: a controller without an answer may still give values."""
-        for _ in range(_FIRMWARE_TRIES):
-            payload = self._ask(request(COMM_FW_VERSION, self._config.can_id), COMM_FW_VERSION, stop)
-            if payload is not None:
-                try:
-                    _log.info("%s: VESC with %s", self._config.port, decode_firmware(payload))
-                except ProtocolError as error:
-                    _log.warning("%s: %s", self._config.port, error)
-                return
-            if stop.is_set():
-                return
-        _log.info("%s: open, firmware version unknown", self._config.port)
-
-    def _ask(self, ask: bytes, command: int, stop: threading.Event) -> bytes | None:
+    def _ask(self, ask: bytes, stop: threading.Event) -> bytes | None:
         """Send a request and wait for its answer; None after the timeout."""
         self._port.write(ask)
         deadline = self._clock.monotonic() + self._config.timeout_s
         wanted = self._expected
         while not stop.is_set():
             for payload in self._read(wanted):
-                if payload[0] == command:
+                if payload[0] == COMM_GET_VALUES:
                     return payload
             if self._clock.monotonic() >= deadline:
                 return None

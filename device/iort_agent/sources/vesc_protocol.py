@@ -16,7 +16,6 @@ from typing import Iterator, NamedTuple
 
 from iort_contract.limits import Value
 
-COMM_FW_VERSION = 0
 COMM_GET_VALUES = 4
 COMM_FORWARD_CAN = 34
 
@@ -126,26 +125,6 @@ def request(command: int, can_id: int | None = None) -> bytes:
     if can_id is None:
         return frame(bytes((command,)))
     return frame(bytes((COMM_FORWARD_CAN, can_id, command)))
-
-
-class Firmware(NamedTuple):
-    """The answer to COMM_FW_VERSION; old firmware does not name its hardware."""
-
-    major: int
-    minor: int
-    hardware: str
-
-    def __str__(self) -> str:
-        on = f" on {self.hardware}" if self.hardware else ""
-        return f"firmware {self.major}.{self.minor:02}{on}"
-
-
-def decode_firmware(payload: bytes) -> Firmware:
-    """The version in an answer to COMM_FW_VERSION. Raises `ProtocolError`."""
-    if len(payload) < 3 or payload[0] != COMM_FW_VERSION:
-        raise ProtocolError(f"a firmware version must have at least 3 bytes, got {len(payload)}")
-    name = payload[3:].split(b"\0", 1)[0].decode("ascii", "replace")
-    return Firmware(payload[1], payload[2], name if name.isprintable() else "")
 
 
 class _Number(NamedTuple):

@@ -233,7 +233,7 @@ def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
     batches = list(audit.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(report["streams"]["vesc"]["samples"]))
-    assert report["spool"]["left_samples"] == 0
+    assert report["spool"]["samples"] == 0
 
 
 @as_root
@@ -346,7 +346,7 @@ def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, 
     until(lambda: agent.status().get("connection", {}).get("connected"))
     agent.stop()
     report = agent.report()
-    assert report["spool"]["dropped_samples"] == report["spool"]["left_samples"] == 0
+    assert report["spool"]["dropped_samples"] == report["spool"]["samples"] == 0
     assert counted(embedded, car.robot) == list(range(report["streams"]["vesc"]["samples"]))
 
 

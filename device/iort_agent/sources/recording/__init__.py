@@ -12,15 +12,12 @@ from typing import Any, ContextManager, Iterator, Mapping, Sequence
 from iort_agent.common.schema import choice, existing_path, flag, number, pairs, setting, text
 from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.errors import SourceError
-from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, WARN, Emit, Finding, SourceConfig
-from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, look_into, play
+from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig
+from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.rosbag import Recording, Unread
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
-
-# `iort-agent check` looks into a recording for this long.
-_LOOK_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -65,28 +62,26 @@ class BagConfig(SourceConfig):
         return self.large == UPLOAD
 
     def check(self, title: str) -> Iterator[Finding]:
-        """Whether the recording can be read, and has a message of every stream."""
+        """Whether the recording can be opened, has every topic, and has a first message."""
         if not self.path.exists():
             yield Finding(title, FAIL, f"{self.path} is not there")
             return
         if not os.access(self.path, os.R_OK):
             yield Finding(title, FAIL, f"{self.path} may not be read", f"chmod a+r {self.path}")
             return
-        wanted = set(self.streams())
         source = self.build(SystemClock())
-        looked = look_into(source.open, wanted, _LOOK_S)
-        if looked.error:
-            yield Finding(title, FAIL, looked.error)
+        try:
+            with source.open() as messages:
+                first = next(messages, None)
+        except SourceError as error:
+            yield Finding(title, FAIL, str(error))
             return
         for line in source.unread.lines.values():
             yield Finding(title, FAIL, line)
-        if looked.streams:
-            yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
-        missing = ", ".join(sorted(wanted.difference(looked.streams)))
-        if missing and looked.ended:
-            yield Finding(title, FAIL, f"it has no message of {missing}", "see `topics`")
-        elif missing:
-            yield Finding(title, WARN, f"no message of {missing} was found within {_LOOK_S:g} s")
+        if first is None:
+            yield Finding(title, FAIL, f"it has no message of {', '.join(self.streams())}", "see `topics`")
+        else:
+            yield Finding(title, OK, f"can be played, as {', '.join(self.streams())}")
 
 
 class BagSource:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Optional
 
-from iort_agent.common.threads import Clock, Pace, brief
-from iort_agent.errors import SourceError
+from iort_agent.common.threads import Clock, Pace
 from iort_agent.sources import Emit
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import Value
@@ -66,41 +65,3 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
             return
         # The next round begins one mean interval later, so that no two samples have one time.
         passed_ns = at_ns + ((at_ns - passed_ns) // (played - 1) if played > 1 else _LONE_NS)
-
-
-class Looked(NamedTuple):
-    """``streams`` have a message; ``ended`` is true if the recording ended before all wanted streams had one;
-    ``error`` is empty if nothing is wrong."""
-
-    streams: list[str]
-    ended: bool
-    error: str
-
-
-def look_into(recording: Open, wanted: set[str], within_s: float) -> Looked:
-    """Read until every wanted stream has a message, or the time is over."""
-    streams: set[str] = set()
-    errors: list[str] = []
-    ended, done, stop = threading.Event(), threading.Event(), threading.Event()
-
-    def look() -> None:
-        try:
-            with recording() as messages:
-                for message in messages:
-                    if message.stream != TYPES_STREAM:
-                        streams.add(message.stream)
-                    if wanted <= streams or stop.is_set():
-                        return
-                ended.set()
-        except SourceError as error:
-            errors.append(str(error))
-        except Exception as error:  # noqa: BLE001 - a bag library may raise anything
-            errors.append(f"{type(error).__name__}: {error}")
-        finally:
-            done.set()
-
-    # A large index is read in one call, which only the end of the process can interrupt.
-    brief("check", look)
-    done.wait(within_s)
-    stop.set()
-    return Looked(sorted(streams.copy()), ended.is_set(), errors[0] if errors else "")

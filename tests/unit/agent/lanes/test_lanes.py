@@ -7,14 +7,13 @@ import bisect
 import logging
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
-from iort_agent.agent import Agent, make_report, make_status
-from iort_agent.common.state import document
+from iort_agent.agent import Agent, make_status
 from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.config import Config
 from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
@@ -132,10 +131,7 @@ class Drive:
             self._record_due = float("inf") if wait_s is None else self.clock.monotonic() + wait_s
 
     def status(self) -> dict[str, Any]:
-        return document(make_status(self.agent))
-
-    def report(self) -> dict[str, Any]:
-        return document(make_report(self.agent))
+        return asdict(make_status(self.agent))
 
     def cut(self) -> None:
         self._acks.clear()
@@ -158,7 +154,7 @@ class Drive:
         self.agent.streams.flush()
         self.run(2, sources=False)
         assert self.backlog() == 0
-        taken = {name: one.samples for name, one in make_report(self.agent).streams.items()}
+        taken = {name: one.samples for name, one in make_status(self.agent).streams.items()}
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
@@ -195,7 +191,7 @@ def test_recordings_go_first_and_live_shares_the_rest(
     assert max(live) - min(live) <= 1, "no stream is favoured"
     mean_hz = sum(live) / count / 15
     assert least_live_hz <= mean_hz <= most_live_hz
-    tempo = drive.report()["live"]
+    tempo = drive.status()["lanes"]["live"]
     assert (tempo["asked_hz"], tempo["slowed"]) == (10, True)
     assert tempo["effective_hz"] == pytest.approx(mean_hz, rel=0.15)
     drive.end()
@@ -206,7 +202,7 @@ def test_few_topics_get_their_rate_without_a_warning(caplog: pytest.LogCaptureFi
     drive.run(SETTLE_S)
     drive.run(10)
     assert set(drive.live(10).values()) <= {99, 100, 101}
-    assert drive.report()["live"]["effective_hz"] == 10
+    assert drive.status()["lanes"]["live"]["effective_hz"] == 10
     assert "SLOWED" not in render(make_status(drive.agent))
     assert not caplog.messages
     drive.end()
@@ -284,10 +280,10 @@ def test_another_fault_code_is_sent_soon_under_any_load() -> None:
 def test_recordings_come_before_pings_and_pings_before_live() -> None:
     drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
-    before = drive.report()["pings"][BROKER]["sent"]
+    before = drive.status()["pings"][BROKER]["sent"]
     held_back = drive.status()["lanes"]["ping"]["held_back"]
     drive.run(10, pings_hz=20)
-    assert drive.report()["pings"][BROKER]["sent"] - before == 200
+    assert drive.status()["pings"][BROKER]["sent"] - before == 200
     assert drive.status()["lanes"]["ping"]["held_back"] == held_back
     assert 10 * 15 <= sum(drive.live(10).values()) <= 10 * 20
     assert drive.backlog() <= 3

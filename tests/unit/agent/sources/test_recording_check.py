@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import shutil
 import struct
-import threading
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any, Callable
 
 import pytest
 from rosbags import rosbag2
@@ -18,8 +16,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Finding
-from iort_agent.sources.recording import BagConfig
-from iort_agent.sources.recording.player import Message, look_into
 from tests.unit.agent.sources.test_bag import START, STORAGES, needs_mcap, play, write_ros1, write_ros2
 from tests.unit.agent.sources.test_vesc_csv import row, write
 from tests.unit.agent.test_agent import config_file
@@ -40,7 +36,7 @@ def mcap_of(folder: Path) -> Path:
 )
 def test_a_recording_that_can_be_played(tmp_path: Path, settings: str, streams: str) -> None:
     finding = found(tmp_path, write_ros1(tmp_path / "a.bag"), settings)
-    assert (finding.level, finding.text) == (OK, f"has messages of {streams}")
+    assert (finding.level, finding.text) == (OK, f"can be played, as {streams}")
 
 
 def test_a_log_that_can_be_played(tmp_path: Path) -> None:
@@ -220,43 +216,3 @@ def test_what_cannot_be_read_comes_with_what_to_do(tmp_path: Path, make: Any, ad
     assert "\n" not in str(raised.value)
     finding = found(tmp_path, path, "topics: {/set/_service_event: event}" if topics else "")
     assert (finding.level, finding.text) == (FAIL, str(raised.value))
-
-
-class Endless:
-    """A recording with messages of one stream, of which there is no end; or none that comes at all."""
-
-    def __init__(self, *, stuck: bool) -> None:
-        self.closed, self.gone = threading.Event(), threading.Event()
-        self._stuck = stuck
-
-    @contextmanager
-    def open(self) -> Iterator[Iterator[Message]]:
-        try:
-            yield self._messages()
-        finally:
-            self.closed.set()
-
-    def _messages(self) -> Iterator[Message]:
-        while not (self._stuck and self.gone.wait(10)):
-            yield Message("vesc", 0, 0, {})
-
-
-@pytest.mark.parametrize("stuck", [False, True])
-def test_it_is_looked_into_for_a_bounded_time(stuck: bool) -> None:
-    source: Any = Endless(stuck=stuck)
-    looked = look_into(source.open, {"vesc", "imu"}, 0.05)
-    assert looked == ([] if stuck else ["vesc"], False, "")
-    source.gone.set()
-    assert source.closed.wait(10), "what it began goes on"
-
-
-def test_the_rest_is_not_read(tmp_path: Path) -> None:
-    source: Any = Endless(stuck=False)
-    assert look_into(source.open, {"vesc"}, 60) == (["vesc"], False, "")
-    assert source.closed.is_set()
-
-
-def test_an_error_of_the_library_is_one_of_the_recording(tmp_path: Path) -> None:
-    source = BagConfig(path=tmp_path / "gone.bag").build(None)  # type: ignore[arg-type]  # nothing is played
-    looked = look_into(source.open, {"vesc"}, 60)
-    assert "gone.bag" in looked.error

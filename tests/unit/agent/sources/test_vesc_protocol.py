@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_agent.sources import vesc_protocol
-from iort_agent.sources.vesc_protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
+from iort_agent.sources.vesc_protocol import FrameParser, ProtocolError, decode_values, frame
 from iort_contract.catalog.vesc import VESC_FIELDS
-from tests.vesc_standin import FIRMWARE, framed, values
+from tests.vesc_standin import framed, values
 
 payloads = st.one_of(
     st.binary(min_size=1, max_size=80),
@@ -124,7 +124,6 @@ def test_a_frame_is_what_the_description_says(payload: bytes) -> None:
 def test_known_frames() -> None:
     """As every description of the protocol has them."""
     assert vesc_protocol.request(vesc_protocol.COMM_GET_VALUES) == bytes.fromhex("02 01 04 40 84 03")
-    assert vesc_protocol.request(vesc_protocol.COMM_FW_VERSION) == bytes.fromhex("02 01 00 00 00 03")
     forwarded = vesc_protocol.request(vesc_protocol.COMM_GET_VALUES, 17)
     assert FrameParser().feed(forwarded) == [bytes((34, 17, 4))]
 
@@ -200,22 +199,3 @@ def test_an_unknown_length_is_refused(payload: bytes) -> None:
 def test_another_commands_answer_is_refused() -> None:
     with pytest.raises(ProtocolError):
         decode_values(b"\x05" + values()[1:])
-
-
-@pytest.mark.parametrize(
-    ("payload", "text"),
-    [
-        (FIRMWARE, "firmware 6.02 on 60_MK6"),
-        (b"\x00\x02\x12", "firmware 2.18"),
-        (b"\x00\x05\x03\x01\x02\x00", "firmware 5.03"),
-        (b"\x00\x05\x03410", "firmware 5.03 on 410"),
-    ],
-)
-def test_firmware_versions(payload: bytes, text: str) -> None:
-    assert str(decode_firmware(payload)) == text
-
-
-@pytest.mark.parametrize("payload", [b"\x00", b"\x00\x05", b"\x04\x05\x03"])
-def test_what_is_no_firmware_version(payload: bytes) -> None:
-    with pytest.raises(ProtocolError):
-        decode_firmware(payload)
