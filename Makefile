@@ -70,12 +70,12 @@ prove-mixed: setup ## drive a robot of every shape of message beside rosbag reco
 	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
 
 # The options of the bench's sections: `python -m bench.run --help` tells whose.
-BENCH_OPTIONS := CARS DURATION HOURS KILLS LIMIT MINUTES NEW OLD PART PICTURES PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
+BENCH_OPTIONS := CARS DURATION KILLS NEW OLD PART PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
 
-bench: setup ## measure every table of the thesis, or others: ONLY=query,outage or agent, drive, fleet ..., TARGET=aws OUT=docs/bench REPORT=figures.json
+bench: setup ## measure every table of the thesis, or others: ONLY=query,outage or agent, drive, fleet ..., TARGET=aws OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) \
 		$(foreach name,$(BENCH_OPTIONS),$(if $($(name)),--set "$(name)=$($(name))")) $(if $(TARGET),--target $(TARGET)) \
-		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE)) $(if $(REPORT),--report "$(REPORT)")
+		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
 
 screenshots: setup ## take the pictures of docs/images anew
 	@$(BIN)/python -m bench.screenshots

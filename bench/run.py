@@ -1,10 +1,10 @@
 """`make bench`: every table of the thesis, and each other instrument of the project, by one command.
 
     python -m bench.run [--only query,outage] [--set NAME=VALUE ...] [--target embedded|aws] [--yes]
-                        [--out build/bench] [--report FILE]
+                        [--out build/bench]
 
-Without --only it measures the tables of the thesis. Writes Markdown, JSON and the pictures of each report
-into the folder. Exit status 1 if a target is missed, 2 if a section could not be measured.
+Without --only it measures the tables of the thesis. Writes Markdown and JSON of each report into the
+folder. Exit status 1 if a target is missed, 2 if a section could not be measured.
 
 With --target aws it shows the cost and asks first. After Ctrl-C or a closed terminal it still restores every
 setting and removes every resource of the bench.
@@ -13,7 +13,6 @@ setting and removes every resource of the bench.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 import traceback
@@ -26,7 +25,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench import report, sections, spending
+from bench import report, sections
 from bench.report import Section
 from bench.sections import ALL, SECTIONS, Declared
 from iort_contract.limits import DEFAULT_NAMESPACE
@@ -74,8 +73,6 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     console, began, here = Console(), time.monotonic(), machine.describe()
     declared = {key: sections.load(key) for key in options.only}
     values = sections.values(declared, options.values)
-    for each in declared.values():
-        each.prepare()
     result = Result({}, [])
 
     def say(text: str) -> None:
@@ -88,9 +85,8 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
                 target = stack.enter_context(
                     open_target(options.target, namespace=options.namespace, cloud=cloud, say=say)
                 )
-                dollars = spending.estimate(target.cloud, options.only) if target.kind == AWS else {}
-                if dollars and not options.yes:
-                    confirm(console, _announced(dollars), StationError)
+                if target.kind == AWS and not options.yes:
+                    confirm(console, _announced(declared), StationError)
             for number, (key, each) in enumerate(declared.items(), 1):
                 say(f"[{number} of {len(declared)}] {key}")
                 _measure(key, each, target, values[key], console, result)
@@ -100,10 +96,6 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     finally:
         for kind, measured in result.reports.items():
             report.write(options.out, measured, here, options.target, kind)
-        if options.report:
-            figures = {"machine": here, "sections": [section.as_json() for section in result.sections]}
-            options.report.parent.mkdir(parents=True, exist_ok=True)
-            options.report.write_text(json.dumps(figures, indent=1, default=str) + "\n")
     report.headline(result.sections).show(console)
     written = ", ".join(f"{options.out / kind.name}.md" for kind in result.reports)
     console.print(f"{written}  after {time.monotonic() - began:.0f} s", highlight=False, soft_wrap=True)
@@ -112,12 +104,13 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     sys.exit(result.status)
 
 
-def _announced(dollars: dict[str, float]) -> str:
+def _announced(declared: dict[str, Declared]) -> str:
+    dollars = {key: each.dollars for key, each in declared.items() if each.dollars}
     parts = ", ".join(f"{key} {usd:.3f}" for key, usd in dollars.items())
     return (
         f"This costs about ${sum(dollars.values()):.2f} in your account ({parts}) at the list prices of "
-        f"{AS_OF} in {REGION}, and PubNub's transactions. Robots, certificates, functions and a table named "
-        "bench-... are made and removed again; utilisation changes Lambda 1's memory and puts it back."
+        f"{AS_OF} in {REGION}, more where the telemetry table is large, and PubNub's transactions. Robots, "
+        "certificates, functions and a table named bench-... are made and removed again."
     )
 
 
@@ -137,12 +130,9 @@ def _measure(  # noqa: PLR0917 - one caller
 
     try:
         measured = each.measure(target, say, **values)
-    except InstrumentError as error:
-        console.print(f"{key}: {error}", style="red", markup=False, highlight=False)
-        result.failed.append(key)
-        return
-    except Exception:  # noqa: BLE001 - any error of a section must not stop the others
-        console.print(traceback.format_exc(), style="red", markup=False, highlight=False)
+    except Exception as error:  # noqa: BLE001 - any error of a section must not stop the others
+        why = f"{key}: {error}" if isinstance(error, InstrumentError) else traceback.format_exc()
+        console.print(why, style="red", markup=False, highlight=False)
         result.failed.append(key)
         return
     several = [measured] if isinstance(measured, Section) else list(measured)
@@ -167,7 +157,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--namespace", default=DEFAULT_NAMESPACE, help="the deployment's, with --target aws")
     parser.add_argument("--yes", action="store_true", help="with --target aws: spend without asking")
     parser.add_argument("--out", type=Path, default=OUT, metavar="FOLDER")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write the figures as JSON there too")
     options = parser.parse_args()
     try:
         sections.values({key: sections.load(key) for key in options.only}, options.values)

@@ -253,7 +253,7 @@ class EmbeddedCloud:
             # Its threads hold the interpreter's lock, and each arena of its own would keep what it once had.
             "MALLOC_ARENA_MAX": "1",
             # glibc raises these by itself; buffers of connections and batches then lie in the heap between
-            # small objects, and it grows by 0.4 MB in each hour of `make bench ONLY=kept,soak`.
+            # small objects, and it grows by 0.4 MB in each hour of five cars.
             "MALLOC_MMAP_THRESHOLD_": "65536",
             "MALLOC_TRIM_THRESHOLD_": "131072",
             "PYTHONPATH": str(package.folder()),

@@ -124,27 +124,9 @@ def _stat(pid: int) -> list[str]:
         return []
 
 
-_INSIDE = "BENCH_OWN_MOUNTS"
-_UNSHARE = ("unshare", "--user", "--map-root-user", "--mount")
 # It takes memory for what is in it only.
 _BYTES = 4 * 2**30
 _TRIES = 100
-
-
-def possible() -> bool:
-    """Whether this process may mount: see `enter`."""
-    return _INSIDE in os.environ
-
-
-def enter(module: str) -> None:
-    """Run this command again, as the module that it is, where it may mount; returns if that is done, or where
-    the machine does not allow it."""
-    if possible() or shutil.which(_UNSHARE[0]) is None:
-        return
-    if subprocess.run([*_UNSHARE, "true"], capture_output=True, check=False).returncode == 0:
-        os.environ[_INSIDE] = "1"
-        command = [*_UNSHARE, sys.executable, "-m", module, *sys.argv[1:]]
-        os.execvp(command[0], command)  # noqa: S606 - it needs no shell
 
 
 class Disk:

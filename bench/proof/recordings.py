@@ -99,36 +99,29 @@ def _phase(drive: Drive) -> tuple[Array, Array, Array]:
     return speed, np.hypot(direct, quadrature), amps
 
 
-def section(folder: Path = FOLDER) -> Section | None:
-    """The report's section; None without the recordings."""
+def sections(folder: Path = FOLDER) -> list[Section]:
+    """The report's section; none without the recordings."""
     if not all((folder / name).is_file() for name in (RIDE, F1TENTH_BAG)):
-        return None
-    made = Section("recordings", "Recordings of real cars")
-    own = [one.name for group in GROUPS.values() for one in group]
+        return []
+    section = Section("recordings", "Recordings of real cars")
+    own = [parameter.name for group in GROUPS.values() for parameter in group]
+    head = ["parameter", "value", "from", "to", "unit", "what speaks for it"]
     for title, streams in (("skateboard", ride(folder)), ("F1TENTH car", f1tenth(folder))):
         key = DriveKey(title.split()[0].lower(), _FIRST_US, "recorded")
         mined = analyse(key, streams).mined
         speaks = _speaks(build(key, streams)) if title == "skateboard" else {}
-        made.table(
+        estimates = {name: mined.estimates[name] for name in own if name in mined.estimates}
+        section.table(
             f"{title}: estimates with 90 % intervals",
-            ["parameter", "value", "from", "to", "unit", "what speaks for it"],
+            head,
             [
-                [
-                    name,
-                    *(f"{value:.4g}" for value in mined.estimates[name][:3]),
-                    mined.estimates[name].unit,
-                    speaks.get(name, ""),
-                ]
-                for name in own
-                if name in mined.estimates
+                [name, *(f"{value:.4g}" for value in estimate[:3]), estimate.unit, speaks.get(name, "")]
+                for name, estimate in estimates.items()
             ],
         )
-        made.table(
-            f"{title}: what it does not tell",
-            ["parameter", "why"],
-            [[name, mined.missing[name]] for name in own if name in mined.missing],
-        )
-    return made
+        missing = [[name, mined.missing[name]] for name in own if name in mined.missing]
+        section.table(f"{title}: what it does not tell", ["parameter", "why"], missing)
+    return [section]
 
 
 def _speaks(drive: Drive) -> dict[str, str]:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import plots
 from bench.proof.fleet import RATE_HZ, Plan, drive_of, stored
 from bench.proof.judging import INDICATORS, RIGHT, SPANNING, Case, Coverage, Detected, Judged
 from bench.report import Section
@@ -112,27 +111,29 @@ _FALSE_ALARMS_HOURS, _COVERED, _LEAST_SPANNED = 24.0, (85.0, 95.0), 90.0
 _OFTEN = 0.2
 
 
-def detected(plan: Plan, found: Mapping[Case, Detected]) -> Section:
+def detected(plan: Plan, counts: Mapping[Case, Detected]) -> Section:
     """The faults found, by kind and strength."""
-    section = Section("detection", "Faults found in the simulated fleet")
-    rows = []
+    section, rows = Section("detection", "Faults found in the simulated fleet"), []
     for kind, what in KINDS.items():
-        strong = found[kind, "strong"]
+        strong = counts[kind, "strong"]
         others = [f"{name} {n}" for name, n in strong.others.most_common() if n >= _OFTEN * strong.drives]
-        cells = [_shown(found[kind, strength], _TARGETS.get(strength)) for strength in STRENGTHS]
-        right, strengths = ", ".join(sorted(RIGHT[kind])), _strengths(kind)
+        cells = []
+        for strength in STRENGTHS:
+            case = counts[kind, strength]
+            percent, target = 100 * case.found / case.drives, _TARGETS.get(strength)
+            cells.append(_marked(f"{percent:.0f} %", good=target is None or percent >= target))
+        right = ", ".join(sorted(RIGHT[kind]))
+        of_kind = dict.fromkeys(what.by_field.values() or [what.strengths])
+        strengths = "; ".join(", ".join(f"{one:g}" for one in three) for three in of_kind)
         rows.append([kind, right, strengths, what.unit, *cells, ", ".join(others)])
     head = ["fault", "right finding", "weak, middle, strong", "unit", *STRENGTHS]
     title = (
         f"{plan.cars} cars, each with {plan.baseline} healthy drives of {plan.seconds / 60:g} minutes before"
     )
     section.table(title, [*head, "other findings of the strong"], rows)
-    bars = {strength: {kind: _percent(found[kind, strength]) for kind in KINDS} for strength in STRENGTHS}
-    title = "Drives with a fault in which it was found"
-    section.plot("detection", title, plots.grouped(bars, unit="%"))
     for strength in STRENGTHS:
-        of = [found[kind, strength] for kind in KINDS]
-        share = 100 * sum(one.found for one in of) / sum(one.drives for one in of)
+        cases = [counts[kind, strength] for kind in KINDS]
+        share = 100 * sum(case.found for case in cases) / sum(case.drives for case in cases)
         settings: dict[str, Any] = {"unit": "%", "at_least": True, "tolerance": 1.05}
         section.ratio(f"faults found, {strength}", round(share, 1), _TARGETS.get(strength), **settings)
     section.notes.append(
@@ -140,8 +141,8 @@ def detected(plan: Plan, found: Mapping[Case, Detected]) -> Section:
         "another field from car to car."
     )
     section.raw = {
-        f"{kind} {strength}": {"drives": one.drives, "found": one.found, "others": dict(one.others)}
-        for (kind, strength), one in found.items()
+        f"{kind} {strength}": {"drives": case.drives, "found": case.found, "others": dict(case.others)}
+        for (kind, strength), case in counts.items()
     }
     return section
 
@@ -161,48 +162,44 @@ def alarms(plan: Plan, judged: Sequence[Judged]) -> Section:
     return section
 
 
-def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) -> Section:
+def covered(drives: int, coverages: Mapping[str, Coverage], without: Sequence[str]) -> Section:
     """How often the intervals hold the truth."""
     section = Section("coverage", "Intervals that hold the truth")
-    found = dict(sorted(found.items()))
-    parameters, spanning, indicators = (
-        {name: one for name, one in found.items() if belongs(name)}
-        for belongs in (
-            lambda name: name not in INDICATORS | SPANNING,
-            SPANNING.__contains__,
-            INDICATORS.__contains__,
-        )
-    )
+    groups: dict[str, dict[str, Coverage]] = {"parameters": {}, "spanning": {}, "indicators": {}}
+    for name, coverage in sorted(coverages.items()):
+        group = "indicators" if name in INDICATORS else "spanning" if name in SPANNING else "parameters"
+        groups[group][name] = coverage
+    parameters, spanning, indicators = groups.values()
     tables: dict[str, tuple[Mapping[str, Coverage], Callable[[float], bool]]] = {
         f"90 % intervals of {drives} healthy cars with a drive each": (parameters, _covers),
         "Intervals that span the makes and ages of battery cells, which no owner tells": (
             spanning,
-            lambda share: share >= _LEAST_SPANNED,
+            lambda percent: percent >= _LEAST_SPANNED,
         ),
         "Indicators: only compared with the car's own earlier drives": (indicators, lambda _: True),
     }
-    for title, (group, good) in tables.items():
+    for title, (shown, good) in tables.items():
         rows = [
             [
                 name,
-                str(one.drives),
-                _marked(f"{100 * one.share:.1f} %", good=good(100 * one.share)),
-                f"{median(one.widths):.2g} {one.unit}",
-                f"{median(one.off):+.2g} {one.unit}",
+                str(coverage.drives),
+                _marked(f"{100 * coverage.share:.1f} %", good=good(100 * coverage.share)),
+                f"{median(coverage.widths):.2g} {coverage.unit}",
+                f"{median(coverage.off):+.2g} {coverage.unit}",
             ]
-            for name, one in group.items()
+            for name, coverage in shown.items()
         ]
         section.table(title, ["parameter", "drives", "held", "width, median", "off, median"], rows)
     section.ratio(
         f"parameters of {len(parameters)} whose intervals hold the truth less or more often than 85 to 95 %",
-        sum(not _covers(100 * one.share) for one in parameters.values()),
+        sum(not _covers(100 * coverage.share) for coverage in parameters.values()),
         0.0,
         unit="parameters",
         tolerance=1.0,
     )
     section.ratio(
         "intervals of a battery's charge and range that hold the truth",
-        round(100 * min(one.share for one in spanning.values()), 1),
+        round(100 * min(coverage.share for coverage in spanning.values()), 1),
         _LEAST_SPANNED,
         unit="%",
         at_least=True,
@@ -214,7 +211,7 @@ def covered(drives: int, found: Mapping[str, Coverage], without: Sequence[str]) 
     )
     if without:
         section.notes.append(f"The simulator has no single truth for {', '.join(without)}.")
-    section.raw = {name: {"drives": one.drives, "held": one.held} for name, one in found.items()}
+    section.raw = {name: {"drives": one.drives, "held": one.held} for name, one in coverages.items()}
     return section
 
 
@@ -231,50 +228,23 @@ def speed(hour: Hour, robot_hours: float, ours: Bill, floor: Bill) -> Section:
             ["minutes", f"{ours.seconds / 60:.1f}", f"{floor.seconds / 60:.1f}"],
         ],
     )
-    section.ratio(
-        f"an hour's {hour.samples:,} samples, decoded and analysed: processor / its floor",
-        round(hour.cpu_s / hour.floor_s, 2),
-        3.0,
-    )
-    section.ratio(
-        f"{robot_hours:,.0f} robot-hours on AWS: dollars / the floor's", round(dollars / least, 2), 3.0
-    )
+    name = f"an hour's {hour.samples:,} samples, decoded and analysed: processor / its floor"
+    section.ratio(name, hour.cpu_s / hour.floor_s, 3.0)
+    name = f"{robot_hours:,.0f} robot-hours on AWS: dollars / the floor's"
+    section.ratio(name, dollars / least, 3.0)
     section.notes.append(
         f"Of the hour's processor time {hour.decode_s:.2f} s decode the stored batches, "
         f"{hour.analyse_s:.2f} s clean and mine. The floor decodes the same values in {hour.floor_s:.2f} s: "
         "base64, zlib, JSON and numpy's sums, a batch at a time, without any check. "
         "Dollars and minutes are those of a processor like this one."
     )
-    section.raw = {
-        **hour._asdict(),
-        "cpu_s": hour.cpu_s,
-        "dollars": ours.dollars,
-        "floor_dollars": floor.dollars,
-        "seconds": ours.seconds,
-    }
+    section.raw = {**hour._asdict(), "dollars": ours.dollars, "floor_dollars": floor.dollars}
     return section
 
 
 def _covers(percent: float) -> bool:
     low, high = _COVERED
     return low <= percent <= high
-
-
-def _strengths(kind: str) -> str:
-    of = KINDS[kind]
-    told = [
-        ", ".join(f"{one:g}" for one in three)
-        for three in dict.fromkeys(of.by_field.values() or [of.strengths])
-    ]
-    return "; ".join(told)
-
-
-def _percent(one: Detected) -> float:
-    return 100 * one.found / one.drives
-
-
-def _shown(one: Detected, target: float | None) -> str:
-    return _marked(f"{_percent(one):.0f} %", good=target is None or _percent(one) >= target)
 
 
 def _marked(text: str, *, good: bool) -> str:

@@ -15,35 +15,16 @@ from bench.report import BENCH, Report, Section
 
 # What `make bench` measures, in the order of the report.
 SECTIONS = (
-    *(
-        "round_trips",
-        "dashboard",
-        "viewing",
-        "utilisation",
-        "query",
-        "command",
-        "abilities",
-        "cost",
-        "outage",
-    ),
-    *("scale", "mixed", "fairness"),
+    *("round_trips", "dashboard", "viewing", "utilisation", "query", "command", "cost", "outage"),
+    *("fleet", "mixed", "fairness"),
 )
 # Each is measured by its name alone.
-ALL = (
-    *SECTIONS,
-    *("agent", "fleet", "drive", "stop", "page", "look", "cold", "worst"),
-    *("analysis", "analysis-cloud", "kept", "soak", "guard"),
-)
-
-
-def yes(text: str) -> bool:
-    """A make variable that is set."""
-    return text.lower() not in {"", "0", "no", "false"}
+ALL = (*SECTIONS, "agent", "drive", "stop", "page", "cold", "analysis", "kept", "guard")
 
 
 def numbers(text: str) -> list[int]:
     """Whole numbers with spaces between."""
-    return [int(one) for one in text.split()]
+    return [int(number) for number in text.split()]
 
 
 @dataclass(frozen=True)
@@ -59,23 +40,22 @@ class Option:
 @dataclass(frozen=True)
 class Declared:
     """``measure`` gets the target, a function that says the step, and the options by their names in lower
-    case; its target is None unless a section of the run wants a ``cloud``. ``prepare`` runs before all."""
+    case; its target is None unless a section of the run wants a ``cloud``.
+    ``dollars`` is what the section costs on AWS at list prices, generously; None if it does not run there.
+    """
 
     what: str
     measure: Callable[..., Section | Sequence[Section]]
     options: Sequence[Option] = ()
     report: Report = BENCH
     cloud: bool = True
-    prepare: Callable[[], None] = lambda: None
+    dollars: float | None = None
 
 
 def load(key: str) -> Declared:
     """The declaration of a section."""
-    module = key if key != "scale" else "fleet"
-    found: Declared = getattr(
-        import_module(f"bench.sections.{module.replace('-', '_')}"), "SCALE" if key == "scale" else "SECTION"
-    )
-    return found
+    declared: Declared = import_module(f"bench.sections.{key}").SECTION
+    return declared
 
 
 def values(declared: Mapping[str, Declared], given: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -85,15 +65,15 @@ def values(declared: Mapping[str, Declared], given: Sequence[str]) -> dict[str, 
     if unknown := sorted(texts.keys() - known):
         has = ", ".join(sorted(known)) or "no options"
         raise ValueError(f"{', '.join(unknown)}: {', '.join(declared)} has {has}")
-    found: dict[str, dict[str, Any]] = {key: {} for key in declared}
+    result: dict[str, dict[str, Any]] = {key: {} for key in declared}
     for key, each in declared.items():
         for option in each.options:
             try:
                 value = option.read(texts[option.name]) if option.name in texts else option.default
             except (ValueError, argparse.ArgumentTypeError) as error:
                 raise ValueError(f"{option.name}={texts[option.name]}: {error}") from error
-            found[key][option.name.lower()] = value
-    return found
+            result[key][option.name.lower()] = value
+    return result
 
 
 def manual() -> str:
@@ -102,5 +82,5 @@ def manual() -> str:
     for key in ALL:
         each = load(key)
         lines.append(f"  {key:15}{each.what}")
-        lines += [f"  {'':17}{one.name}={one.default}: {one.what}" for one in each.options]
+        lines += [f"  {'':17}{option.name}={option.default}: {option.what}" for option in each.options]
     return "\n".join(lines)

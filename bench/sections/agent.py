@@ -10,16 +10,12 @@
 
 from __future__ import annotations
 
-import json
-import os
 import struct
-import subprocess
 import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from bench import thesis
 from bench.floors import mosquitto
 from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
 from bench.report import Report, Section
@@ -34,7 +30,7 @@ from iort_station.fleet import robots
 from iort_station.operations import audit
 from local.figures import Spread
 from testkit import machine
-from testkit.ros import PYTHONPATH, RosError, RosGraph, python_with_rospy
+from testkit.ros import RosGraph, python_with_rospy
 from testkit.target import Say, Target
 from testkit.waiting import reached
 
@@ -45,17 +41,8 @@ _AGENT = (build_topic(LIVE, ROBOT, VESC_STREAM), live_topic(ROBOT, VESC_STREAM))
 _WARM_UP_S = 3
 
 
-@dataclass(frozen=True)
-class Lane:
-    """The delays at one rate, of the agent and of the floor."""
-
-    rate_hz: int
-    agent_ms: Spread
-    floor_ms: Spread
-
-
-def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
-    """Run both side by side. Raises `RosError` if one of the processes stops."""
+def delays(program: str, python: str, rate_hz: int, seconds: int) -> tuple[Spread, Spread]:
+    """The delays through mosquitto, of the agent and of the floor beside it."""
     agent_ms: list[float] = []
     floor_ms: list[float] = []
 
@@ -83,7 +70,7 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
         publisher.publish_for(_WARM_UP_S)
         warm = len(agent_ms), len(floor_ms)
         publisher.finish()
-    return Lane(rate_hz, Spread.of(agent_ms[warm[0] :]), Spread.of(floor_ms[warm[1] :]))
+    return Spread.of(agent_ms[warm[0] :]), Spread.of(floor_ms[warm[1] :])
 
 
 def _stamp_us(message: bytes) -> int:
@@ -92,10 +79,9 @@ def _stamp_us(message: bytes) -> int:
 
 
 RATES_HZ = (50, 1000)
-# The most: processor time and live delay as a multiple of the floor's in the same run, memory, and the node's
-# cycle as a share of the thesis'.
+# The most: processor time and live delay as a multiple of the floor's in the same run, and memory.
 CPU_TIMES = {50: 3.5, 1000: 2.0}
-LIVE_TIMES, RSS_MB, CYCLE_SHARE = 2.0, 80.0, 0.05
+LIVE_TIMES, RSS_MB = 2.0, 80.0
 _CATCH_UP_S = 30.0
 
 
@@ -114,18 +100,17 @@ class Run:
 
 def run(target: Target, say: Say, *, duration: int, soak: int) -> Section:
     """Measure each rate on the embedded cloud, then the live lane through mosquitto."""
-    section, python, lanes = Section("agent", "The agent on a real ROS 1 graph"), python_with_rospy(), []
-    cycle, runs = _cycle(python), []
+    python, live, runs = python_with_rospy(), dict[int, tuple[Spread, Spread]](), []
     for rate_hz in (1000,) if soak else RATES_HZ:
         say(f"{rate_hz} Hz for {soak or duration} s")
         runs.append(_measure(target.cloud, python, rate_hz, soak or duration))
     program = mosquitto.found()
-    if program is None:
-        section.notes.append("mosquitto is not installed (apt install mosquitto): the live lane is left out.")
     for rate_hz in RATES_HZ if program is not None and not soak else ():
         say(f"mosquitto, {rate_hz} Hz for {duration} s")
-        lanes.append(measure(str(program), python, rate_hz, duration))
-    report(section, runs, cycle, lanes)
+        live[rate_hz] = delays(str(program), python, rate_hz, duration)
+    section = report(runs, live)
+    if program is None:
+        section.notes.append("mosquitto is not installed (apt install mosquitto): the live lane is left out.")
     return section
 
 
@@ -145,10 +130,10 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         publisher.ready()
         publisher.go()
         publisher.publish_for(_WARM_UP_S)
-        before, began = (machine.usage_of(agent.pid), machine.usage_of(floor.pid)), time.monotonic()
+        before, began = [machine.usage_of(process.pid) for process in (agent, floor)], time.monotonic()
         publisher.publish_for(seconds - 1)
         measured = (time.monotonic() - began) * rate_hz
-        after = machine.usage_of(agent.pid), machine.usage_of(floor.pid)
+        after = [machine.usage_of(process.pid) for process in (agent, floor)]
         publisher.finish()
 
         def stored() -> int:
@@ -159,51 +144,35 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         agent.terminate()
         agent.wait()
     agent_us, floor_us = (
-        round((then.cpu_s - first.cpu_s) / measured * 1e6, 1)
-        for first, then in zip(before, after, strict=True)
+        (then.cpu_s - first.cpu_s) / measured * 1e6 for first, then in zip(before, after, strict=True)
     )
-    rss_mb = round(before[0].rss_mb, 1), round(after[0].rss_mb, 1)
-    return Run(rate_hz, count, lost, agent_us, floor_us, *rss_mb)
+    return Run(rate_hz, count, lost, agent_us, floor_us, before[0].rss_mb, after[0].rss_mb)
 
 
-def _cycle(python: str) -> dict[str, float]:
-    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
-    command = [python, "-m", "bench.ros.cycle", "20000"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RosError(f"{' '.join(command)} failed:\n{done.stderr[-1000:]}")
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
-
-
-def report(section: Section, runs: list[Run], cycle: dict[str, float], lanes: list[Lane]) -> None:
-    """Add the table and the figures with their targets."""
-    rows = []
+def report(runs: list[Run], live: dict[int, tuple[Spread, Spread]]) -> Section:
+    """Make the section of the runs, and of the live lane's delays beside the floor's, by rate."""
+    section, rows = Section("agent", "The agent on a real ROS 1 graph"), []
     for run in runs:
         rate, ours, floor = f"at {run.rate_hz} Hz", run.agent_cpu_us, run.floor_cpu_us
         rss = f"{run.rss_mb_first:.1f} to {run.rss_mb_last:.1f} MB"
         rows.append([f"processor a sample {rate}", f"{ours:.0f} us", f"{floor:.0f} us"])
         rows.append([f"memory {rate}, first to last", rss, ""])
-        times = round(ours / floor, 2)
-        section.ratio(f"agent's processor a sample {rate} / floor", times, CPU_TIMES[run.rate_hz])
+        name = f"agent's processor a sample {rate} / floor"
+        section.ratio(name, ours / floor, CPU_TIMES[run.rate_hz])
         section.ratio(f"agent's memory {rate}", run.rss_mb_last, RSS_MB, unit="MB")
         section.ratio(f"samples lost {rate}", run.lost, 0, unit=f"of {run.samples:,}")
-    for lane in lanes:
-        name = f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto"
+    for rate_hz, (agent_ms, floor_ms) in live.items():
+        name = f"ROS publish to MQTT subscriber at {rate_hz} Hz, mosquitto"
         # To a hundredth of a ms: the two differ by no more.
-        rows.append([name, lane.agent_ms.text(2), lane.floor_ms.text(2)])
-        if lane.agent_ms.p50 and lane.floor_ms.p50:
-            section.ratio(f"{name} / floor", round(lane.agent_ms.p50 / lane.floor_ms.p50, 2), LIVE_TIMES)
-    p50 = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
-    rows.append(["node's cycle, callback to spool", p50, f"thesis: {thesis.NODE_CYCLE_MS} ms"])
-    share = round(cycle["p50"] / thesis.NODE_CYCLE_MS, 4)
-    section.ratio("node's cycle / thesis'", share, CYCLE_SHARE, by_machine=True)
+        rows.append([name, agent_ms.text(2), floor_ms.text(2)])
+        if agent_ms.p50 and floor_ms.p50:
+            section.ratio(f"{name} / floor", agent_ms.p50 / floor_ms.p50, LIVE_TIMES)
     section.table("The agent", ["figure", "measured", "floor, same run"], rows)
     section.raw = {
-        "cycle_ms": cycle,
         "runs": [asdict(run) for run in runs],
-        "mosquitto": [asdict(lane) for lane in lanes],
+        "live_ms": {rate_hz: [asdict(spread) for spread in spreads] for rate_hz, spreads in live.items()},
     }
+    return section
 
 
 SECTION = Declared(

@@ -18,7 +18,7 @@ from bench.proof import recordings, report
 from bench.proof.fleet import FULL, QUICK, DriveSpec, Plan
 from bench.proof.judging import TRUTHS, Analysed, Car, analysed, coverage, detection, judge, on_all_cores
 from bench.report import ANALYSIS, Section
-from bench.sections import Declared, Option, yes
+from bench.sections import Declared, Option
 from testkit import ROOT
 from testkit.command import progress
 from testkit.target import Say, Target
@@ -28,38 +28,27 @@ OUT = ROOT / "build" / "bench-analysis" / "report"
 _ROBOT_HOURS = 1000
 
 
-def run(_target: Target | None, say: Say, *, quick: bool, part: str) -> list[Section]:
+def run(_target: Target | None, say: Say, *, quick: int, part: str) -> list[Section]:
     """Measure all, or one part again for the report that is there."""
     say("an ended run goes on where it was")
-    console = Console()
-    if part not in {"", "speed", "coverage"}:
-        raise InstrumentError(f"PART={part}: allowed is speed or coverage")
-    return _again(part, console) if part else _measure(QUICK if quick else FULL, console)
-
-
-def _measure(plan: Plan, console: Console) -> list[Section]:
-    with progress(console) as bars:
+    plan = QUICK if quick else FULL
+    if part == "speed":
+        return [_timed(plan)]
+    with progress(Console()) as bars:
+        if part == "coverage":
+            return [_covered(plan, _drives(plan.covered_drives(), bars)), *recordings.sections()]
+        if part:
+            raise InstrumentError(f"PART={part}: allowed is speed or coverage")
         drives = _drives(list(plan.all_drives()), bars)
         judging = bars.add_task("cars judged", total=plan.cars)
         judged = on_all_cores(judge, _cars(plan, drives), lambda: bars.advance(judging))
-        hours = bars.add_task("hours timed", total=1)
-        timed = _timed(plan)
-        bars.advance(hours)
     return [
         report.detected(plan, detection(judged)),
         report.alarms(plan, judged),
         _covered(plan, drives),
-        timed,
-        *_recordings(),
+        _timed(plan),
+        *recordings.sections(),
     ]
-
-
-def _again(part: str, console: Console) -> list[Section]:
-    if part == "speed":
-        return [_timed(FULL)]
-    with progress(console) as bars:
-        drives = _drives(FULL.covered_drives(), bars)
-    return [_covered(FULL, drives), *_recordings()]
 
 
 def _drives(specs: Sequence[DriveSpec], bars: Progress) -> dict[DriveSpec, Analysed]:
@@ -80,7 +69,9 @@ def _cars(plan: Plan, drives: dict[DriveSpec, Analysed]) -> list[Car]:
             baseline=baselines[car],
             healthy=[drives[spec] for spec in plan.healthy_drives(car)],
             faulty={case: drives[spec] for case, spec in plan.faulty_drives(car).items()},
-            fleet=[one.measured for other in range(plan.cars) if other != car for one in baselines[other]],
+            fleet=[
+                drive.measured for other in range(plan.cars) if other != car for drive in baselines[other]
+            ],
         )
         for car in range(plan.cars)
     ]
@@ -92,16 +83,11 @@ def _covered(plan: Plan, drives: dict[DriveSpec, Analysed]) -> Section:
     return report.covered(plan.covered, coverage(truths), sorted(estimated - TRUTHS.keys()))
 
 
-def _recordings() -> list[Section]:
-    real = recordings.section()
-    return [] if real is None else [real]
-
-
 SECTION = Declared(
     "the proof of the analysis, on simulated cars with known faults",
     run,
     (
-        Option("QUICK", yes, False, "a small version, to see that it works"),
+        Option("QUICK", int, 0, "a small version, to see that it works"),
         Option("PART", str, "", "speed or coverage: measure this again for the report that is in OUT"),
     ),
     ANALYSIS,

@@ -1,4 +1,4 @@
-"""The cost of a cold start of every function, with bytecode and without, in turns.
+"""The cost of a cold start of every function as it is deployed.
 
 Each function is started by AWS' own runtime interface client on a Runtime API of this machine, with the
 layer, and answers one event. Stand-ins for the services that it calls answer at once. The operating system
@@ -10,17 +10,12 @@ from __future__ import annotations
 
 import compileall
 import platform
-import shutil
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from py_compile import PycInvalidationMode
 from statistics import median
 from tempfile import TemporaryDirectory
 
 from bench.report import Report, Section
 from bench.sections import Declared, Option
-from bench.sections.utilisation import ONE_VCPU_MB
 from testkit import ROOT
 from testkit.deployed import events, functions
 from testkit.runtime import Function, RuntimeFailedError, link_runtime, started
@@ -28,59 +23,15 @@ from testkit.target import Say, Target
 from testkit.waiting import InstrumentError
 
 LAYER = ROOT / "build" / "layer" / "local"
-# What has bytecode: what is deployed is the second.
-NOTHING, LAYER_ALONE, ALL = "none", "layer", "all"
-
-
-@dataclass(frozen=True)
-class Start:
-    """Medians of one function: processor time until it asked for an event, and for the first one, with the
-    bytecode of ``compiled``; the most memory resident."""
-
-    function: str
-    compiled: str
-    memory_mb: int
-    start_cpu_ms: float
-    first_cpu_ms: float
-    peak_mb: float
-
-    @property
-    def cold_ms(self) -> float:
-        """Time from the start to the first answer, with the processor share of its memory size."""
-        return (self.start_cpu_ms + self.first_cpu_ms) / min(1.0, self.memory_mb / ONE_VCPU_MB)
+# "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".
+ONE_VCPU_MB = 1769
 
 
 def run(_target: Target | None, say: Say, *, rounds: int) -> Section:
-    """Start every function so often with each kind of bytecode."""
+    """Start every function so often; the medians are shown."""
     if not LAYER.is_dir():
         raise InstrumentError(f"{LAYER} is not there: run `make setup`")
-    try:
-        starts = list(measure(rounds, say))
-    except RuntimeFailedError as error:
-        raise InstrumentError(str(error)) from error
-    section = Section("cold", "Cold starts")
-    section.table(
-        f"Python {platform.python_version()}, {platform.machine()}",
-        ["function", "memory", "bytecode", "start", "first event", "at its share", "resident"],
-        (
-            [
-                start.function,
-                f"{start.memory_mb} MB",
-                start.compiled,
-                f"{start.start_cpu_ms:.0f} ms",
-                f"{start.first_cpu_ms:.0f} ms",
-                f"{start.cold_ms / 1000:.2f} s",
-                f"{start.peak_mb:.0f} MB",
-            ]
-            for start in starts
-        ),
-    )
-    section.raw = {"starts": [{**asdict(start), "cold_ms": start.cold_ms} for start in starts]}
-    return section
-
-
-def measure(rounds: int, say: Say) -> Iterator[Start]:
-    """Yield the figures of every function; the kinds of bytecode take turns."""
+    section, rows = Section("cold", "Cold starts"), []
     with TemporaryDirectory() as name:
         folder = Path(name)
         # AWS' own packages are taken to be compiled there, as those of a Python are that has run once.
@@ -89,34 +40,19 @@ def measure(rounds: int, say: Say) -> Iterator[Start]:
             compile_(package, quiet=2)
         for function in functions(folder / "functions", LAYER).values():
             say(function.name)
-            kinds = _kinds(function, folder)
-            figures: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in kinds}
-            for _ in range(rounds):
-                for kind, one in kinds.items():
-                    figures[kind].append(_start(one))
-            for kind, several in figures.items():
-                start, first, peak = (median(values) for values in zip(*several, strict=True))
-                yield Start(function.name, kind, function.memory_mb, start, first, peak)
-
-
-def _kinds(function: Function, folder: Path) -> dict[str, Function]:
-    bare, code = folder / f"layer-{function.layer and function.layer.name}", folder / "code"
-    if function.layer is not None and not bare.exists():
-        shutil.copytree(function.layer, bare, ignore=shutil.ignore_patterns("__pycache__"))
-    if not code.exists():
-        shutil.copytree(function.code, code)
-        # As the layer's is: never compared with the source.
-        compileall.compile_dir(code, quiet=2, invalidation_mode=PycInvalidationMode.UNCHECKED_HASH)
-    if function.layer is None:
-        return {NOTHING: function, ALL: replace(function, code=code)}
-    return {
-        NOTHING: replace(function, layer=bare),
-        LAYER_ALONE: function,
-        ALL: replace(function, code=code),
-    }
+            starts = [_start(function) for _ in range(rounds)]
+            start_ms, first_ms, peak_mb = (median(values) for values in zip(*starts, strict=True))
+            cold_s = (start_ms + first_ms) / min(1.0, function.memory_mb / ONE_VCPU_MB) / 1000
+            times = f"{start_ms:.0f} ms", f"{first_ms:.0f} ms", f"{cold_s:.2f} s"
+            rows.append([function.name, f"{function.memory_mb} MB", *times, f"{peak_mb:.0f} MB"])
+            section.raw[function.name] = {"start_ms": start_ms, "first_ms": first_ms, "cold_s": cold_s}
+    head = ["function", "memory", "start", "first event", "at its share", "resident"]
+    section.table(f"Python {platform.python_version()}, {platform.machine()}", head, rows)
+    return section
 
 
 def _start(function: Function) -> tuple[float, float, float]:
+    """Processor time until the function asks for an event, and for the first one, in ms; its peak memory."""
     with TemporaryDirectory() as folder, started(function, Path(folder)) as environment:
         answer = environment.invoke(events()[function.name])
         if answer.error_type:
@@ -128,7 +64,7 @@ def _start(function: Function) -> tuple[float, float, float]:
 SECTION = Declared(
     "a cold start of every function, under AWS' runtime client",
     run,
-    (Option("ROUNDS", int, 5, "starts of each kind"),),
+    (Option("ROUNDS", int, 5, "starts of each"),),
     Report("cold", "Cold starts", "make bench ONLY=cold"),
     cloud=False,
 )

@@ -24,7 +24,6 @@ from iort_station.cloud import EMBEDDED
 from testkit.car import RATE_HZ
 from testkit.target import Say, Target
 
-ROBOT = "bench-command"
 REPEATS = 5
 _PYTHON = "python -c pass"
 # The most that a command may take, as a multiple of Python doing nothing, and what the person may wait.
@@ -45,56 +44,50 @@ class Times(NamedTuple):
 
 def run(target: Target, say: Say) -> Section:
     """Run each command in turns."""
-    robot = target.robot(ROBOT).robot
+    robot = target.robot("bench-command").robot
     say("storing a minute of one robot")
     stored_drive.store(target, robot, stored_drive.simulated(60 * RATE_HZ))
     iort = [str(Path(sys.executable).parent / "iort"), *_options(target)]
-    query = [*iort, "query", robot, VESC_STREAM, "--last", "3m"]
     tab = {"_IORT_COMPLETE": "complete_bash", "XDG_CACHE_HOME": str(target.folder / "cache")}
     ways: dict[str, tuple[list[str], Mapping[str, str]]] = {
         _PYTHON: ([sys.executable, "-c", "pass"], {}),
         "iort --help": ([*iort, "--help"], {}),
-        "iort query, a minute": (query, {}),
+        "iort query, a minute": ([*iort, "query", robot, VESC_STREAM, "--last", "3m"], {}),
         "TAB: a verb": (iort[:1], tab | _line([*iort, "qu"])),
         "TAB: a robot": (iort[:1], tab | _line([*iort, "query", robot[:-1]])),
     }
-    found: dict[str, list[Times]] = {name: [] for name in ways}
+    measured: dict[str, list[Times]] = {name: [] for name in ways}
     for turn in range(REPEATS + 1):
         say(f"{turn} of {REPEATS}" if turn else "to warm up")
         for name, (command, environment) in ways.items():
             times = _timed(command, environment)
-            found[name] += [times] if turn else []
-    section = Section("command", "The command iort")
-    report(section, found)
-    return section
+            measured[name] += [times] if turn else []
+    return report(measured)
 
 
-def report(section: Section, found: Mapping[str, list[Times]]) -> None:
-    """Add the table and the ratios."""
-    rows = []
-    for name, times in found.items():
+def report(measured: Mapping[str, list[Times]]) -> Section:
+    """Make the section of the times of every command."""
+    section, rows = Section("command", "The command iort"), []
+    for name, times in measured.items():
         _, wait = TARGETS.get(name, (0, ""))
         rows.append([name, *(f"{median(column):.3f} s" for column in zip(*times, strict=True)), wait])
     section.table(f"Median of {REPEATS}", ["command", "wall", "processor", "wanted"], rows)
-    python = [[times.cpu_s] for times in found[_PYTHON]]
+    cpu_s = {name: [[time.cpu_s] for time in times] for name, times in measured.items()}
     for name, (most, _) in TARGETS.items():
-        value = ratio([[times.cpu_s] for times in found[name]], python)
-        section.ratio(f"{name}: processor / {_PYTHON}", value and round(value, 1), most)
+        section.ratio(f"{name}: processor / {_PYTHON}", ratio(cpu_s[name], cpu_s[_PYTHON]), most)
     section.notes.append(
         "The names of robots come from a file that an earlier TAB has had written; only the first TAB waits "
         "for the cloud."
     )
-    section.raw = {name: [times._asdict() for times in each] for name, each in found.items()}
+    section.raw = {name: [times._asdict() for times in each] for name, each in measured.items()}
+    return section
 
 
 def _options(target: Target) -> list[str]:
     if target.embedded is not None:
         return ["--local", "--embedded", str(target.embedded.folder / EMBEDDED.name)]
-    chosen = {
-        "--namespace": target.cloud.namespace,
-        "--region": target.cloud.region,
-        "--profile": target.cloud.profile,
-    }
+    cloud = target.cloud
+    chosen = {"--namespace": cloud.namespace, "--region": cloud.region, "--profile": cloud.profile}
     return [part for name, value in chosen.items() if value for part in (name, value)]
 
 
@@ -106,8 +99,7 @@ def _line(words: list[str]) -> dict[str, str]:
 def _timed(command: list[str], environment: Mapping[str, str]) -> Times:
     before, began = _children_s(), time.perf_counter()
     subprocess.run(command, env={**os.environ, **environment}, stdout=subprocess.DEVNULL, check=True)
-    wall_s = time.perf_counter() - began
-    return Times(round(wall_s, 4), round(_children_s() - before, 4))
+    return Times(time.perf_counter() - began, _children_s() - before)
 
 
 def _children_s() -> float:
@@ -115,4 +107,4 @@ def _children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-SECTION = Declared("how long a person waits for `iort`", run)
+SECTION = Declared("how long a person waits for `iort`", run, dollars=0.001)

@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from bench import plots
-from bench.report import Section, spread, text
+from bench.report import Section, text
 from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
@@ -18,15 +17,13 @@ from iort_station.operations import audit, trace
 from iort_station.page.page import BUILT, load_keys
 from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
-from local.figures import THESIS
+from local.figures import THESIS, Spread
 from testkit import chromium
 from testkit.car import AgentProcess
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError
 
-ROBOT = "bench-dashboard"
 SECONDS = 24
-_CHUNKS = 3
 _WARM_UP_S = 3.0
 _THESIS_MS = 300
 # After the frame that shows an update has been handed over, in the page's own clock, which is the
@@ -54,20 +51,19 @@ _WATCH = """robot => {
 
 def run(target: Target, say: Say) -> Section:
     """Drive one car at 50 Hz, its live lane at 10 Hz, and watch it as an operator does."""
-    section = Section("dashboard", "To the dashboard")
     bundle = target.robot(
-        ROBOT,
+        "bench-dashboard",
         sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
         metrics={"every_s": 1},
         live={"when": "always"},
         ping={"rate_hz": 1},
     )
     pubnub = load_keys(target.cloud)
-    found: list[trace.Times] = []
+    updates: list[trace.Times] = []
     listener = Listener(
         robot=bundle.robot,
         namespace=target.cloud.namespace,
-        on_update=lambda update, at, here: found.append(trace.times(update, at, here)),
+        on_update=lambda update, at, here: updates.append(trace.times(update, at, here)),
         **pubnub.reading(),
     )
     painted: list[tuple[float, float]] = []
@@ -75,61 +71,48 @@ def run(target: Target, say: Say) -> Section:
         here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
         with AgentProcess(bundle) as agent, _page(target, bundle.robot, say) as page:
             threading.Event().wait(_WARM_UP_S)
-            found.clear()
+            updates.clear()
             say(f"driving for {SECONDS} s")
             if page is not None:
                 page.evaluate(_WATCH, bundle.robot)
                 page.wait_for_timeout(SECONDS * 1000)
-                painted = [(float(t), float(at)) for t, at in page.evaluate("window.__painted")]
+                painted = page.evaluate("window.__painted")
             else:
                 threading.Event().wait(SECONDS)
             if agent.process.poll() is not None:
                 raise InstrumentError("the agent stopped while it was watched")
-            updates = list(found)
+            heard = list(updates)
         figures = audit.last_figures(target.cloud, bundle.robot)
-    if not updates:
+    if not heard:
         raise InstrumentError("no live update was heard")
-    hops = trace.trace(updates, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
-    heard = [(one.here_us - one.sample_us) / 1000 for one in updates]
-    shown = [at - t / 1000 for t, at in painted]
-    _report(section, hops, heard, shown)
-    return section
+    hops = trace.trace(heard, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
+    heard_ms = [(update.here_us - update.sample_us) / 1000 for update in heard]
+    return report(hops, heard_ms, [at - t / 1000 for t, at in painted])
 
 
-def _report(section: Section, hops: trace.Trace, heard: list[float], shown: list[float]) -> None:
-    to_subscriber, to_pixel = spread(_chunks(heard)), spread(_chunks(shown))
-    thesis = f"{THESIS['dashboard']} ms"
+def report(hops: trace.Trace, heard_ms: list[float], shown_ms: list[float]) -> Section:
+    """Make the section of the hops and the delays."""
+    section, thesis = Section("dashboard", "To the dashboard"), f"{THESIS['dashboard']} ms"
     section.table(
         "From the sample in the car, by this machine's one clock where the car is simulated on it",
-        ["way", "median (p95, p99; range of the medians of three stretches)", "thesis, 2018"],
+        ["way", "median (p95)", "thesis, 2018"],
         [
-            ["car to PubNub subscriber", text(_chunks(heard)), thesis],
-            [
-                "car to painted frame in Chromium",
-                to_pixel.text() if to_pixel else "no Chromium here",
-                thesis,
-            ],
+            ["car to PubNub subscriber", text([heard_ms]), thesis],
+            ["car to painted frame in Chromium", text([shown_ms]), thesis],
         ],
     )
-    rows = [
-        [
-            hop.name,
-            f"{hop.p50_ms:.2f} ms",
-            f"{hop.p95_ms:.2f} ms",
-            "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms",
-        ]
-        for hop in [*hops.hops, hops.whole]
-    ]
+    rows = []
+    for hop in [*hops.hops, hops.whole]:
+        doubt = "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms"
+        rows.append([hop.name, f"{hop.p50_ms:.2f} ms", f"{hop.p95_ms:.2f} ms", doubt])
     section.table("Hop by hop", ["hop", "median", "p95", "clocks may falsify it by"], rows)
-    curves = {"PubNub subscriber": heard, "painted frame": shown}
-    section.plot("dashboard", "From the sample in the car", plots.cdf(curves))
     # To the subscriber it is a few milliseconds through five processes, which vary more than a frame does.
-    for way, found, most, tolerance in (
-        ("subscriber", to_subscriber, 1.0, 8.0),
-        ("pixel", to_pixel, 0.15, 2.5),
+    for way, delays_ms, most, tolerance in (
+        ("subscriber", heard_ms, 1.0, 8.0),
+        ("pixel", shown_ms, 0.15, 2.5),
     ):
-        share = round(found.p50 / _THESIS_MS, 4) if found else None
-        name = f"car to {way} / thesis' {_THESIS_MS} ms"
+        took = Spread.of(delays_ms).p50
+        name, share = f"car to {way} / thesis' {_THESIS_MS} ms", took and took / _THESIS_MS
         section.ratio(name, share, most, tolerance=tolerance, by_machine=True)
     section.notes.append(
         "A painted frame is the first one after the update's that the browser has handed over; Chromium "
@@ -137,14 +120,10 @@ def _report(section: Section, hops: trace.Trace, heard: list[float], shown: list
     )
     section.raw = {
         "hops": asdict(hops),
-        "subscriber_ms": asdict(to_subscriber) if to_subscriber else None,
-        "painted_ms": asdict(to_pixel) if to_pixel else None,
+        "subscriber_ms": asdict(Spread.of(heard_ms)),
+        "painted_ms": asdict(Spread.of(shown_ms)),
     }
-
-
-def _chunks(values: list[float]) -> list[list[float]]:
-    size = max(1, -(-len(values) // _CHUNKS))
-    return [values[i : i + size] for i in range(0, len(values), size)]
+    return section
 
 
 @contextmanager
@@ -164,4 +143,4 @@ def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
         yield page
 
 
-SECTION = Declared("from the car to a subscriber and to a painted frame", run)
+SECTION = Declared("from the car to a subscriber and to a painted frame", run, dollars=0.001)

@@ -28,25 +28,17 @@ def ratios(report: Figures) -> dict[str, Ratio]:
 
 
 def regressions(new: Figures, old: Figures) -> list[str]:
-    """Return a line for each figure that became worse. A section must be in both reports."""
-    found = []
+    """Return a line for each figure that became worse, of sections that are in both reports."""
     now, before = ratios(new), ratios(old)
-    kind = all(new["machine"].get(key) == old["machine"].get(key) for key in _KIND)
-    for name, ratio in now.items():
-        if name in before and _worse(ratio, before[name].value, of_a_kind=kind):
-            found.append(f"{name}: {ratio.value:g} {ratio.unit}, was {before[name].value:g}")
+    of_a_kind = all(new["machine"].get(key) == old["machine"].get(key) for key in _KIND)
     measured = {section["key"] for section in new["sections"]}
-    for section in old["sections"]:
-        if section["key"] in measured:
-            gone = {ratio["name"] for ratio in section["ratios"]} - now.keys()
-            found += [f"{name}: no longer measured" for name in sorted(gone)]
-    return found
-
-
-def not_compared(new: Figures, old: Figures) -> list[str]:
-    """Return the sections that the new report lacks."""
-    measured = {section["key"] for section in new["sections"]}
-    return [section["key"] for section in old["sections"] if section["key"] not in measured]
+    lines = [
+        f"{name}: {ratio.value:g} {ratio.unit}, was {before[name].value:g}"
+        for name, ratio in now.items()
+        if name in before and _worse(ratio, before[name].value, of_a_kind=of_a_kind)
+    ]
+    kept = (ratio for section in old["sections"] if section["key"] in measured for ratio in section["ratios"])
+    return lines + [f"{ratio['name']}: no longer measured" for ratio in kept if ratio["name"] not in now]
 
 
 def _worse(now: Ratio, was: float, *, of_a_kind: bool) -> bool:
@@ -61,17 +53,18 @@ def run(_target: Target | None, _say: Say, *, new: Path, old: Path) -> Section:
         now, before = (json.loads(path.read_text()) for path in (new, old))
     except (OSError, ValueError) as error:
         raise InstrumentError(f"{error}; `make bench` writes a report") from error
-    if now["target"] != before["target"]:
-        raise InstrumentError(f"a report of {now['target']} says nothing about one of {before['target']}")
     compared = ratios(now).keys() & ratios(before).keys()
-    if not compared:
-        raise InstrumentError(f"{new} has no figure of {old}")
+    if now["target"] != before["target"] or not compared:
+        raise InstrumentError(f"{new} has no figure of {old} on its target, {before['target']}")
     worse = regressions(now, before)
     section = Section("guard", "Against the report that is kept")
     section.table(f"{len(compared)} figures compared", ["figure that became worse"], [[one] for one in worse])
     section.ratio("figures that became worse", len(worse), 0, unit="figures")
-    if left := not_compared(now, before):
-        section.notes.append(f"Not measured, so not compared: {', '.join(left)}.")
+    lacking = {section["key"] for section in before["sections"]} - {
+        section["key"] for section in now["sections"]
+    }
+    if lacking:
+        section.notes.append(f"Not measured, so not compared: {', '.join(sorted(lacking))}.")
     return section
 
 

@@ -1,4 +1,4 @@
-"""The kept cloud, killed: five cars drive while processes of `make up` get SIGKILL, or its disk is full.
+"""The kept cloud, killed: five cars drive while processes of `make up` get SIGKILL.
 
 The emulator, its functions, all processes of `make up`, or an agent are killed at random moments; the code of
 `iort audit` then counts what is lost.
@@ -14,26 +14,23 @@ import sys
 import tempfile
 import threading
 import time
-import urllib.error
 import urllib.request
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from typing_extensions import Self
 
-from bench.load.counting import Counted, count
-from bench.report import KEPT, Section
+from bench.report import Report, Section
 from bench.sections import Declared, Option
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_station import kept
 from iort_station.cloud import EMBEDDED, Cloud
-from iort_station.errors import StationError
+from iort_station.data import inventory
 from iort_station.fleet import robots
-from iort_station.operations import audit
+from iort_station.operations import accounts, audit
 from local.figures import Spread
 from local.processes import Child
 from testkit import ROOT, machine
@@ -41,13 +38,12 @@ from testkit.car import AgentProcess
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError, reached, until
 
-_START_S, _AGAIN_S, _POLL_S = 600.0, 120.0, 0.05
 CARS, RATE_HZ = 5, 50
 # What a killed agent may take with it: the open batch of a second, and the time until that is on its disk.
 OPEN_MOST_S = 2.5
-# Between the moment at which the emulator answers again and the next kill; and how long the disk is full.
-_PAUSES_S, _FULL_S = (0.3, 6.0), (3.0, 10.0)
-_FIRST_S, _SUMMARY_S = 60.0, 120.0
+# Between the moment at which the emulator answers again and the next kill.
+_PAUSES_S = 0.3, 6.0
+_START_S, _AGAIN_S, _POLL_S, _FIRST_S, _SUMMARY_S = 600.0, 120.0, 0.05, 60.0, 120.0
 
 
 class Up:
@@ -81,20 +77,10 @@ class Up:
         self._start()
         return self._answering()
 
-    def kill_function(self) -> float:
+    def kill_functions(self) -> float:
         """SIGKILL to the processes of the functions."""
         _kill(*(pid for emulator in self._emulators() for pid in machine.descendants(emulator)))
         return 0.0
-
-    def wait_until_whole(self) -> None:
-        """Wait until `make up` has done everything that belongs to a start."""
-
-        def whole() -> bool:
-            with suppress(StationError, OSError):
-                return kept.Up.load(self.state).pids["up"] == self._child.pid
-            return False
-
-        self._wait_for(whole, _AGAIN_S)
 
     def _emulators(self) -> list[int]:
         """The emulator's process, if there is one."""
@@ -123,7 +109,7 @@ class Up:
 
         def answers() -> bool:
             with (
-                suppress(urllib.error.URLError, ConnectionError, TimeoutError),
+                suppress(OSError),
                 urllib.request.urlopen(url, timeout=5, context=context),  # noqa: S310 - always https
             ):
                 return True
@@ -135,14 +121,14 @@ class Up:
     def _wait_for(self, condition: Callable[[], bool], seconds: float) -> None:
         deadline = time.monotonic() + seconds
 
-        def reached() -> bool:
+        def holds() -> bool:
             if self._child.poll() is not None and deadline - time.monotonic() < _AGAIN_S:
                 # An emulator that ends too often ends it.
                 self._start()
             return condition()
 
         try:
-            until(reached, within_s=seconds, poll_s=_POLL_S)
+            until(holds, within_s=seconds, poll_s=_POLL_S)
         except InstrumentError as error:
             raise InstrumentError(f"the cloud is not up: {error}:\n{self._child.tail()}") from None
 
@@ -151,6 +137,54 @@ def _kill(*pids: int) -> None:
     for pid in pids:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """The counts of a robot's streams together; ``lost`` are samples and batches that are not stored.
+
+    ``killed_runs`` is how many runs of the agent did not end properly: what was in their open batches is no
+    part of ``lost``, nor of ``incomplete``. ``summarized`` and ``expected`` are samples of the motor
+    controller's stream alone.
+    """
+
+    samples: int
+    batches: int
+    duplicated: int
+    lost: int
+    incomplete: tuple[str, ...]
+    killed_runs: int
+    summarized: int
+    expected: int
+
+
+def count(cloud: Cloud, robot: str) -> Counted:
+    """Audit every stream of a robot, from its first batch on."""
+    account, now_us = accounts.accounts(cloud, robot), time.time_ns() // 1000
+    audits = [
+        accounts.held_against(
+            audit.audit(name, audit.headers(cloud, robot, name), from_start=True), account, now_us
+        )
+        for name in inventory.known(cloud, robot)
+    ]
+    # A known stream of which the agent took nothing has no audit.
+    audits = [each for each in audits if each.runs or each.refused or each.taken is not None]
+    runs = [run for each in audits for run in each.runs]
+    shortfalls = [short for each in audits for short in each.shortfalls]
+    known = [
+        replace(each, shortfalls=tuple(short for short in each.shortfalls if short.samples is not None))
+        for each in audits
+    ]
+    return Counted(
+        samples=sum(run.samples for run in runs),
+        batches=sum(run.batches for run in runs),
+        duplicated=sum(run.duplicated for run in runs),
+        lost=sum(each.missing for each in audits) + sum(abs(short.samples or 0) for short in shortfalls),
+        incomplete=tuple(each.stream for each in known if not each.complete),
+        killed_runs=len({short.boot for short in shortfalls if short.samples is None}),
+        summarized=audit.samples_summarized(cloud, robot, VESC_STREAM),
+        expected=sum(run.samples for each in audits if each.stream == VESC_STREAM for run in each.runs),
+    )
 
 
 class AgentKill(NamedTuple):
@@ -163,7 +197,7 @@ class AgentKill(NamedTuple):
 
 @dataclass(frozen=True)
 class Kills:
-    """What was killed how often, and what the audit found of each car afterwards.
+    """What was killed how often, and what the audit counted of each car afterwards.
 
     ``open_s`` has, by car, how long before each kill of its agent the last stored sample was taken; None for
     a run that was killed before its first batch.
@@ -192,11 +226,9 @@ def drive(folder: Path, kills: int, seed: int, say: Say) -> Kills:
     chance = random.Random(seed)  # noqa: S311 - moments, no secrets
     killed, restarts, agent_kills = Counter[str](), list[float](), list[AgentKill]()
     say("starting the cloud")
-    folder.mkdir(parents=True)
     with ExitStack() as stack, ExitStack() as driving:
-        small = stack.enter_context(machine.Disk(folder / "state")) if machine.possible() else None
         up = stack.enter_context(Up(folder / "state"))
-        settings: dict[str, Any] = {
+        settings = {
             "sources": [{"type": "sim", "rate_hz": RATE_HZ, "pose": {"rate_hz": 0}}],
             "queue": {"path": "queue.db"},
         }
@@ -212,13 +244,9 @@ def drive(folder: Path, kills: int, seed: int, say: Say) -> Kills:
         ways: dict[str, Callable[[], float]] = {
             "killed emulator": up.kill_emulator,
             "all killed": up.kill_all,
-            "killed functions": up.kill_function,
+            "killed functions": up.kill_functions,
             "killed agent": kill_agent,
         }
-        if small:
-            ways["full disk"] = lambda: _full(small, up, names, chance.uniform(*_FULL_S))
-        else:
-            say("the disk is never full: this machine allows nobody a mount namespace of his own")
         _wait_until_driving(cloud, names)
         began = time.monotonic()
         # Each way comes, whatever the dice say.
@@ -239,25 +267,6 @@ def drive(folder: Path, kills: int, seed: int, say: Say) -> Kills:
         open_s = _open_s(cloud, agent_kills)
     restart_s = Spread.of([took_s for took_s in restarts if took_s])
     return Kills(dict(killed), seed, seconds, restart_s, counted, open_s)
-
-
-def _full(small: machine.Disk, up: Up, names: Sequence[str], seconds: float) -> float:
-    """Let the disk be full. Raises `InstrumentError` if a batch is stored all the same."""
-
-    def stored() -> int:
-        return sum(1 for name in names for _ in audit.headers(up.cloud, name, VESC_STREAM))
-
-    # It starts with free space only.
-    up.wait_until_whole()
-    with small.full():
-        # A batch that was written before may still have to be acknowledged.
-        threading.Event().wait(1.0)
-        before = stored()
-        threading.Event().wait(seconds)
-        after = stored()
-    if after != before:
-        raise InstrumentError(f"{after - before} batches were stored on a full disk")
-    return 0.0
 
 
 def _wait_until_driving(cloud: Cloud, names: Sequence[str], since_us: int | None = None) -> None:
@@ -285,51 +294,46 @@ def _open_s(cloud: Cloud, agent_kills: Sequence[AgentKill]) -> dict[str, list[fl
 
 def _count(cloud: Cloud, robot: str) -> Counted:
     """Count when the summaries are complete, or come no more."""
-    counted = [count(cloud, robot)]
+    counted = count(cloud, robot)
 
     def whole() -> bool:
-        counted[:] = [count(cloud, robot)]
-        return counted[0].summarized >= counted[0].expected
+        nonlocal counted
+        counted = count(cloud, robot)
+        return counted.summarized >= counted.expected
 
     reached(whole, within_s=_SUMMARY_S)
-    return counted[0]
+    return counted
 
 
 def run(_target: Target | None, say: Say, *, kills: int, seed: int) -> Section:
     """Kill so often, and count."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        return report(drive(Path(folder) / "kills", kills, seed or time.time_ns() % 2**32, say))
+        return report(drive(Path(folder), kills, seed or time.time_ns() % 2**32, say))
 
 
 def report(killed: Kills) -> Section:
     """A row for each car, and whether anything is lost that may not be."""
-    section = Section("kept", "Killed")
+    section, rows = Section("kept", "Killed"), []
+    for name, car in killed.cars.items():
+        open_s = ", ".join("all" if s is None else f"{s:.2f}" for s in killed.open_s.get(name, ())) or "-"
+        lost = f"**{car.lost:,}**" if car.lost else "0"
+        summarized = f"{car.summarized:,} of {car.expected:,}"
+        rows.append(
+            [name, f"{car.batches:,}", f"{car.samples:,}", lost, open_s, f"{car.duplicated:,}", summarized]
+        )
     times = ", ".join(f"{name} ({count})" for name, count in sorted(killed.killed.items()))
     section.table(
         f"Five cars at 50 Hz for {killed.seconds:.0f} s through: {times}",
         ["car", "batches", "samples", "lost", "open s", "sent twice", "summarised"],
-        (
-            [
-                name,
-                f"{car.batches:,}",
-                f"{car.samples:,}",
-                f"**{car.lost:,}**" if car.lost else "0",
-                ", ".join("all" if s is None else f"{s:.2f}" for s in killed.open_s.get(name, ())) or "-",
-                f"{car.duplicated:,}",
-                f"{car.summarized:,} of {car.expected:,}",
-            ]
-            for name, car in killed.cars.items()
-        ),
+        rows,
     )
     bad = sum(not killed.whole(name) for name in killed.cars)
     section.ratio("cars that lost more than an open batch", bad, 0, unit="cars")
-    if killed.restart_s.p50 is not None:
-        section.notes.append(f"The emulator answered again after {killed.restart_s.p50:.1f} s (median).")
-    if killed.open_s:
-        section.notes.append(
-            "`open s`: how long before each kill of an agent its last stored sample was taken. What came "
-            "after that was in the batch of a second that was still open. `all`: it had sent none."
-        )
+    section.notes.append(
+        f"The emulator answered again after {killed.restart_s.p50} s (median). `open s`: how long before "
+        "each kill of an agent its last stored sample was taken. What came after that was in the batch of a "
+        "second that was still open. `all`: it had sent none."
+    )
     section.raw = asdict(killed)
     return section
 
@@ -341,7 +345,6 @@ SECTION = Declared(
         Option("KILLS", int, 50, "kills"),
         Option("SEED", int, 0, "of the random moments; 0: another each time"),
     ),
-    KEPT,
+    Report("kept", "The kept cloud, killed", "make bench ONLY=kept"),
     cloud=False,
-    prepare=lambda: machine.enter("bench.run"),
 )

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import plots
 from bench.floors.mosquitto import Mosquitto, found, subscribed
 from bench.report import NOT_MEASURED, Section
 from bench.ros.mixed_robot import MIXED, topics
@@ -43,7 +42,7 @@ _PACKAGES = f"{PACKAGES} python3-rosbag mosquitto"
 
 
 @dataclass
-class Found:
+class Recorded:
     """The result of a run, by topic or by subscriber. ``late`` samples arrived after the drive."""
 
     seconds: float = 0.0
@@ -51,23 +50,21 @@ class Found:
     recorded: Counter[str] = field(default_factory=Counter)
     arrived: Counter[str] = field(default_factory=Counter)
     late: int = 0
-    cpu_s: dict[str, float] = field(default_factory=dict)
-    rss_mb: dict[str, float] = field(default_factory=dict)
+    used: dict[str, machine.Usage] = field(default_factory=dict)
     bag_bytes: int = 0
     bag_bz2_bytes: int = 0
     lane_bytes: Counter[str] = field(default_factory=Counter)
     stream_bytes: Counter[str] = field(default_factory=Counter)
-    batches: int = 0
     agent: dict[str, Any] = field(default_factory=dict)
 
     def left_out(self) -> Counter[str]:
         """Return how often the agent reported that it left a field out, by topic."""
         return Counter(
             {
-                topic: sum(said.get("left_out", {}).values())
+                topic: sum(counts.get("left_out", {}).values())
                 for source in self.agent.get("sources", [])
-                for topic, said in source.items()
-                if isinstance(said, dict)
+                for topic, counts in source.items()
+                if isinstance(counts, dict)
             }
         )
 
@@ -87,9 +84,9 @@ def run(_target: Target | None, say: Say) -> Section:
     return section
 
 
-def measure(program: str, python: str, seconds: int, say: Say) -> Found:
+def measure(program: str, python: str, seconds: int, say: Say) -> Recorded:
     """Drive for ``seconds``, then wait until the agent has delivered everything."""
-    result = Found()
+    result = Recorded()
     heard: list[tuple[float, str, bytes]] = []
     with (
         tempfile.TemporaryDirectory() as name,
@@ -139,8 +136,8 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         if graph.run(compress).wait(_END_S + seconds):
             raise InstrumentError("`rosbag compress` failed")
         result.bag_bz2_bytes = (smaller / bag.name).stat().st_size
-    result.cpu_s = {who: after[who].cpu_s - before[who].cpu_s for who in processes}
-    result.rss_mb = {who: after[who].rss_mb for who in processes}
+    for who, usage in after.items():
+        result.used[who] = machine.Usage(usage.cpu_s - before[who].cpu_s, usage.rss_mb)
     count(result, heard, ended)
     return result
 
@@ -179,7 +176,7 @@ def _in_bag(bag: Path) -> Counter[str]:
     return counted
 
 
-def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) -> None:
+def count(result: Recorded, heard: list[tuple[float, str, bytes]], ended: float) -> None:
     """Count the samples and bytes of the messages in ``heard``; a repeated batch counts once."""
     names = {one.stream: one.name for one in topics().values()}
     numbers: set[tuple[str, str, int]] = set()
@@ -194,68 +191,55 @@ def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) ->
         if (topic.name, batch.boot, batch.seq) in numbers:
             continue
         numbers.add((topic.name, batch.boot, batch.seq))
-        result.batches += 1
         if topic.name in names:
             result.arrived[names[topic.name]] += len(batch.times_us)
             result.late += len(batch.times_us) if at > ended + 2 else 0
 
 
-def report(section: Section, result: Found) -> None:
-    """Add the tables, the picture and the ratios."""
+def report(section: Section, result: Recorded) -> None:
+    """Add the tables and the ratios."""
     messages = sum(result.published.values())
     # The rates are even, so each stretch has its share of the messages.
     measured = messages * result.seconds / (SECONDS + _WARM_UP_S)
-    each_us = {who: cpu_s / measured * 1e6 for who, cpu_s in result.cpu_s.items()}
-    sent = result.lane_bytes[RECORD]
+    each_us = {who: usage.cpu_s / measured * 1e6 for who, usage in result.used.items()}
+    sent, left_out = result.lane_bytes[RECORD], result.left_out()
     lost = {RECORDER: result.lost(result.recorded), AGENT: result.lost(result.arrived)}
-    left_out = result.left_out()
     order = (RECORDER, AGENT, FLOOR)
-
-    def size(name: str, bag_bytes: int) -> list[str]:
-        ours = f"{sent / messages:.0f}"
-        return [name, f"{bag_bytes / messages:.0f}", ours, NOT_MEASURED, f"{sent / bag_bytes:.3f}"]
-
-    cpu = [f"{result.cpu_s[who] / result.seconds:.1%}" for who in order]
-    ours = f"{each_us[AGENT] / each_us[RECORDER]:.2f}"
-    missing = [f"{lost[who]:,} of {messages:,}" for who in (RECORDER, AGENT)]
-    section.table(
-        f"{len(result.published)} topics, {messages:,} messages in {SECONDS + _WARM_UP_S} s",
-        ["figure", *order, f"{AGENT} / {RECORDER}"],
-        [
-            ["processor a message", *(f"{each_us[who]:.0f} us" for who in order), ours],
-            ["of one core", *cpu, NOT_MEASURED],
-            ["memory", *(f"{result.rss_mb[who]:.0f} MB" for who in order), NOT_MEASURED],
-            size("bytes a message, to the file and to the cloud's record lane", result.bag_bytes),
-            size("the same, of the bag after rosbag compress --bz2", result.bag_bz2_bytes),
-            ["messages lost", *missing, NOT_MEASURED, NOT_MEASURED],
-        ],
-    )
+    rows = [
+        ["processor a message", *(f"{each_us[who]:.0f} us" for who in order)],
+        ["of one core", *(f"{result.used[who].cpu_s / result.seconds:.1%}" for who in order)],
+        ["memory", *(f"{result.used[who].rss_mb:.0f} MB" for who in order)],
+        ["messages lost", *(f"{lost[who]:,} of {messages:,}" for who in (RECORDER, AGENT)), NOT_MEASURED],
+    ]
+    for name, bag_bytes in (
+        ("bytes a message, to the file and to the cloud's record lane", result.bag_bytes),
+        ("the same, of the bag after rosbag compress --bz2", result.bag_bz2_bytes),
+    ):
+        rows.append([name, f"{bag_bytes / messages:.0f}", f"{sent / messages:.0f}", NOT_MEASURED])
+    title = f"{len(result.published)} topics, {messages:,} messages in {SECONDS + _WARM_UP_S} s"
+    section.table(title, ["figure", *order], rows)
     rows = []
     for name, topic in topics().items():
-        counts = (one[name] for one in (result.published, result.recorded, result.arrived, left_out))
+        counts = (
+            by_topic[name] for by_topic in (result.published, result.recorded, result.arrived, left_out)
+        )
         arrived = result.arrived[name]
         each = f"{result.stream_bytes[topic.stream] / arrived:.0f}" if arrived else NOT_MEASURED
         rows.append([name, topic.kind, *(f"{number:,}" for number in counts), each])
     head = ["topic", "type", "published", "in the bag", "arrived from the agent", "fields left out"]
     section.table("By topic", [*head, "bytes a message"], rows)
-    title = "Processor time a message of the mixed robot"
-    section.plot("mixed", title, plots.bars({who: each_us[who] for who in order}, unit="us"))
     section.ratio("mixed robot: messages that the agent lost", lost[AGENT], 0, unit="messages")
     section.ratio("mixed robot: fields that the agent left out", left_out.total(), 0, unit="fields")
     for who, floor in ((RECORDER, "rosbag record's"), (FLOOR, "a bare rospy subscriber's")):
-        times = round(each_us[AGENT] / each_us[who], 2)
+        times = each_us[AGENT] / each_us[who]
         section.ratio(f"mixed robot: the agent's processor / {floor}", times, None, tolerance=2)
-    section.ratio("mixed robot: bytes published / bytes of the bag", round(sent / result.bag_bytes, 3), 1.0)
+    section.ratio("mixed robot: bytes published / bytes of the bag", sent / result.bag_bytes, 1.0)
     section.notes.append(
-        f"The agent's live lane published {result.lane_bytes[LIVE] / 1e6:.1f} MB beside, and the record lane "
-        f"{result.batches:,} batches; {result.late:,} samples came over two seconds after the last message. "
-        "The bag is as `rosbag record`, a program in C++, writes it: not compressed."
+        f"The agent's live lane published {result.lane_bytes[LIVE] / 1e6:.1f} MB beside; {result.late:,} "
+        "samples came over two seconds after the last message. The bag is as `rosbag record`, a program in "
+        "C++, writes it: not compressed. What was lost and left out makes the agent's ratios smaller."
     )
-    if lost[AGENT] or left_out.total():
-        section.notes.append("What was lost and left out was not sent: it makes the agent's ratios smaller.")
-    # `dataclasses.asdict`, by which the report is written, makes no sense of a Counter.
-    plain = {name: dict(one) if isinstance(one, Counter) else one for name, one in vars(result).items()}
-    section.raw = {**plain, "lost": lost}
+    section.raw = {"processor_us": each_us, "lost": lost, "published": dict(result.published)}
 
 
 SECTION = Declared("a robot of many topics, beside rosbag record", run, cloud=False)

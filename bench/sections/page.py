@@ -1,9 +1,9 @@
 """The cost of the page in the browser, with 20 cars at 10 Hz.
 
-Processor time of the page's main thread and of its worker, as shares of a processor, on the fleet's view
-and on that of one car, by Chromium's own counters; and the JavaScript heap after a collection, every half
-minute of the soak, with the memory of the page's process. Processor time, because on a machine that is
-shared the wall clock measures the others.
+Processor time of the page's main thread, as shares of a processor, on the fleet's view and on that of one
+car, by Chromium's own counters; and the JavaScript heap after a collection, every half minute of the soak,
+with the memory of the page's process. Processor time, because on a machine that is shared the wall clock
+measures the others.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
 from typing import Any
 
 from bench.load.cars import RATE_HZ
@@ -32,49 +31,9 @@ _STEP_S = 30.0
 _KEY = "bench"
 
 
-@dataclass(frozen=True)
-class View:
-    """The main thread's share of a processor over ``seconds``, and the messages a second."""
-
-    name: str
-    seconds: float
-    main_thread: float
-    messages_per_s: float
-
-
 def run(_target: Target | None, say: Say, *, cars: int, rate: float, seconds: float, soak: float) -> Section:
     """Measure each view, then the memory for as long as the soak."""
-    views, heap, process, bounds = _watched(say, cars, rate, seconds, soak)
     section = Section("page", "The page in its browser")
-    section.table(
-        f"The page with {cars} cars at {rate:g} Hz",
-        ["view", "main thread busy", "messages/s"],
-        [
-            [view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}"]
-            for view in views
-        ],
-    )
-    memory = {"JavaScript heap after a collection": heap, "the page's process": process}
-    rows = [[what, ", ".join(f"{mb:.1f}" for mb in figures)] for what, figures in memory.items()]
-    section.table(f"Memory every {_STEP_S:.0f} s", ["of", "MB"], rows)
-    for view in views:
-        name = f"main thread busy, {view.name}"
-        section.ratio(name, round(view.main_thread, 4), MAX_BUSY, unit="of a processor", by_machine=True)
-    section.raw = {
-        "cars": cars,
-        "rate_hz": rate,
-        "views": [asdict(view) for view in views],
-        "heap_mb": heap,
-        "process_mb": process,
-        "bounds": bounds,
-    }
-    return section
-
-
-def _watched(
-    say: Say, cars: int, rate: float, seconds: float, soak: float
-) -> tuple[list[View], list[float], list[float], Any]:
-    """Return the views; heap and memory in MB every half minute of the soak; and the page's bounds."""
     with ExitStack() as stack:
         pubnub = stack.enter_context(PubNubStandIn(publish_key=_KEY, subscribe_key=_KEY))
         vehicles = {f"car{i + 1}": F1TENTH for i in range(cars)}
@@ -88,21 +47,32 @@ def _watched(
         page.goto(url)
         probe = page.context.new_cdp_session(page)
         probe.send("Performance.enable", {"timeDomain": "threadTicks"})
-        views = []
-        for name, address in (("fleet", "#/"), ("one car", "#/car/car1")):
+        rows = []
+        for view, address in (("fleet", "#/"), ("one car", "#/car/car1")):
             page.goto(url + address)
-            say(f"{name}: filling the charts")
+            say(f"{view}: filling the charts")
             page.wait_for_timeout(_WARM_UP_S * 1000)
-            say(f"{name}: measuring for {seconds:.0f} s")
-            views.append(_measure(page, probe, name, seconds))
-        heap, process = [], []
-        all_processes = browser.new_browser_cdp_session()
-        for _ in range(int(soak / _STEP_S) + 1):
-            heap.append(_heap_mb(probe))
-            process.append(_process_mb(all_processes))
-            say(f"memory: {heap[-1]:.1f} MB after {len(heap) * _STEP_S - _STEP_S:.0f} s")
+            say(f"{view}: measuring for {seconds:.0f} s")
+            busy, messages_per_s = _measure(page, probe, seconds)
+            rows.append([view, f"{busy:.1%} of a processor", f"{messages_per_s:.0f}"])
+            name = f"main thread busy, {view}"
+            section.ratio(name, busy, MAX_BUSY, unit="of a processor", by_machine=True)
+        head = ["view", "main thread busy", "messages/s"]
+        section.table(f"The page with {cars} cars at {rate:g} Hz", head, rows)
+        memory_mb: dict[str, list[float]] = {
+            "JavaScript heap after a collection": [],
+            "the page's process": [],
+        }
+        processes = browser.new_browser_cdp_session()
+        for step in range(int(soak / _STEP_S) + 1):
+            for of, mb in zip(memory_mb.values(), (_heap_mb(probe), _process_mb(processes)), strict=True):
+                of.append(mb)
+            say(f"memory after {step * _STEP_S:.0f} s")
             page.wait_for_timeout(_STEP_S * 1000)
-        return views, heap, process, page.evaluate("iort.bounds")
+        rows = [[of, ", ".join(f"{mb:.1f}" for mb in values)] for of, values in memory_mb.items()]
+        section.table(f"Memory every {_STEP_S:.0f} s", ["of", "MB"], rows)
+        section.raw = {"memory_mb": memory_mb, "bounds": page.evaluate("iort.bounds")}
+    return section
 
 
 @contextmanager
@@ -115,14 +85,14 @@ def _cars(origin: str, count: int, rate_hz: float) -> Iterator[None]:
         yield
 
 
-def _measure(page: Any, probe: Any, name: str, seconds: float) -> View:
+def _measure(page: Any, probe: Any, seconds: float) -> tuple[float, float]:
+    """The main thread's share of a processor over ``seconds``, and the messages a second."""
     before, messages = _metrics(probe), page.evaluate("iort.received")
     began = time.monotonic()
     page.wait_for_timeout(seconds * 1000)
     took = time.monotonic() - began
     busy = _metrics(probe)["TaskDuration"] - before["TaskDuration"]
-    received = page.evaluate("iort.received") - messages
-    return View(name, took, busy / took, received / took)
+    return busy / took, (page.evaluate("iort.received") - messages) / took
 
 
 def _metrics(probe: Any) -> dict[str, float]:
@@ -136,10 +106,11 @@ def _heap_mb(probe: Any) -> float:
 
 def _process_mb(browser: Any) -> float:
     """The memory of the page's process: columns of numbers are not on the heap."""
-    found = browser.send("SystemInfo.getProcessInfo")["processInfo"]
-    renderers = [each for each in found if each["type"] == "renderer"]
+    processes = browser.send("SystemInfo.getProcessInfo")["processInfo"]
     # The others are Chromium's spare ones.
-    return machine.usage_of(max(renderers, key=lambda each: each["cpuTime"])["id"]).rss_mb
+    renderers = (process for process in processes if process["type"] == "renderer")
+    busiest = max(renderers, key=lambda process: process["cpuTime"])
+    return machine.usage_of(busiest["id"]).rss_mb
 
 
 SECTION = Declared(

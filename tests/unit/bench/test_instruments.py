@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import pytest
 
@@ -12,7 +11,6 @@ from bench.floors import summarize as summarize_floor
 from bench.floors.raw_mqtt import _packet, _text
 from bench.load.course import Heard, Try
 from bench.load.generator import laps
-from bench.sections.fleet import look_for
 from functions.shared.summary import process
 from iort_contract.codec import DICTIONARY, flat_second
 from iort_contract.dynamodb import plain
@@ -37,20 +35,6 @@ def test_the_remaining_length_is_encoded_as_in_the_standard(length, head):
 
 def test_a_text_is_prefixed_with_its_length():
     assert _text("größe".encode()) == b"\x00\x07" + "größe".encode()
-
-
-@pytest.mark.parametrize(("limit", "first"), [(137, 200), (640, 50), (1, 50), (0, 4)])
-def test_the_limit_is_found_to_a_tenth(limit, first):
-    driven = []
-
-    def drive(robots):
-        driven.append(robots)
-        return SimpleNamespace(keeps_up=robots <= limit)
-
-    found = look_for(drive, first)
-    assert found <= limit <= max(found * 1.12, found + 1)
-    assert 0 not in driven
-    assert len(driven) == len(set(driven)) < 12
 
 
 def test_a_lap_has_every_sample_of_its_second():

@@ -1,4 +1,4 @@
-"""The verdicts about a kept cloud that is killed, and soaked."""
+"""The verdicts about a kept cloud that is killed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from bench.load.counting import Counted
-from bench.sections import kept, soak
-from bench.sections.kept import OPEN_MOST_S, Kills
-from bench.sections.soak import Look, Soak
+from bench.sections import kept
+from bench.sections.kept import OPEN_MOST_S, Counted, Kills
 from local.figures import Spread
 
 CAR = Counted(
@@ -45,16 +43,3 @@ def test_a_killed_agent_may_lose_its_open_batch_and_nothing_else(change, good):
 def test_the_table_names_what_was_open():
     (table,) = kept.report(replace(DRIVE, open_s={"car1": [0.9, None]})).tables
     assert "| 0.90, all |" in table.as_markdown()
-
-
-@pytest.mark.parametrize(
-    ("last", "sent", "reached"),
-    [(101.0, 15_000, [True, True]), (111.0, 15_000, [True, False]), (101.0, 15_050, [False, True])],
-)
-def test_memory_may_not_grow_after_the_first_quarter_and_nothing_is_lost(last, sent, reached):
-    memory = (80.0, 100.0, 100.0, last)
-    looks = [Look(hour + 1, 300, mb, 700.0, 5.0, 1.0, 10.0 * hour) for hour, mb in enumerate(memory)]
-    car = Counted(15_000, 300, 0, 0, (), 0, 15_000, 15_000)
-    section = soak.report(Soak(4, 1, looks, {"car1": sent}, {"car1": car}))
-    assert [ratio.reached for ratio in section.ratios] == reached
-    assert len(section.plots) == 1
