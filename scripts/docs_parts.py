@@ -229,7 +229,7 @@ def errors() -> Iterator[Row]:
 
 
 def cost(name: str) -> None:
-    """A table of the cost model: a robot's hour or year, what changes if, or fleets of several sizes."""
+    """A table of the cost model: a robot's hour, what changes if, or fleets of several sizes."""
     usage = Usage()
     if name == "scale":
         rows = fleets(usage)
@@ -239,7 +239,6 @@ def cost(name: str) -> None:
             "hour": report.robot_hour,
             "month": report.month,
             "whatif": report.what_if,
-            "year": report.robot_year,
         }
         rows = tables[name](usage)
     _table(rows.head, rows.body)
@@ -251,7 +250,7 @@ def month() -> None:
     def dollars(usage: Usage) -> tuple[float, float]:
         """For the driving, and for the deployment itself."""
         driving = model.dollars_per_month(model.bill(usage), usage)
-        return driving, sum(model.deployment_dollars_per_month(usage).values())
+        return driving, sum(report.deployment_dollars_per_month(usage).values())
 
     usage = Usage(robots=1, hours_per_day=2.0)
     by_pubnub = replace(usage, live_transport=PUBNUB)

@@ -24,7 +24,8 @@ from iort_analysis.process import analyse
 from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.codec import DICTIONARY
-from iort_station.cost.model import DRIVES_AT_ONCE, drive_billed_s, drive_items
+from iort_station.cost.model import DRIVE_S, DRIVES_AT_ONCE, drive_items
+from iort_station.cost.prices import PRICES
 from iort_station.cost.usage import Usage
 from testkit.waiting import InstrumentError
 
@@ -99,9 +100,9 @@ def bill(robot_hours: float, cpu_s: float, drive_s: float) -> Bill:
     The samples, of a VESC and as many of poses, are read from the telemetry table.
     """
     drives = ceil(robot_hours * HOUR_S / drive_s)
-    billed_s = drive_billed_s(cpu_s * drive_s / HOUR_S)
+    billed_s = DRIVE_S + cpu_s * drive_s / HOUR_S
     items = drive_items(Usage(rate_hz=RATE_HZ, streams=2), drives / robot_hours, billed_s)
-    dollars = {f"{item.service}, {item.what}": robot_hours * item.dollars for item in items}
+    dollars = {f"{item.service}, {PRICES[item.price].unit}": robot_hours * item.dollars for item in items}
     return Bill(ceil(drives / DRIVES_AT_ONCE) * billed_s, dollars)
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich import console
 from rich.json import JSON
@@ -75,14 +75,16 @@ def tell(facts: Mapping[str, Any], text: str | Lines, *, as_json: bool) -> None:
     out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
 
 
-def table(*head: str, left: Sequence[str] = (), title: str | None = None) -> Table:
-    """A table without lines, of numbers except in the columns ``left``."""
+def table(*head: str, left: Sequence[str] = (), title: str | None = None, wrap: bool = False) -> Table:
+    """A table without lines, of numbers except in the columns ``left``; with ``wrap``, a cell may take
+    several lines."""
     # It takes longer to load than TAB may take.
     from rich.table import Table  # noqa: PLC0415 - see above
 
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for name in head:
-        shown.add_column(name, justify="left" if name in left else "right", no_wrap=True)
+        justify: Literal["left", "right"] = "left" if name in left else "right"
+        shown.add_column(name, justify=justify, no_wrap=not wrap, overflow="fold")
     return shown
 
 

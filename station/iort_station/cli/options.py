@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -326,25 +326,36 @@ def _time_us(text: str, now_us: int) -> int:
     return t_us
 
 
-def ranged(verb: Callable[..., None]) -> Callable[..., None]:
-    """Give a verb the options of its parameter ``when``, which typer does not know how to read."""
-    hints = get_type_hints(When, include_extras=True)
-    options = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
-        for name, hint in hints.items()
-    ]
+def spread(
+    parameter: str, options: Mapping[str, Any], made_of: Callable[..., Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a verb these options in place of its ``parameter``, which typer does not know how to read: it gets
+    what ``made_of`` makes of them."""
 
-    @functools.wraps(verb)
-    def called(**given: Any) -> None:
-        verb(when=When(*(given.pop(name) for name in hints)), **given)
+    def decorated(verb: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(verb)
+        def called(**given: Any) -> None:
+            verb(**{parameter: made_of(**{name: given.pop(name) for name in options})}, **given)
 
-    signature = inspect.signature(verb, eval_str=True)
-    parameters: list[inspect.Parameter] = []
-    for one in signature.parameters.values():
-        parameters += options if one.name == "when" else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-    called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # read by inspect
-    called.__annotations__ = {one.name: one.annotation for one in parameters}
-    return called
+        signature, keyword = inspect.signature(verb, eval_str=True), inspect.Parameter.KEYWORD_ONLY
+        parameters: list[inspect.Parameter] = []
+        for each in signature.parameters.values():
+            parameters += (
+                [
+                    inspect.Parameter(name, keyword, default=None, annotation=of)
+                    for name, of in options.items()
+                ]
+                if each.name == parameter
+                else [each.replace(kind=keyword)]
+            )
+        called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # read by inspect
+        called.__annotations__ = {each.name: each.annotation for each in parameters}
+        return called
+
+    return decorated
+
+
+ranged = spread("when", get_type_hints(When, include_extras=True), When)
 
 
 # The cloud of an `iort` command, from the options before its name.

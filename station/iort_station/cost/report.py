@@ -1,91 +1,94 @@
-"""The cost model's tables as rows of text, for the command, the README and the bench; and a fleet's needs
-compared with AWS' default quotas, to find the one that is used up first. Pure.
-"""
+"""The cost model's tables as rows of text, for the command, the README and the bench; with them what a fleet
+needs of AWS' default quotas, and a deployment's own month, whoever drives. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from iort_contract.cloud import PUBNUB
+from iort_contract.catalog.metrics import METRICS, metrics_of
+from iort_contract.cloud import IOT, PUBNUB
 from iort_station.cost import model
-from iort_station.cost.model import LineItem, bill, dollars_per_month, pubnub_bill, thesis_bill, total
-from iort_station.cost.prices import AS_OF, LISTED, PRICES, QUOTAS, REGION, Listed, Price, Quota
-from iort_station.cost.usage import Usage, variations
+from iort_station.cost.model import WRITE, bill, dollars_per_month, pubnub_bill, thesis_bill, total, units
+from iort_station.cost.prices import MONTH_HOURS, PRICES
+from iort_station.cost.usage import Usage
 
 # The agent waits at least this long before it reconnects; a test compares it with the agent.
 SHORTEST_RECONNECT_S = 1.0
-_RESERVED = "Lambda 1: concurrency reserved by this deployment"
-# Quotas of one robot, which has its own connection and partition keys.
-_ONE_ROBOTS = frozenset(
-    {
-        "IoT Core: publishes of one connection",
-        "IoT Core: connects of one client id",
-        "DynamoDB: writes to one partition",
-    }
-)
 # The table of a robot-hour has no rows below this; the totals include them.
 _LEAST_DOLLARS = 0.00005
 
 
 class Need(NamedTuple):
-    """A fleet's need of one quota, and the number of robots that use it up; None means never."""
+    """A fleet's need of one default quota, and the number of robots that use it up; None means never.
+
+    AWS raises quotas on request, except the ``fixed`` ones, which are of one robot: it has its own connection
+    and partition keys.
+    """
 
     name: str
     needed: float
-    quota: Quota
+    quota: float
+    unit: str
+    fixed: bool
     robots_at_quota: float | None
 
     @property
     def times(self) -> float:
         """The need as a multiple of the quota."""
-        return self.needed / self.quota.value
+        return self.needed / self.quota
 
 
 def needs(usage: Usage) -> list[Need]:
     """What a fleet whose robots all drive at once needs of the quotas, in the order in which they are used
-    up."""
-    of_one = _per_robot(usage)
-    quotas = dict(QUOTAS)
-    if usage.live_concurrency:
-        quotas[_RESERVED] = Quota(usage.live_concurrency, "executions")
-    rows = []
-    for name, quota in quotas.items():
-        grows = name not in _ONE_ROBOTS
-        at = quota.value / of_one[name] if grows and of_one[name] else None
-        rows.append(Need(name, of_one[name] * (usage.robots if grows else 1), quota, at))
-    return sorted(rows, key=lambda need: need.robots_at_quota or float("inf"))
+    up.
 
-
-def _per_robot(usage: Usage) -> dict[str, float]:
+    IoT Core's are of https://docs.aws.amazon.com/general/latest/gr/iot-core.html. The others are of the same
+    services' developer guides: DynamoDB's ServiceQuotas and bp-partition-key-design, Lambda's
+    gettingstarted-limits. A new account may have lower quotas, such as of Lambda's executions.
+    """
     sizes = model.sizes_of(usage.rate_hz, usage.batch_s)
-    item_writes, second_writes = (
-        model.units(size, model.WRITE) for size in (sizes.telemetry_item, sizes.summary_item)
-    )
     batches, own, clock = usage.batches_per_s, usage.own_batches_per_s, usage.clock_pings_per_s
     publishes = batches + own + usage.live_hz + 3 * usage.ping_hz + clock
     # Two more rules evaluate each live message that passes the broker. The stream's shards limit Lambda 2, so
     # only Lambda 1 and the pings count.
-    is_pubnub = usage.live_transport == PUBNUB
-    by_pubnub = usage.live_hz * is_pubnub
-    live_rules = by_pubnub + 2 * (usage.live_at_broker_per_s if is_pubnub else usage.live_hz)
+    by_pubnub = usage.live_hz if usage.live_transport == PUBNUB else 0.0
+    live_rules = by_pubnub + 2 * (usage.live_at_broker_per_s if by_pubnub else usage.live_hz)
     live_s = by_pubnub * usage.live_ms / 1000
-    return {
-        _RESERVED: live_s,
-        "IoT Core: connections": 1,
-        "IoT Core: connects in a minute after an outage": 1,
-        "IoT Core: connects of one client id": 1 / SHORTEST_RECONNECT_S,
-        "IoT Core: subscriptions": model.SUBSCRIPTIONS,
+    item_writes, second_writes = (units(size, WRITE) for size in (sizes.telemetry_item, sizes.summary_item))
+    # The quota and its unit, and a robot's need.
+    quotas = {
+        # Confirmed: docs.espressif.com, specs/limits of RainMaker Neo, undated copy.
+        "IoT Core: connections": (500_000, "connections", 1),
+        # The lower of two: AWS' pages of 2019 to 2023 say 500 a second, later ones 3,000 in most regions.
+        # Service Quotas shows an account's own.
+        "IoT Core: connects in a minute after an outage": (500 * 60, "connects", 1),
+        "IoT Core: subscriptions": (500_000, "subscriptions", model.SUBSCRIPTIONS),
         # Basic Ingest passes the same gateway.
-        "IoT Core: publishes in": publishes,
-        "IoT Core: rule evaluations": batches + own + live_rules + 2 * usage.ping_hz + clock,
-        "IoT Core: publishes of one connection": publishes,
-        "DynamoDB: writes to table telemetry": batches * item_writes + own,
-        "DynamoDB: writes to table summary": batches * second_writes + own,
-        "DynamoDB: writes to one partition": usage.stream_batches_per_s * item_writes,
-        "Lambda: concurrent executions": live_s + usage.ping_hz * 0.005,
+        "IoT Core: publishes in": (20_000, "1/s", publishes),
+        "IoT Core: rule evaluations": (20_000, "1/s", batches + own + live_rules + 2 * usage.ping_hz + clock),
+        # Confirmed by undated copies of the pages: writes to both tables, and Lambda's executions.
+        "DynamoDB: writes to table telemetry": (40_000, "units/s", batches * item_writes + own),
+        "DynamoDB: writes to table summary": (40_000, "units/s", batches * second_writes + own),
+        "Lambda: concurrent executions": (1_000, "executions", live_s + usage.ping_hz * 0.005),
     }
+    if usage.live_concurrency:
+        reserved = "Lambda 1: concurrency reserved by this deployment"
+        quotas[reserved] = (usage.live_concurrency, "executions", live_s)
+    of_one = {
+        # Confirmed: repost.aws, question QUshJCmEV8SOSkAJ00SWfQ4Q, undated copy.
+        "IoT Core: publishes of one connection": (100, "1/s", publishes),
+        # Confirmed by an undated copy of the page.
+        "IoT Core: connects of one client id": (1, "1/s", 1 / SHORTEST_RECONNECT_S),
+        "DynamoDB: writes to one partition": (1_000, "units/s", usage.stream_batches_per_s * item_writes),
+    }
+    rows = [
+        Need(name, need * usage.robots, quota, unit, False, quota / need if need else None)
+        for name, (quota, unit, need) in quotas.items()
+    ]
+    rows += [Need(name, need, quota, unit, True, None) for name, (quota, unit, need) in of_one.items()]
+    return sorted(rows, key=lambda need: need.robots_at_quota or float("inf"))
 
 
 class Rows(NamedTuple):
@@ -95,11 +98,10 @@ class Rows(NamedTuple):
     body: list[tuple[str, ...]]
 
 
-def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """Dollars per robot-hour by service and lane, in the thesis' layout and in ours; ours also for an hour in
-    which nobody looks."""
+def robot_hour(usage: Usage) -> Rows:
+    """By service and lane, in the thesis' layout and in ours; ours also while nobody looks."""
     alone = replace(usage, watched_hours=0.0)
-    columns = thesis_bill(usage, prices), bill(usage, prices), bill(alone, prices)
+    columns = thesis_bill(usage), bill(usage), bill(alone)
     body: list[tuple[str, ...]] = []
     # By service; its lanes as the bills have them.
     kinds = dict.fromkeys((item.service, item.lane) for items in columns for item in items)
@@ -116,15 +118,8 @@ def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
         ("total AWS without archive and analysis", lambda item: item.lane not in {"archive", "analysis"}),
     ):
         body.append(_compared(what, [total(filter(counts, items)) for items in columns]))
-    pubnub = [
-        total(items)
-        for items in (
-            pubnub_bill(usage, prices, thesis=True),
-            pubnub_bill(usage, prices),
-            pubnub_bill(alone, prices),
-        )
-    ]
-    body.append(_compared("PubNub, plan by transactions", pubnub))
+    pubnub = pubnub_bill(usage, thesis=True), pubnub_bill(usage), pubnub_bill(alone)
+    body.append(_compared("PubNub, plan by transactions", [total(items) for items in pubnub]))
     return Rows(("dollars a robot-hour", "a message a sample", "iort", "nobody looks", "ratio"), body)
 
 
@@ -132,48 +127,103 @@ def _compared(what: str, sums: Sequence[float]) -> tuple[str, ...]:
     return what, *map(dollars, sums), f"1/{sums[0] / sums[1]:.1f}" if sums[1] else ""
 
 
-def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+def month(usage: Usage) -> Rows:
     """Dollars per month for the fleet, and for the deployment itself."""
-
-    def driving(items: list[LineItem]) -> str:
-        return f"{dollars_per_month(items, usage):,.2f}"
-
+    ours, thesis, pubnub = (
+        f"{dollars_per_month(of(usage), usage):,.2f}" for of in (bill, thesis_bill, pubnub_bill)
+    )
     users = model.pubnub_mau_dollars_per_month(usage)
-    fixed = model.deployment_dollars_per_month(usage, prices)
+    fixed = deployment_dollars_per_month(usage)
     body: list[tuple[str, ...]] = [
-        ("AWS, the driving", driving(bill(usage, prices))),
+        ("AWS, the driving", ours),
         *((f"AWS, {name}", f"{value:,.2f}") for name, value in fixed.items()),
-        ("AWS, the same driving a message a sample", driving(thesis_bill(usage, prices))),
-        ("PubNub, plan by transactions", driving(pubnub_bill(usage, prices))),
+        ("AWS, the same driving a message a sample", thesis),
+        ("PubNub, plan by transactions", pubnub),
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
     ]
     return Rows((f"dollars a month, {robots(usage.robots)}", ""), body)
 
 
-def robot_year(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """What a robot records in a year, in DynamoDB beside the archive."""
-    body: list[tuple[str, ...]] = [
-        (place.what, f"{place.size_bytes / 1e9:.2f}", dollars(place.dollars))
-        for place in model.robot_year(usage, prices)
-    ]
-    return Rows((f"a robot-year, {usage.hours_per_day:g} h a day", "GB", "dollars"), body)
+# "Amazon CloudWatch pricing", free tier: three dashboards of up to fifty metrics each, ten custom metrics,
+# ten alarms that name their metric. A dashboard with more metrics is billed, and so is each metric that a
+# Metrics Insights alarm analyses or that GetMetricData returns. It is the whole account's.
+FREE_DASHBOARDS, FREE_DASHBOARD_METRICS, FREE_METRICS, FREE_ALARMS = 3, 50, 10, 10
+# The live page's refresh interval; CloudWatch's own console is free. With robot_metrics, the searches of the
+# last dashboard find so many metrics per robot.
+PAGE_REFRESH_S, ROBOT_SEARCHES = 30, 4
 
 
-def differences(listed: Listed) -> Rows:
-    """The differences between AWS' price list and the built-in prices."""
-    body: list[tuple[str, ...]] = [
-        (f"{name}: {PRICES[name].per:,.0f} x {PRICES[name].unit}", f"{ours:g}", f"{aws:g}")
-        for name, (ours, aws) in listed.changed().items()
-    ]
-    body.append((f"as built in: {len(listed.each) - len(body)} of {len(LISTED)}", "", ""))
-    return Rows(("dollars", f"{AS_OF}, {REGION}", f"{listed.read_on}, {listed.region}"), body)
+def deployment_dollars_per_month(usage: Usage) -> dict[str, float]:
+    """Dollars by purpose: metrics, alarms, dashboards, queue polls, and if set the account's own key.
+
+    Costs below a cent are left out, such as of files of code and page. Parameter Store's standard tier, SNS'
+    mails, the budget and reading a table's stream are free.
+    """
+    metrics = len(METRICS) + usage.robots * usage.robot_metrics * len(metrics_of("health"))
+    if usage.live_transport == IOT:
+        # AWS bills what is written, and nothing calls Lambda 1.
+        metrics -= len(metrics_of("live"))
+    dashboards = dashboard_metrics(usage)
+    small = sum(shown <= FREE_DASHBOARD_METRICS for shown in dashboards)
+    # People look at one dashboard at a time; this counts the largest.
+    requested = usage.dashboard_hours * 3600 / PAGE_REFRESH_S * max(dashboards, default=0)
+    # Lambda polls around the clock, with five long polls of 20 s where concurrency has a limit: the queues of
+    # quarantine, batches put off and archive ("Configuring scaling behavior for SQS event source mappings").
+    polls = 3 * 5 * MONTH_HOURS * 3600 / 20
+    table: dict[str, tuple[str, float]] = {
+        "metrics": ("metric", max(0, metrics - FREE_METRICS)),
+        "alarms": ("alarm", max(0, usage.alarms - FREE_ALARMS)),
+        "alarms by Metrics Insights, at most": ("insights_alarm", usage.insights_metrics),
+        "dashboards": ("dashboard", len(dashboards) - min(small, FREE_DASHBOARDS)),
+        "metrics requested by the live page": ("metric_request", requested),
+        "polling the queues": ("queue_request", polls),
+    }
+    if usage.customer_key:
+        # SQS requests the queue's key every five minutes (KmsDataKeyReusePeriodSeconds).
+        table["key"] = ("key", 1)
+        table["requests to the key, by the queue"] = ("key_request", 12 * MONTH_HOURS)
+    return {what: count * PRICES[price].each for what, (price, count) in table.items()}
 
 
-def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+def dashboard_metrics(usage: Usage) -> tuple[int, ...]:
+    """The number of metrics on each dashboard, including those that a search finds."""
+    if not usage.robot_metrics or not usage.dashboards:
+        return usage.dashboards
+    return (*usage.dashboards[:-1], usage.dashboards[-1] + ROBOT_SEARCHES * usage.robots)
+
+
+def variations(usage: Usage) -> dict[str, Usage]:
+    """The usage with one setting changed at a time."""
+    rates = {f"live lane at {hz:g} Hz": {"live_hz": hz} for hz in (5.0, 2.0, 1.0) if hz != usage.live_hz}
+    changes: dict[str, dict[str, Any]] = {
+        "as configured": {},
+        "nobody looks": {"watched_hours": 0.0},
+        "somebody looks a tenth of the time": {"watched_hours": 0.1 * usage.hours_per_day},
+        "live messages by PubNub": {"live_transport": PUBNUB},
+        **rates,
+        "no live lane": {"live_hz": 0.0},
+        "batches of 0.2 s": {"batch_s": 0.2},
+        "one sample a batch": {"batch_s": 0.0},
+        "round trips measured at 1 Hz": {"ping_hz": 1.0},
+        "commands at 10 Hz": {"command_hz": 10.0},
+        "a question to the cloud every minute": {"questions_per_hour": 60.0},
+        "reconnecting every minute": {"connects_per_hour": 60.0},
+        "with Lambda's own log lines": {"function_logs": "all"},
+        "kept for 30 days": {"retention_days": 30},
+        "without an archive": {"archive_days": 0},
+        "kept for ten years in the archive": {"archive_days": 3653},
+        "without the nightly analysis": {"drive_minutes": 0.0},
+        "tables recoverable to a point in time (`prod`)": {"recoverable": True},
+        "a thousand robots": {"robots": 1000},
+    }
+    return {name: replace(usage, **changed) for name, changed in changes.items()}
+
+
+def what_if(usage: Usage) -> Rows:
     """Dollars per robot-hour with one setting changed at a time, compared with the thesis' layout."""
     body: list[tuple[str, ...]] = []
-    for name, other in variations(usage):
-        ours, thesis, pubnub = (total(of(other, prices)) for of in (bill, thesis_bill, pubnub_bill))
+    for name, other in variations(usage).items():
+        ours, thesis, pubnub = (total(of(other)) for of in (bill, thesis_bill, pubnub_bill))
         body.append((name, dollars(ours), f"1/{thesis / ours:.1f}", dollars(pubnub)))
     return Rows(("dollars a robot-hour", "AWS", "of a message a sample", "PubNub by transactions"), body)
 
@@ -183,7 +233,7 @@ def quotas(usage: Usage) -> Rows:
     body: list[tuple[str, ...]] = []
     for need in needs(usage):
         at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
-        quota = f"{need.quota.value:,.0f} {need.quota.unit}{'' if need.quota.adjustable else ', fixed'}"
+        quota = f"{need.quota:,.0f} {need.unit}{', fixed' if need.fixed else ''}"
         body.append((need.name, f"{need.needed:,.1f}", quota, times(need.times), at))
     return Rows((robots(usage.robots), "needed", "quota", "times", "robots at the quota"), body)
 

@@ -1,10 +1,9 @@
-"""How a fleet is driven, with everything that affects its bill: as given, from a car.yaml, as deployed."""
+"""How a fleet is driven, with everything that affects its bill: as given, or from a car.yaml."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -18,11 +17,7 @@ from iort_contract.messages.account import ACCOUNT_EVERY_S
 from iort_contract.messages.live import VIEW_RENEW_S
 from iort_contract.messages.shadow import ALWAYS, WATCHED
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
-from iort_station.cloud import Cloud
-from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet.roles import transport
-from iort_station.operations import cloudwatch
 
 TRANSPORTS = (PUBNUB, IOT)
 # A car without round-trip pings still pings for its clock offset; a test compares this with the agent.
@@ -40,9 +35,8 @@ class Usage:
     ``drive_minutes`` are analysed, 0 for none. Only AWS knows the billed milliseconds ``live_ms`` and
     ``summarize_ms``: they are assumptions.
 
-    Of a deployment: alarms by Metrics Insights analyse ``insights_metrics`` together. ``dashboards`` has the
-    number of metrics on each; ``robot_metrics`` adds to the last. ``function_logs`` "all" adds Lambda's own
-    log lines.
+    Alarms by Metrics Insights analyse ``insights_metrics`` together. ``dashboards`` has the metrics on each;
+    ``robot_metrics`` adds to the last. ``function_logs`` "all" adds Lambda's own log lines.
     """
 
     robots: int = 1
@@ -113,10 +107,6 @@ class Usage:
         return figures + 1 / ACCOUNT_EVERY_S + min(1.0, 3 * self.ping_hz)
 
     @property
-    def own_streams(self) -> int:
-        return bool(self.agent_every_s) + 1 + bool(self.ping_hz)
-
-    @property
     def watched(self) -> float:
         """The share of its hours that somebody looks at a robot, or that it sends as if."""
         return 1.0 if self.watched_hours is None else min(1.0, self.watched_hours / self.hours_per_day)
@@ -147,46 +137,12 @@ class Usage:
         """A robot's pings a second that measure its clock offset."""
         return 0.0 if self.ping_hz else 1 / CLOCK_PING_S
 
-    @property
-    def robot_hours_per_month(self) -> float:
-        """Robot-hours of the whole fleet."""
-        return self.robots * self.hours_per_day * MONTH_DAYS
-
-
-def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
-    """The usage with one setting changed at a time."""
-    rates = {f"live lane at {hz:g} Hz": {"live_hz": hz} for hz in (5.0, 2.0, 1.0) if hz != usage.live_hz}
-    changes: dict[str, dict[str, Any]] = {
-        "as configured": {},
-        "nobody looks": {"watched_hours": 0.0},
-        "somebody looks a tenth of the time": {"watched_hours": 0.1 * usage.hours_per_day},
-        "live messages by PubNub": {"live_transport": PUBNUB},
-        **rates,
-        "no live lane": {"live_hz": 0.0},
-        "batches of 0.2 s": {"batch_s": 0.2},
-        "one sample a batch": {"batch_s": 0.0},
-        "round trips measured at 1 Hz": {"ping_hz": 1.0},
-        "commands at 10 Hz": {"command_hz": 10.0},
-        "a question to the cloud every minute": {"questions_per_hour": 60.0},
-        "reconnecting every minute": {"connects_per_hour": 60.0},
-        "with Lambda's own log lines": {"function_logs": "all"},
-        "kept for 30 days": {"retention_days": 30},
-        "without an archive": {"archive_days": 0},
-        "kept for ten years in the archive": {"archive_days": 3653},
-        "without the nightly analysis": {"drive_minutes": 0.0},
-        "tables recoverable to a point in time (`prod`)": {"recoverable": True},
-        "a thousand robots": {"robots": 1000},
-    }
-    for name, changed in changes.items():
-        yield name, replace(usage, **changed)
-
 
 # --- from a robot's car.yaml; `iort-agent check` judges the whole file
 
-# Sources that take samples at a rate of their own, with its default; a test compares them with the agent's.
-_OWN_RATE_HZ = {"sim": 50.0, "vesc": 50.0}
-# A simulated car's poses, a stream beside its samples.
-_POSE_RATE_HZ = 20.0
+# Sources that take samples at a rate of their own, with its default, and that of a simulated car's poses, a
+# stream beside its samples; a test compares them with the agent's.
+_OWN_RATE_HZ, _POSE_RATE_HZ = {"sim": 50.0, "vesc": 50.0}, 20.0
 
 
 def as_configured(usage: Usage, file: Path) -> Usage:
@@ -212,9 +168,7 @@ def as_configured(usage: Usage, file: Path) -> Usage:
             streams=len(rates),
             rate_hz=mean(rate_hz or usage.rate_hz for rate_hz in rates),
         ).check()
-    except (OSError, UnicodeDecodeError) as error:
-        raise StationError(f"{file} cannot be read: {error}") from error
-    except (AttributeError, KeyError, TypeError, ValueError, yaml.YAMLError, UsageError) as error:
+    except (AttributeError, KeyError, OSError, TypeError, ValueError, yaml.YAMLError, UsageError) as error:
         raise StationError(
             f"{file} must be as `iort-agent check` accepts it, got {type(error).__name__}: {error}"
         ) from error
@@ -231,64 +185,3 @@ def _rates_hz(source: Mapping[str, Any]) -> list[float | None]:
     poses = source.get("pose") or {}
     poses_hz = float(poses.get("rate_hz", _POSE_RATE_HZ)) if kind == "sim" else 0.0
     return [rate_hz, min(rate_hz, poses_hz)] if poses_hz else [rate_hz]
-
-
-# --- from the deployment
-
-_INSIGHTS = re.compile(r'SELECT SUM\((?P<metric>\w+)\) FROM "(?P<namespace>[\w/]+)"')
-
-
-def as_deployed(usage: Usage, cloud: Cloud) -> Usage:
-    """The usage with live messages, memory, concurrency, logs, alarms, dashboards, recovery and key as
-    deployed.
-
-    Alarms and dashboards are the whole account's, like CloudWatch's free allowances.
-    """
-    functions, dynamodb = cloud.client("lambda"), cloud.client("dynamodb")
-    names = [cloud.output("processing", f"{name}Function") for name in ("Live", "Summarize")]
-    live, summarize = (functions.get_function_configuration(FunctionName=name) for name in names)
-    reserved = functions.get_function_concurrency(FunctionName=names[0])
-    table = cloud.output("storage", "TelemetryTable")
-    encryption = dynamodb.describe_table(TableName=table)["Table"].get("SSEDescription", {})
-    backups = dynamodb.describe_continuous_backups(TableName=table)["ContinuousBackupsDescription"]
-    recovery = backups.get("PointInTimeRecoveryDescription", {})
-    return replace(
-        usage,
-        live_transport=transport(cloud),
-        live_memory_mb=live["MemorySize"],
-        summarize_memory_mb=summarize["MemorySize"],
-        function_logs="own" if live.get("LoggingConfig", {}).get("SystemLogLevel") == "WARN" else "all",
-        live_concurrency=reserved.get("ReservedConcurrentExecutions", 0),
-        customer_key=encryption.get("SSEType") == "KMS",
-        recoverable=recovery.get("PointInTimeRecoveryStatus") == "ENABLED",
-        **watching(cloud),
-    )
-
-
-def watching(cloud: Cloud) -> dict[str, Any]:
-    """The alarms and dashboards, as AWS bills them."""
-    client = cloud.client("cloudwatch")
-    pages = client.get_paginator("describe_alarms").paginate()
-    alarms = [alarm for page in pages for alarm in page.get("MetricAlarms", [])]
-    expressions = (
-        [_INSIGHTS.match(query.get("Expression", "")) for query in alarm.get("Metrics", [])]
-        for alarm in alarms
-    )
-    insights = [match for matches in expressions if (match := next(filter(None, matches), None))]
-    lists = client.get_paginator("list_metrics")
-    analysed = sum(
-        len(page["Metrics"])
-        for query in insights
-        for page in lists.paginate(
-            Namespace=query["namespace"], MetricName=query["metric"], RecentlyActive="PT3H"
-        )
-    )
-    # The robots' dashboard comes last, where `dashboard_metrics` counts what its searches find.
-    names = sorted(cloudwatch.dashboards(cloud), key=lambda name: name == f"{cloud.namespace}-robots")
-    counted = [cloudwatch.count(cloudwatch.body_of(cloud, name)) for name in names]
-    return {
-        "alarms": len(alarms) - len(insights),
-        "insights_metrics": analysed,
-        "dashboards": tuple(dashboard.metrics for dashboard in counted),
-        "robot_metrics": bool(counted and counted[-1].searches),
-    }

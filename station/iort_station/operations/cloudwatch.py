@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from botocore.exceptions import ClientError
 
@@ -78,22 +78,6 @@ def metrics(rows: Sequence[Sequence[Any]]) -> Iterator[tuple[list[str], dict[str
         if parts:
             before = parts
         yield parts, options
-
-
-class Counted(NamedTuple):
-    """The billed contents of a dashboard: named metrics, and searches, which each find any number of
-    metrics."""
-
-    metrics: int
-    searches: int
-
-
-def count(widgets: Sequence[Mapping[str, Any]]) -> Counted:
-    """Count the metrics of a dashboard's widgets; a metric counts each time it is shown."""
-    rows = [row for widget in widgets for row in widget.get("properties", {}).get("metrics", [])]
-    named = sum(len(parts) >= _LEAST_PARTS for parts, _ in metrics(rows))
-    searches = sum("SEARCH(" in str(options.get("expression", "")) for _, options in metrics(rows))
-    return Counted(named, searches)
 
 
 def _widget(client: Any, number: int, widget: Mapping[str, Any], from_s: int, to_s: int) -> Widget:
