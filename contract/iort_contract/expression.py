@@ -8,7 +8,7 @@ if it is neither null, zero nor empty. A comparison of a number with a text, or 
 error, since no sample could match.
 
 `evaluate` walks the tree; a `Calculus` says how to calculate: with one sample's values here, for the query
-function, and with numpy's columns in iort_station.data.selection.
+function, and with numpy's columns in iort_station.data.conditions.
 """
 
 from __future__ import annotations

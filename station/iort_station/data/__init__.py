@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from iort_analysis.samples.blocks import Block, values
 from iort_station.data.queries import CLIENT, LAMBDA, Result, query, samples
-from iort_station.data.recorded import Reading
-from iort_station.data.selection import Selection, select
+from iort_station.data.recorded import Reading, Selection, select
 
 __all__ = [
     "CLIENT",

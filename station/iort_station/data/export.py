@@ -19,8 +19,7 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages
 from iort_station.data.bags import Recording, Write
-from iort_station.data.recorded import Recorded
-from iort_station.data.selection import Selection
+from iort_station.data.recorded import Recorded, Selection
 from iort_station.fleet import files
 
 # Gives the content of an uploaded file by its key; None if the file is missing.

@@ -18,8 +18,8 @@ from iort_contract.ros1.definition import Fields, parse
 from iort_contract.ros1.message import MessageType, message_type
 from iort_contract.tables import STATS, STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Recorded, last_reports
-from iort_station.data.selection import Selection
+from iort_station.data.accounts import last_reports
+from iort_station.data.recorded import Recorded, Selection
 from iort_station.errors import StationError, unknown
 from iort_station.fleet import registry
 from iort_station.times import iso

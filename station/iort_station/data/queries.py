@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-import ssl
-import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.archive.stored import AUTO, TABLE, Origin, PageProgress, Source
+from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Source
 from iort_analysis.samples.batches import in_order
-from iort_analysis.samples.blocks import Block, Column, column_of, join, ordered, resample
+from iort_analysis.samples.blocks import Block, Column, join, resample
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
 from iort_contract.dynamodb import with_samples_between
-from iort_contract.limits import ContractError
-from iort_contract.messages import questions
 from iort_contract.ros1.message import MessageType
 from iort_contract.tables import STATS
-from iort_station.cloud import Cloud, invoke
+from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.conditions import derive, holds
 from iort_station.data.inventory import unit
-from iort_station.data.recorded import Reading, in_column_order, seconds
-from iort_station.data.selection import Selection, derive, holds, select
+from iort_station.data.recorded import Reading, Selection, select
+from iort_station.data.remote import by_function, check_in_table
+from iort_station.data.seconds import in_column_order, seconds
 from iort_station.errors import StationError
 from iort_station.fleet import registry
-from iort_station.times import Time, duration_us, iso_s
+from iort_station.times import Time, duration_us
 
 # Where samples are selected: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
 _BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
 _MEAN = f"_{STATS[1]}"
-_DOWNLOAD_S = 60
 
 
 @dataclass(frozen=True)
@@ -114,8 +111,8 @@ def query(
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; query the summary without --on lambda")
-        _check_in_table(cloud, selection, reading)
-        blocks = _by_function(cloud, selection, reading)
+        check_in_table(cloud, selection, reading)
+        blocks = by_function(cloud, selection, reading)
     else:
         blocks = (seconds if summary else samples)(cloud, selection, reading)
     ros2 = False
@@ -188,19 +185,6 @@ def samples(
         raise inventory.unknown_fields(cloud, selection, there)
 
 
-def _check_in_table(cloud: Cloud, selection: Selection, reading: Reading) -> None:
-    """Raise `StationError` if the query function, which reads the table only, would leave something out."""
-    if reading.source == TABLE:
-        return
-    keys = with_samples_between(selection.start_us, selection.end_us)
-    hours = reading.recorded(cloud, selection).archived(keys)
-    if archived := Origin(hours).within(selection.start_us, selection.end_us).told():
-        raise StationError(
-            f"the query function reads the table only, from which {archived['hours']:,} hours of this range "
-            f"have expired, or soon will: leave out --on lambda, or start at {iso_s(archived['to_us'])}"
-        )
-
-
 def has_fraction(block: Block) -> bool:
     """Whether charge or energy has fractions, which only the ROS 2 driver sends; the ROS 1 driver counts."""
     return any(
@@ -233,72 +217,3 @@ def _without_absent(block: Block, counts: Counter[str]) -> Block:
             changed[name][mask] = np.nan if numbers else None
             counts[name] += int(mask.sum())
     return Block(block.times_us, {**block.columns, **changed}) if changed else block
-
-
-def _by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
-    """The selection's samples, from as many invocations of the query function as needed.
-
-    Raises `StationError` if the function fails, and at the end for a field that no sample has.
-    """
-    request = questions.QueryRequest(
-        selection.robot,
-        selection.stream,
-        questions.FIRST_US if selection.start_us is None else selection.start_us,
-        questions.LAST_US if selection.end_us is None else selection.end_us,
-        selection.fields,
-        selection.where,
-        reading.scan,
-    )
-    parts: list[Block] = []
-    there: set[str] = set()
-    while True:
-        answer = _invoke(cloud, request)
-        part = _unpacked(cloud, answer)
-        parts.append(part)
-        there |= set(answer.fields)
-        reading.refused.count += answer.refused
-        reading.refused.named += [answer.reason] if answer.reason else []
-        if reading.absent is not None:
-            reading.absent.update(answer.absent)
-        if reading.progress is not None and len(part.times_us):
-            reading.progress(answer.items, int(part.times_us[-1]))
-        if answer.token is None:
-            break
-        request = replace(request, token=answer.token)
-    if there and not selection.named() <= there:
-        raise inventory.unknown_fields(cloud, selection, there)
-    # A batch may overlap the next one, which another invocation may have read.
-    block = ordered(join(parts))
-    if len(block.times_us):
-        names = selection.fields or tuple(block.columns)
-        yield Block(block.times_us, {name: block.columns[name] for name in names})
-
-
-def _invoke(cloud: Cloud, request: questions.QueryRequest) -> questions.QueryAnswer:
-    event = questions.encode_query_request(request)
-    text = invoke(cloud, "processing", "QueryFunction", event, "the query function")
-    try:
-        answer = questions.decode_query_answer(text)
-    except ContractError as error:
-        raise StationError(f"{error}: deploy the current stacks") from error
-    if answer.error:
-        raise StationError(f"the query function refused: {answer.error}")
-    return answer
-
-
-def _unpacked(cloud: Cloud, answer: questions.QueryAnswer) -> Block:
-    packed = _download(cloud, str(answer.url)) if answer.samples is None else answer.samples
-    times_us, columns = questions.unpacked_samples(packed)
-    times = np.array(times_us, dtype=np.int64)
-    return Block(times, {name: column_of(column) for name, column in columns.items()})
-
-
-def _download(cloud: Cloud, url: str) -> bytes:
-    context = ssl.create_default_context(cafile=cloud.ca_bundle)
-    try:
-        with urllib.request.urlopen(  # noqa: S310 - signed by our own function
-            url, timeout=_DOWNLOAD_S, context=context
-        ) as response:
-            return bytes(response.read())
-    except OSError as error:
-        raise StationError(f"the result cannot be downloaded: {error}") from error

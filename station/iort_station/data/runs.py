@@ -36,8 +36,9 @@ from iort_contract.messages.page import Run, RunPart, RunsAnswer, RunState
 from iort_contract.tables import RECEIVED_MS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.accounts import SILENT_US, Account, last_of
 from iort_station.data.queries import has_fraction, query
-from iort_station.data.recorded import SILENT_US, Account, Recorded, last_of
+from iort_station.data.recorded import Recorded
 from iort_station.fleet import registry
 
 _READERS = 8

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from iort_contract.messages.account import StreamAccount
-from iort_station.data.recorded import SILENT_US, Account, accounts, last_of
+from iort_station.data.accounts import SILENT_US, Account, accounts, last_of
 from iort_station.operations.audit import Audit, RunAudit, Shortfall
 
 __all__ = ["accounts", "held_against", "in_car", "last_of", "without_lateness"]

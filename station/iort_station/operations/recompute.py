@@ -14,9 +14,9 @@ from iort_contract import tables
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import with_samples_between
 from iort_station.cloud import Cloud
-from iort_station.data import inventory, recorded
-from iort_station.data.recorded import Recorded
-from iort_station.data.selection import Selection
+from iort_station.data import inventory
+from iort_station.data.recorded import Recorded, Selection
+from iort_station.data.seconds import stored_seconds
 from iort_station.errors import StationError
 from iort_station.operations.quarantine import summarize
 
@@ -89,7 +89,7 @@ def _from(robot: str, stream: str, since_us: int | None) -> Selection:
 
 
 def _has_speed(cloud: Cloud, selection: Selection) -> bool:
-    pages = recorded.stored_seconds(cloud, selection)
+    pages = stored_seconds(cloud, selection)
     return any(name.startswith("speed") for items in pages for item in items for name in item)
 
 

@@ -20,8 +20,8 @@ from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Selection, bags, export, inventory, tabular
 from iort_station.data.bags import Recording, Write
+from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
-from iort_station.data.selection import derive
 from iort_station.errors import StationError
 from iort_station.page.requests import robot_of, text, whole
 from iort_station.page.server import Download

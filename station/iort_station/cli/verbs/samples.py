@@ -206,7 +206,7 @@ def export(
     from iort_station.data import bags  # noqa: PLC0415 - as above
     from iort_station.data.export import write  # noqa: PLC0415 - as above
     from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
-    from iort_station.data.selection import select  # noqa: PLC0415 - as above
+    from iort_station.data.recorded import select  # noqa: PLC0415 - as above
 
     kind = bags.KINDS.get(out.suffix)
     if kind is None:
@@ -312,7 +312,7 @@ def plot(
 
 def _read(cloud: Cloud, robot: str, stream: str, within: options.Range, **asked: Any) -> Any:
     from iort_station import data  # noqa: PLC0415 - as above
-    from iort_station.data.selection import derive  # noqa: PLC0415 - as above
+    from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
         result = data.query(cloud, robot, stream, within.start_us, within.end_us, progress=progress, **asked)

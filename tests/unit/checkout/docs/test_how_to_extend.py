@@ -164,11 +164,11 @@ def test_the_way_to_add_a_derived_field_works(deployed: Deployed) -> None:
     found = copy.show(
         f"values(derive({arrays}, None)['motor_power_w'])",
         "import numpy as np",
-        "from iort_station.data.selection import derive, values",
+        "from iort_station.data.conditions import derive, values",
     )
     assert found == [60.0, None]
     needs = "select('car', 'vesc', where='motor_power_w > 5').wanted()('duty_cycle')"
-    assert copy.show(needs, "from iort_station.data.selection import select") is True
+    assert copy.show(needs, "from iort_station.data.recorded import select") is True
     formula = "`duty_cycle * voltage_input * current_motor`"
     assert f"| {formula} |" in (copy.root / "docs/reference/fields.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()

@@ -29,7 +29,7 @@ from iort_contract.ros1.message import Messages, MessageType, RosType, cut
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import Export, write
-from iort_station.data.selection import select
+from iort_station.data.recorded import select
 from testkit.agent import ManualClock
 from testkit.dynamodb import TELEMETRY, item_of, item_of_message, serialize
 from testkit.ros1_types import HEADER, MESSAGES, Message, fields, header

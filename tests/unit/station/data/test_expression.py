@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from iort_contract import expression
 from iort_contract.expression import ExpressionError, MismatchError, parse
-from iort_station.data import selection
+from iort_station.data import conditions
 from iort_station.errors import StationError
 
 SAMPLES = {
@@ -32,7 +32,7 @@ def column(values):
 def both(text, samples=SAMPLES):
     node, n = parse(text), len(next(iter(samples.values())))
     lists = expression.holds(node, samples, n)
-    arrays = selection.holds(node, {name: column(values) for name, values in samples.items()}, n)
+    arrays = conditions.holds(node, {name: column(values) for name, values in samples.items()}, n)
     assert arrays.tolist() == lists
     return lists
 
@@ -135,7 +135,7 @@ def test_a_number_compared_with_a_text_is_an_error(text, said):
         expression.holds(node, samples, 4)
     assert said in str(in_the_cloud.value)
     with pytest.raises(StationError) as here:
-        selection.holds(node, {name: column(values) for name, values in samples.items()}, 4)
+        conditions.holds(node, {name: column(values) for name, values in samples.items()}, 4)
     assert str(here.value) == f"the condition cannot be evaluated: {in_the_cloud.value}"
 
 
@@ -190,9 +190,9 @@ def test_lists_and_arrays_agree_on_errors(text, rows):
         return
     except MismatchError:
         with pytest.raises(StationError):
-            selection.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
+            conditions.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
         return
-    arrays = selection.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
+    arrays = conditions.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
     assert arrays.tolist() == lists
 
 

@@ -24,8 +24,7 @@ from iort_contract.ros1.message import MessageType
 from iort_contract.topics import build_topic
 from iort_station import data
 from iort_station.cli.verbs import samples
-from iort_station.data import select
-from iort_station.data import selection as conditions
+from iort_station.data import conditions, select
 from iort_station.data.inventory import unit
 from iort_station.errors import StationError
 from testkit.dynamodb import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize

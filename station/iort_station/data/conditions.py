@@ -1,14 +1,8 @@
-"""A selection: which samples and fields of a stream a query asks for.
-
-Conditions and derived fields are evaluated over numpy columns, with the same results as
-`iort_contract.expression`.
-"""
+"""Conditions and derived fields over numpy columns, with the same results as `iort_contract.expression`."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,78 +11,8 @@ from numpy.typing import NDArray
 from iort_analysis.samples.blocks import Column, values
 from iort_contract import expression
 from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
-from iort_contract.expression import ExpressionError, MismatchError, Node
-from iort_contract.limits import ContractError
-from iort_contract.topics import check_robot, check_stream
-from iort_station.errors import StationError, UsageError
-from iort_station.times import Time, time_us
-
-
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """A stream's samples from ``start_us`` (inclusive) to ``end_us`` (exclusive) that meet a condition.
-
-    ``fields`` are the fields to return; None means all. ``where`` is the condition's text.
-    """
-
-    robot: str
-    stream: str
-    start_us: int | None = None
-    end_us: int | None = None
-    fields: tuple[str, ...] | None = None
-    where: str | None = None
-    condition: Node | None = field(default=None, repr=False)
-
-    def named(self) -> frozenset[str]:
-        """The fields that the selection names, in its list or in its condition."""
-        deciding = expression.names(self.condition) if self.condition is not None else frozenset()
-        return deciding.union(self.fields or ())
-
-    def wanted(self) -> Callable[[str], bool]:
-        """Which stored fields the answer needs."""
-        if self.fields is None:
-            return lambda _name: True
-        named = self.named()
-        return named.union(*(SOURCES[name] for name in named & SOURCES.keys())).__contains__
-
-    def holds_time(self, t_us: int) -> bool:
-        """Whether the range includes a time."""
-        return (self.start_us is None or self.start_us <= t_us) and (
-            self.end_us is None or t_us < self.end_us
-        )
-
-
-def select(
-    robot: str,
-    stream: str,
-    start: Time | None = None,
-    end: Time | None = None,
-    *,
-    fields: Sequence[str] | None = None,
-    where: str | None = None,
-) -> Selection:
-    """Make a selection from times and a condition as people write them; raises `UsageError`."""
-    now_us = time.time_ns() // 1000
-    try:
-        check_robot(robot)
-        check_stream(stream)
-        condition = expression.parse(where) if where is not None else None
-    except (ContractError, ExpressionError) as error:
-        raise UsageError(str(error)) from error
-    start_us = None if start is None else time_us(start, now_us)
-    end_us = None if end is None else time_us(end, now_us)
-    if start_us is not None and end_us is not None and start_us > end_us:
-        raise UsageError("the range ends before it starts")
-    return Selection(
-        robot=robot,
-        stream=stream,
-        start_us=start_us,
-        end_us=end_us,
-        fields=None if fields is None else tuple(dict.fromkeys(fields)),
-        where=where,
-        condition=condition,
-    )
-
+from iort_contract.expression import MismatchError, Node
+from iort_station.errors import StationError
 
 Columns: TypeAlias = Mapping[str, Column]
 
