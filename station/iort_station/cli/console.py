@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from rich import console
 from rich.json import JSON
@@ -22,6 +22,8 @@ from rich.segment import Segment
 from rich.text import Text
 
 from iort_station.output import one_line, visible
+
+_Row = TypeVar("_Row")
 
 
 class Lines:
@@ -70,9 +72,41 @@ def print_json(value: Any) -> None:
     out.print_json(json.dumps(value, default=_number))
 
 
-def tell(facts: Mapping[str, Any], text: str | Lines, *, as_json: bool) -> None:
-    """Print what a verb has done: a line of JSON for a script, or a text."""
-    out.print(json.dumps(facts, default=_number) if as_json else text, soft_wrap=True)
+def tell(
+    facts: Any, text: str | Lines | Callable[[], object], *, as_json: bool, indented: bool = False
+) -> None:
+    """Print what a verb has done or found: JSON for a script, in a line or ``indented``; or a text, or what a
+    function prints."""
+    if as_json and indented:
+        print_json(facts)
+    elif as_json:
+        out.print(json.dumps(facts, default=_number), soft_wrap=True)
+    elif callable(text):
+        text()
+    else:
+        out.print(text, soft_wrap=True)
+
+
+def listing(
+    rows: Iterable[_Row],
+    facts: Callable[[_Row], Mapping[str, Any]],
+    show: Callable[[_Row], object],
+    *,
+    as_json: bool,
+    none: str = "",
+) -> int:
+    """Print rows, as one list of JSON or each by ``show``, and return how many there are; ``none`` says on
+    standard error that there are none."""
+    count = 0
+    if as_json:
+        told = [facts(row) for row in rows]
+        print_json(told)
+        return len(told)
+    for count, row in enumerate(rows, 1):  # noqa: B007 - counts what may be an iterator
+        show(row)
+    if not count and none:
+        errors.print(none, soft_wrap=True)
+    return count
 
 
 def table(*head: str, left: Sequence[str] = (), title: str | None = None, wrap: bool = False) -> Table:

@@ -7,21 +7,19 @@ lost, or that still waits in the car."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
-from iort_analysis.archive.hours import key_of
 from iort_analysis.archive.stored import HEADER, Origin, only
 from iort_analysis.samples.batches import ATTRIBUTES, RefusedItems, part
-from iort_contract.archive import HASH, content_hash, item_hash
+from iort_contract.archive import HASH
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.checks import shown
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
-from iort_contract.tables import BATCH, ENVELOPE, PREVIOUS, RECEIVED_MS, SAMPLES
+from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.recorded import Recorded, summary_table, topic_of
 
@@ -292,22 +290,6 @@ def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
         return decode_batch(plain(found[0])) if found else None
     except ContractError:
         return None
-
-
-# What a stream's batches contain, as hashes that two deployments can compare.
-
-
-def hashes(
-    cloud: Cloud, robot: str, stream: str, first_us: int | None = None, last_us: int | None = None
-) -> dict[str, str]:
-    """For each run, the hash over its batches that start between two times, wherever they are stored."""
-    found: dict[str, list[tuple[str, str]]] = {}
-    for items in Recorded(cloud, robot, stream).items(starting_between(first_us, last_us), (*ENVELOPE, HASH)):
-        for item in items:
-            key = key_of(item)
-            with suppress(ContractError):
-                found.setdefault(batch_id(key).boot, []).append((key, item_hash(dict(item))))
-    return {boot: content_hash(batches) for boot, batches in found.items()}
 
 
 # Samples counted in the tables, stored and summarised.

@@ -14,7 +14,7 @@ from rich.text import Text
 from iort_contract.messages.page import AlarmEntry
 from iort_contract.tables import NO_ROBOT
 from iort_station.cli import options
-from iort_station.cli.console import Lines, bar, errors, out, print_json
+from iort_station.cli.console import Lines, bar, errors, listing, out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot, Range, When, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -54,13 +54,8 @@ def alarms_(
             raise StationError(f"alarm {acknowledge} is not raised; raised are: {names}")
         alarm["acknowledged"] = alarms.acknowledge(cloud, alarm["key"], alarm["since_s"], by)
         found = raised = [alarm]
-    shown = found if every else raised
-    if as_json:
-        print_json([_as_json(alarm) for alarm in shown])
-        return
-    for alarm in shown:
-        _print(alarm)
-    if not raised:
+    listing(found if every else raised, _as_json, _print, as_json=as_json)
+    if not raised and not as_json:
         options.say(f"none of {len(found)} alarms is raised")
 
 

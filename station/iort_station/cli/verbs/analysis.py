@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from datetime import timedelta
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -29,10 +30,9 @@ from iort_contract.messages.analysis import (
 )
 from iort_contract.page import history_link
 from iort_station.cli import options
-from iort_station.cli.console import errors, out, print_json, tell
+from iort_station.cli.console import errors, listing, out, tell
 from iort_station.cli.options import AsJson, Robot, When, argument, examples, option, ranged, say
 from iort_station.cloud import Cloud
-from iort_station.data import findings
 from iort_station.data import findings as stored
 from iort_station.errors import UsageError
 from iort_station.fleet import registry
@@ -81,13 +81,13 @@ def analyse(
     failed = [
         finding
         for robot in asked
-        for finding in findings.findings(cloud, robot, from_us, request.end_us)
+        for finding in stored.findings(cloud, robot, from_us, request.end_us)
         if finding.kind == ANALYSIS_FAILED and finding.to_us >= request.start_us
     ]
     facts = {"run": name, "drives": done.drives or 0, "failed": len(failed), "findings": done.findings}
     text = f"drives analysed: {done.drives or 0}, findings: {done.findings}"
     if not done.drives:
-        for line in _recorded(cloud, robots or findings.robots_of(cloud, None), request):
+        for line in _recorded(cloud, robots or stored.robots_of(cloud, None), request):
             say(line)
     for one in failed:
         say(f"{one.drive.robot}: {one.text}")
@@ -183,28 +183,20 @@ def findings_(
     cloud, within = context.obj.cloud(), when.range()
     if drives:
         analysed = stored.drives(cloud, robot, within.start_us, within.end_us, most=count)
-        if as_json:
-            print_json([_drive_as_json(one) for one in analysed])
-        for one in () if as_json else analysed:
-            _show_drive(one)
-        found: list[Any] = list(analysed)
+        none = "no drive in this range is analysed; `iort analyse` looks now"
+        count = listing(analysed, _drive_as_json, _show_drive, as_json=as_json, none=none)
     else:
         # The embedded cloud serves one.
         page = page or cloud.page or ""
         page += "/" if page and not page.endswith("/") else ""
         found = stored.findings(cloud, robot, within.start_us, within.end_us, most=count)
-        if as_json:
-            print_json([_as_json(one, page) for one in found])
-        for finding in () if as_json else found:
-            _show(finding, page)
-    if not found and robot is not None:
+        none = "nothing was found in this range; `iort analyse` looks now"
+        count = listing(found, partial(_as_json, page), partial(_show, page), as_json=as_json, none=none)
+    if not count and robot is not None:
         registry.get(cloud, robot)
-    if not found and not as_json:
-        what = "no drive in this range is analysed" if drives else "nothing was found in this range"
-        errors.print(f"{what}; `iort analyse` looks now")
 
 
-def _show(one: Finding, page: str) -> None:
+def _show(page: str, one: Finding) -> None:
     kind = KINDS.get(one.kind)
     out.print(
         Text.assemble(
@@ -229,7 +221,7 @@ def _show(one: Finding, page: str) -> None:
     out.print(Text(f" evidence {history_link(page, one)}"), soft_wrap=True)
 
 
-def _as_json(finding: Finding, page: str) -> dict[str, Any]:
+def _as_json(page: str, finding: Finding) -> dict[str, Any]:
     evidence = between({"from_us": finding.from_us, "to_us": finding.to_us})
     start = stamped("start", finding.drive.start_us)
     return {**encode_finding(finding), **start, **evidence, "link": history_link(page, finding)}
@@ -309,14 +301,14 @@ def note(
     else:
         registry.get(cloud, robot)
         found = stored.notes(cloud, robot, within.start_us, within.end_us, most=count)
-    if as_json:
-        print_json([_as_json_note(one) for one in found])
-        return
-    for one in found:
-        out.print(f"{iso_s(one.t_us)}  {one.id}  {one.by}: {one.text}", soft_wrap=True)
-    if not found:
-        errors.print(f"no notes about {robot} in this range")
+    none = f"no notes about {robot} in this range"
+    listing(found, _note_as_json, _show_note, as_json=as_json, none=none)
 
 
-def _as_json_note(one: Note) -> dict[str, object]:
-    return {"id": one.id, "robot": one.robot, **stamped("time", one.t_us), "by": one.by, "text": one.text}
+def _show_note(note: Note) -> None:
+    out.print(f"{iso_s(note.t_us)}  {note.id}  {note.by}: {note.text}", soft_wrap=True)
+
+
+def _note_as_json(note: Note) -> dict[str, object]:
+    about = {"id": note.id, "robot": note.robot, **stamped("time", note.t_us)}
+    return {**about, "by": note.by, "text": note.text}

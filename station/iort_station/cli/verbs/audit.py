@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -22,6 +21,7 @@ from iort_station.fleet import registry
 from iort_station.times import between_hours, duration_us, iso, iso_s, stamped
 
 if TYPE_CHECKING:
+    from iort_contract.messages.page import Archived
     from iort_station.cloud import Cloud
     from iort_station.operations.audit import Audit, RunAudit
 
@@ -49,9 +49,6 @@ def audit_(
     from_start: Annotated[
         bool, option("Count batches before the first stored one as missing.", "--from-start")
     ] = False,
-    hashes: Annotated[
-        bool, option("Also hash what each run recorded, to compare it with another cloud.", "--hashes")
-    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Prove that every sample of a robot arrived, for each of its streams and each run of its agent.
@@ -65,22 +62,19 @@ def audit_(
     within, late_us = when.range(), duration_us(late)
     cloud = context.obj.cloud()
     names = [robot] if robot else sorted(str(row[ROBOT]) for row in registry.listed(cloud))
-    audited = []
+    audited: dict[str, _Audited] = {}
     for name in names:
-        audited.append(_audit(cloud, name, within, streams, late_us, from_start=from_start))
-        if hashes:
-            audited[-1] = audited[-1].hashed(cloud, name, within)
+        audited[name] = _audit(cloud, name, within, streams, late_us, from_start=from_start)
         if not as_json:
             if every:
                 out.print(Text(name, "bold"))
-            _print(name, audited[-1])
-    if as_json and every:
-        print_json({"robots": {name: one.told() for name, one in zip(names, audited, strict=True)}})
-    elif as_json:
-        print_json(audited[0].told())
+            _print(name, audited[name])
+    if as_json:
+        told = {name: each.as_json() for name, each in audited.items()}
+        print_json({"robots": told} if every else told[names[0]])
     # A robot that never recorded has lost nothing, but is no proof of anything either.
-    judged = [one for one in audited if one.found] if every else audited
-    complete = sum(one.complete for one in judged)
+    judged = [each for each in audited.values() if each.streams or not every]
+    complete = sum(each.complete for each in judged)
     if every and not as_json:
         out.print(f"complete: {complete} of {len(judged)} robots with recordings")
     raise typer.Exit(0 if judged and complete == len(judged) else 1)
@@ -89,37 +83,30 @@ def audit_(
 class _Audited(NamedTuple):
     """A robot's streams, what its agent did not record by run and cause, and the hours of its archive."""
 
-    found: list[Audit]
+    streams: list[Audit]
     causes: dict[str, Any]
-    archive: Any
-    contents: Mapping[str, Mapping[str, str]] = {}
-
-    def hashed(self, cloud: Cloud, robot: str, within: Range) -> _Audited:
-        """With the hashes of each stream's runs."""
-        from iort_station.operations import audit  # noqa: PLC0415 - numpy, as below
-
-        with errors.status("reading contents"):
-            return self._replace(
-                contents={
-                    one.stream: audit.hashes(cloud, robot, one.stream, within.start_us, within.end_us)
-                    for one in self.found
-                }
-            )
+    archive: Archived | None
 
     @property
     def complete(self) -> bool:
-        return bool(self.found) and not self.causes and all(one.complete for one in self.found)
+        return bool(self.streams) and not self.causes and all(one.complete for one in self.streams)
 
-    def told(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         return {
-            "streams": [_as_json(one, self.contents.get(one.stream, {})) for one in self.found],
+            "streams": list(map(_as_json, self.streams)),
             "not_recorded": self.causes,
             "archive": self.archive and between_hours(self.archive),
         }
 
 
 def _audit(
-    cloud: Cloud, robot: str, within: Range, streams: list[str] | None, late_us: int, *, from_start: bool
+    cloud: Cloud,
+    robot: str,
+    within: Range,
+    streams: list[str] | None,
+    late_us: int,
+    *,
+    from_start: bool,
 ) -> _Audited:
     # numpy takes longer to load than TAB may take.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
@@ -133,7 +120,7 @@ def _audit(
     except ContractError as error:
         raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
-    found, archived, now_us = [], Origin(), time.time_ns() // 1000
+    audits, archived, now_us = list[Audit](), Origin(), time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
@@ -149,37 +136,32 @@ def _audit(
             if within == Range(None, None):
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
-                found.append(one)
+                audits.append(one)
                 archived.hours += origin.within(within.start_us, within.end_us).hours
-    waiting, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
-    in_car = accounts.in_car(waiting, found, told)
-    found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
+    waiting, dropped = (figures.get(name) for name in ("backlog_batches", "dropped_batches"))
+    in_car = accounts.in_car(None if waiting is None else int(waiting), audits, told)
+    dropped = None if dropped is None else int(dropped)
+    audits = [replace(one, in_car=in_car, dropped=dropped) for one in audits]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
-    for one in found if streams else ():
+    for one in audits if streams else ():
         if not (one.runs or one.refused or one.taken):
             inventory.check_there(cloud, robot, one.stream)
-    if not found:
+    if not audits:
         inventory.check_recorded(cloud, robot)
-    return _Audited(found, causes, archived.told())
+    return _Audited(audits, causes, archived.told())
 
 
 def _print(robot: str, audited: _Audited) -> None:
-    if not audited.found:
+    if not audited.streams:
         errors.print(f"this range holds nothing of {robot}")
-    for one in audited.found:
+    for one in audited.streams:
         _show(one)
-        for boot, content in audited.contents.get(one.stream, {}).items():
-            out.print(f"  run {boot[:8]}: hash {content[:16]}")
-    for boot, sources in audited.causes.items() if audited.found else ():
+    for boot, sources in audited.causes.items() if audited.streams else ():
         for source, counts in sources.items():
             out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
             for cause, count in counts.items():
                 out.print(f"  {count:,} {cause}")
     say_archived(audited.archive)
-
-
-def _count(value: float | None) -> int | None:
-    return None if value is None else int(value)
 
 
 def _counting(items: Any, name: str, status: Any) -> Any:
@@ -263,33 +245,25 @@ def _late(run: RunAudit) -> Lines:
     return Lines(f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else ""))
 
 
-def _as_json(one: Audit, contents: Mapping[str, str]) -> dict[str, Any]:
-    left_out = {"samples_of", "first_us", "last_us"}
-    runs = [
-        {
-            **{name: value for name, value in asdict(run).items() if name not in left_out},
-            **stamped("first", run.first_us),
-            **stamped("last", run.last_us),
-            "expected": run.expected,
-            **({"content": contents[run.boot]} if run.boot in contents else {}),
-            "missing_batches": sum(gap.batches for gap in run.missing),
-            "missing": [
-                {
-                    "first": gap.first,
-                    "last": gap.last,
-                    **stamped("after", gap.after_us),
-                    **stamped("before", gap.before_us),
-                }
-                for gap in run.missing
-            ],
-        }
-        for run in one.runs
-    ]
-    shortfalls = [short._asdict() for short in one.shortfalls]
-    return {
-        **asdict(one),
-        "runs": runs,
-        "shortfalls": shortfalls,
-        "missing": one.missing,
-        "complete": one.complete,
-    }
+def _as_json(audit: Audit) -> dict[str, Any]:
+    """With each run's times and gaps as JSON has them, and what follows from the counts."""
+    runs = []
+    for run in audit.runs:
+        facts = asdict(run)
+        for name in ("samples_of", "first_us", "last_us"):
+            del facts[name]
+        gaps = [
+            {
+                "first": gap.first,
+                "last": gap.last,
+                **stamped("after", gap.after_us),
+                **stamped("before", gap.before_us),
+            }
+            for gap in run.missing
+        ]
+        times = stamped("first", run.first_us) | stamped("last", run.last_us)
+        counts = {"expected": run.expected, "missing_batches": sum(gap.batches for gap in run.missing)}
+        runs.append(facts | times | counts | {"missing": gaps})
+    shortfalls = [short._asdict() for short in audit.shortfalls]
+    verdict = {"missing": audit.missing, "complete": audit.complete}
+    return {**asdict(audit), "runs": runs, "shortfalls": shortfalls, **verdict}

@@ -14,7 +14,7 @@ from botocore.exceptions import ClientError
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_station.cli import console, options
-from iort_station.cli.console import bar
+from iort_station.cli.console import bar, listing
 from iort_station.cli.options import AsJson, Force, Robot, When, Yes, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, unknown
@@ -39,14 +39,11 @@ def list_(
     The files of a robot that is no longer registered stay, and are listed.
     """
     listed = _chosen(context.obj.cloud(), robot, name, when.range())
-    if as_json:
-        console.print_json([_as_json(file) for file in listed])
-        return
-    file = None
-    for file in listed:
-        console.out.print(f"{iso_s(file.second * 1_000_000)}  {file.size:>15,}  {file.name}", soft_wrap=True)
-    if file is None:
-        console.errors.print("no matching files", soft_wrap=True)
+    listing(listed, _as_json, _show, as_json=as_json, none="no matching files")
+
+
+def _show(file: StoredFile) -> None:
+    console.out.print(f"{iso_s(file.second * 1_000_000)}  {file.size:>15,}  {file.name}", soft_wrap=True)
 
 
 @commands.command("get", epilog=examples("files get car7 --name '*.bag' --out bags"))
@@ -113,20 +110,17 @@ def _chosen(cloud: Cloud, robot: str, name: str, within: options.Range) -> Itera
         registry.get(cloud, robot)
 
 
-def _as_json(one: StoredFile) -> dict[str, Any]:
-    return {
-        "key": one.key,
-        "robot": one.robot,
-        "name": one.name,
-        "size": one.size,
-        **stamped("written", one.second * 1_000_000),
-        **stamped("stored", round(one.stored_s * 1e6)),
-    }
+def _as_json(file: StoredFile) -> dict[str, Any]:
+    written, stored = (
+        stamped("written", file.second * 1_000_000),
+        stamped("stored", round(file.stored_s * 1e6)),
+    )
+    return {"key": file.key, "robot": file.robot, "name": file.name, "size": file.size, **written, **stored}
 
 
-def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:
-    for one in reversed(found):
-        if which in (one.name, one.key):
-            return one
+def _newest(files: list[StoredFile], robot: str, which: str) -> StoredFile:
+    for file in reversed(files):
+        if which in (file.name, file.key):
+            return file
     problem = f"{robot} has no file {which} in this range"
-    raise unknown(problem, [which], (one.name for one in found), f"iort files list {robot}")
+    raise unknown(problem, [which], (file.name for file in files), f"iort files list {robot}")
