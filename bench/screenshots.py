@@ -1,4 +1,4 @@
-"""Takes the pictures in docs/images: `make screenshots`, or with --out and --only for a look.
+"""Takes the pictures in docs/images: `make screenshots`.
 
 On the embedded cloud: one real agent drives a simulated car through everything, and other cars are
 published to PubNub's stand-in as Lambda 1 would, so that there is a fleet to see, with a fault, a car that
@@ -6,18 +6,16 @@ is gone, poses and accelerations. A second agent drives a healthy car, for `iort
 
 from __future__ import annotations
 
-import argparse
 import io
 import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.proof.fleet import drive_of
@@ -36,15 +34,13 @@ from iort_station.data import findings
 from iort_station.data.runs import laps_of_runs, runs
 from iort_station.fleet import robots
 from iort_station.kept import CLOUD
-from iort_station.page import answers as control
-from iort_station.page.answers import actions, answers
+from iort_station.page.answers import actions, answers, keyed_actions
 from iort_station.page.history import downloads
 from iort_station.page.server import PageServer
 from iort_station.times import iso
 from local.cloud import EmbeddedCloud
 from testkit import ROOT, chromium
 from testkit.car import AgentProcess
-from testkit.waiting import InstrumentError
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100
@@ -65,44 +61,30 @@ VIEWS = {
     "alarms": "#/alarms",
     "cloudwatch": "#/cloudwatch",
 }
-PLOT = "plot"
 _PLOTTED = "speed_mps,current_motor,voltage_input"
 _FILL_S = 65.0
 _SETTLE_MS = 4_000
 # The laps of a whole run, beside everything else.
 _LAPS_MS = 90_000
 
-Theme = Literal["dark", "light"]
-
 
 def main() -> None:
     """Drive, look, and write one picture a view, theme and width; and what `iort plot` draws."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--only", choices=[*VIEWS, PLOT], nargs="*", default=[*VIEWS, PLOT])
-    options = parser.parse_args()
-    try:
-        _take(options.only, options.out)
-    except InstrumentError as error:
-        sys.exit(f"screenshots: {error}")
-
-
-def _take(views: Sequence[str], out: Path) -> None:
     with ExitStack() as stack:
         # Open the browser first: without it nothing else is needed.
         browser = stack.enter_context(chromium.opened())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        cloud = stack.enter_context(EmbeddedCloud(folder / "local"))
-        stack.enter_context(_driving(cloud, folder))
-        vehicles = {f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 2)}
+        embedded = stack.enter_context(EmbeddedCloud(folder / "local"))
+        cloud = embedded.cloud
+        stack.enter_context(_driving(embedded, folder))
         server = PageServer(
             namespace=cloud.namespace,
-            **cloud.keys.reading(),
-            vehicles=vehicles,
-            answers=answers(cloud.cloud),
-            downloads=downloads(cloud.cloud),
-            open_actions=actions(cloud.cloud),
-            actions=control.keyed_actions(cloud.cloud),
+            **embedded.keys.reading(),
+            vehicles={f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 2)},
+            answers=answers(cloud),
+            downloads=downloads(cloud),
+            open_actions=actions(cloud),
+            actions=keyed_actions(cloud),
         )
         stack.enter_context(server)
         pages = {
@@ -111,23 +93,17 @@ def _take(views: Sequence[str], out: Path) -> None:
         }
         # Wait until the charts are full and CloudWatch has a minute of metrics.
         threading.Event().wait(_FILL_S)
-        if "insights" in views:
-            _analyse(cloud.cloud)
-        if PLOT in views:
-            _plot(folder / "local" / CLOUD, out / "plot.png")
-        addresses = {**VIEWS, "compare": _compared(cloud.cloud)}
-        for view in views:
-            if view == PLOT:
-                continue
-            on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
-            looks: list[tuple[str, str, Theme]] = [
+        _analyse(cloud)
+        _plot(folder / "local" / CLOUD)
+        for view, address in {**VIEWS, "compare": _compared(cloud)}.items():
+            on_phone = "light" if view in {"car", "cloudwatch"} else "dark"
+            for name, device, theme in (
                 ("dark", "laptop", "dark"),
                 ("light", "laptop", "light"),
                 ("phone", "phone", on_phone),
-            ]
-            for name, device, theme in looks:
-                _look(pages[device], server.url + addresses[view], theme)
-                _write(out / f"{view}-{name}.webp", pages[device].screenshot())
+            ):
+                _look(pages[device], server.url + address, theme)
+                _write(OUT / f"{view}-{name}.webp", pages[device].screenshot())
 
 
 def _page(browser: Any, url: str, size: tuple[int, int], *, ratio: int) -> Any:
@@ -139,7 +115,7 @@ def _page(browser: Any, url: str, size: tuple[int, int], *, ratio: int) -> Any:
     return page
 
 
-def _look(page: Any, address: str, theme: Theme) -> None:
+def _look(page: Any, address: str, theme: str) -> None:
     """Open another view of the same page, which keeps its data."""
     page.emulate_media(color_scheme=theme)
     page.goto(address)
@@ -241,19 +217,12 @@ def _compared(cloud: Cloud) -> str:
     return f"#/compare?runs={','.join(parts)}&stream={VESC_STREAM}&x=distance"
 
 
-def _plot(cloud: Path, out: Path) -> None:
+def _plot(cloud: Path) -> None:
     """Have `iort plot` draw the two real cars."""
-    command: list[str | Path] = [
-        Path(sys.executable).with_name("iort"),
-        "--embedded",
-        cloud,
-        "plot",
-        _HEALTHY,
-        VESC_STREAM,
-    ]
-    subprocess.run(
-        [*command, "--with", _REAL, "--last", "1m", "--fields", _PLOTTED, "--force", "--out", out], check=True
-    )
+    iort = str(Path(sys.executable).with_name("iort"))
+    what = ["plot", _HEALTHY, VESC_STREAM, "--with", _REAL, "--last", "1m", "--fields", _PLOTTED]
+    out = ["--force", "--out", str(OUT / "plot.png")]
+    subprocess.run([iort, "--embedded", str(cloud), *what, *out], check=True)
 
 
 def _write(path: Path, png: bytes) -> None:
@@ -265,6 +234,4 @@ def _write(path: Path, png: bytes) -> None:
 
 
 if __name__ == "__main__":
-    began = time.monotonic()
     main()
-    print(f"done in {time.monotonic() - began:.0f} s")

@@ -13,11 +13,11 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.load.course import LEASE_S, ROBOT, Course, Heard, Try
+from bench.load.course import LEASE_S, ROBOT, Course, Try
 from bench.report import Report, Section
 from bench.sections import Declared, Option
 from local.figures import Spread
@@ -36,22 +36,6 @@ _HOLDS, _VOID = 60, 3
 _SEEN_S = 1.0
 Failed = tuple[float, Callable[[], None]]
 _DRIVEN_S, _PAUSE_S, _START_MS = 0.3, 0.7, 60_000
-
-
-@dataclass(frozen=True)
-class Stops:
-    """The tries of one failure.
-
-    ``within`` counts those whose stop came within the lease of the last command that moved the car, with no
-    motion after it. ``after_ms`` is from the failure to the stop. ``latest_ms`` is the longest time to a
-    stop, from the failure or from the last command that moved the car, whichever was later.
-    """
-
-    failure: str
-    tries: int
-    within: int
-    after_ms: Spread
-    latest_ms: float
 
 
 class Driver:
@@ -189,42 +173,29 @@ FAILURES: dict[str, Callable[[Driver], Failed]] = {
 }
 
 
-def _stops(
-    driver: Driver, failure: str, tries: int, progress: Callable[[str], None]
-) -> tuple[Stops, list[Try]]:
-    """The figures of all tries, and those that failed."""
-    course = driver.course
-    done: list[Try] = []
+def _tries(driver: Driver, failure: str, tries: int, say: Say) -> list[Try]:
+    """So many tries of a failure. Raises `InstrumentError` where the car stood too often when it came."""
+    course, done = driver.course, list[Try]()
     for _ in range(tries * _VOID):
         driver.drive()
         began = time.monotonic() - _SEEN_S
         failed_at, again = FAILURES[failure](driver)
-        failed = Heard(failed_at, time.time() - (time.monotonic() - failed_at), 0.0)
         with suppress(InstrumentError):
             course.wait(failed_at, moving=False, within_s=LEASE_S * 6)
             course.quiet(LEASE_S)
-        heard = [one for one in course.heard if one.at >= began]
+        each = Try(failed_at, [heard for heard in course.heard if heard.at >= began])
         again()
         with suppress(Exception):  # a page that is closed or still frozen has no keys
             driver.release()
-        one = Try(failure, len(done) + 1, failed, heard, LEASE_S)
-        if not one.driven:
-            progress(f"{failure}: the car stood when it came: no try")
+        if not each.driven:
+            say(f"{failure}: the car stood when it came: no try")
             continue
-        done.append(one)
-        within = sum(not each.why for each in done)
-        progress(f"{failure}: {within} of {len(done)}" + (f": {one.why}" if one.why else ""))
+        done.append(each)
+        good = sum(not one.why for one in done)
+        say(f"{failure}: {good} of {len(done)}" + (f": {each.why}" if each.why else ""))
         if len(done) == tries:
-            break
-    else:
-        raise InstrumentError(
-            f"{failure}: the car stood in {tries * _VOID - len(done)} of {tries * _VOID} tries"
-        )
-    after_ms = [(one.first.at - one.failed.at) * 1000 for one in done if one.first is not None]
-    latest_s = max((one.late_s for one in done if one.late_s is not None), default=0.0)
-    missed = [one for one in done if one.why]
-    spread = Spread.of(after_ms)
-    return Stops(failure, tries, tries - len(missed), spread, round(latest_s * 1000, 1)), missed
+            return done
+    raise InstrumentError(f"{failure}: the car stood in too many of {tries * _VOID} tries")
 
 
 def run(_target: Target | None, say: Say, *, tries: int, presses: int, part: str) -> Section:
@@ -244,22 +215,22 @@ def run(_target: Target | None, say: Say, *, tries: int, presses: int, part: str
     ):
         driver = Driver(course, tabs, play.chromium)
         say(f"{presses} key presses")
-        press_ms, stops = _press_ms(driver, presses), list[Stops]()
-        for failure in [part] if part else FAILURES:
-            each, missed = _stops(driver, failure, tries, say)
-            stops.append(each)
-            for one in missed:
-                story = "; ".join(one.lines(course.cloud, ROBOT))
-                section.notes.append(f"Try {one.number} of {one.failure}: {story}")
+        press_ms = _press_ms(driver, presses)
+        done = {failure: _tries(driver, failure, tries, say) for failure in ([part] if part else FAILURES)}
     rows = [["key press to command at the ROS subscriber", press_ms.text(0), ""]]
-    for each in stops:
-        after = f"{each.after_ms.text(0)}, at most {each.latest_ms:.0f}"
-        rows.append([f"stop, {each.failure}", f"{each.within} of {each.tries}", after])
-        late = each.tries - each.within
-        section.ratio(f"{each.failure}: stops after the lease", late, 0, unit=f"of {each.tries}")
+    for failure, of_failure in done.items():
+        stopped = [one.first.at - one.failed_at for one in of_failure if one.first is not None]
+        after = Spread.of([seconds * 1000 for seconds in stopped])
+        latest_ms = max((one.late_s for one in of_failure if one.late_s is not None), default=0.0) * 1000
+        missed = [one for one in of_failure if one.why]
+        stops = f"{tries - len(missed)} of {tries}"
+        rows.append([f"stop, {failure}", stops, f"{after.text(0)}, at most {latest_ms:.0f}"])
+        section.ratio(f"{failure}: stops after the lease", len(missed), 0, unit=f"of {tries}")
+        section.notes += [f"{failure}: {one.story()}" for one in missed]
+        section.raw[failure] = {"after_ms": asdict(after), "latest_ms": latest_ms}
     lease = f"stop after, lease {LEASE_S * 1000:.0f} ms"
     section.table("Driving by hand", ["figure", "measured", lease], rows)
-    section.raw = {"press_ms": asdict(press_ms), "stops": [asdict(one) for one in stops]}
+    section.raw["press_ms"] = asdict(press_ms)
     return section
 
 

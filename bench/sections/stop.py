@@ -11,7 +11,7 @@ from __future__ import annotations
 import http.client
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, cast
@@ -21,9 +21,8 @@ from typing_extensions import Self
 from bench.report import Report, Section
 from bench.sections import Declared, Option
 from iort_station.fleet import stopping
-from iort_station.page import answers as control
 from iort_station.page import motion
-from iort_station.page.answers import actions, answers
+from iort_station.page.answers import actions, answers, keyed_actions
 from iort_station.page.requests import Handler
 from iort_station.page.server import PageServer
 from local.figures import Spread
@@ -75,7 +74,7 @@ class Course:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(AgentProcess(self._target.robot(_ROBOT), drain_s=0.0))
-            keyed = control.keyed_actions(self.cloud)
+            keyed = keyed_actions(self.cloud)
             self.server = stack.enter_context(
                 PageServer(
                     namespace=self.cloud.namespace,
@@ -134,28 +133,23 @@ def _past(server: PageServer) -> str:
     return f"{server.url}#/compare?runs={','.join(ranges)}"
 
 
-def _press(course: Course, page: Page, tries: int, progress: Callable[[str], None]) -> dict[str, list[float]]:
-    took: dict[str, list[float]] = {"taken": [], "answered": [], "shown": []}
-    for number in range(tries):
-        before = len(course.answered_ms)
-        page.locator(".stop-press").click()
-        until(lambda known=before: len(course.answered_ms) > known, "the answer", _START_S)  # type: ignore[misc]  # bound now
-        # Not playwright's own waiting: the page's policy forbids what that evaluates.
-        until(lambda: page.evaluate("window.shown_ms !== undefined"), "the car's word", _START_S)
-        pressed = float(page.evaluate("pressed_ms"))
-        took["taken"].append(course.taken_ms[-1] - pressed)
-        took["answered"].append(course.answered_ms[-1] - pressed)
-        took["shown"].append(float(page.evaluate("shown_ms")) - pressed)
-        progress(
-            f"{number + 1}: " + ", ".join(f"{name} {values[-1]:.0f} ms" for name, values in took.items())
-        )
-        course.release()
-        page.locator(".stop-stands").wait_for(state="hidden", timeout=_START_S * 1000)
-    return took
+def _press(course: Course, page: Page) -> dict[str, float]:
+    """Press stop once, and let the car move again; the milliseconds until each of `_WORDS`."""
+    before = len(course.answered_ms)
+    page.locator(".stop-press").click()
+    until(lambda: len(course.answered_ms) > before, "the answer", _START_S)
+    # Not playwright's own waiting: the page's policy forbids what that evaluates.
+    until(lambda: page.evaluate("window.shown_ms !== undefined"), "the car's word", _START_S)
+    pressed, shown = (float(page.evaluate(name)) for name in ("pressed_ms", "shown_ms"))
+    course.release()
+    page.locator(".stop-stands").wait_for(state="hidden", timeout=_START_S * 1000)
+    times = {"taken": course.taken_ms[before], "answered": course.answered_ms[before], "shown": shown}
+    return {name: ms - pressed for name, ms in times.items()}
 
 
 def run(target: Target, say: Say, *, tries: int) -> Section:
     """Press stop so often while everything else is overloaded."""
+    took: dict[str, list[float]] = {name: [] for name in _WORDS}
     with chromium.opened() as browser, Course(target) as course:
         until(course.ready, "the car", _START_S)
         context = browser.new_context()
@@ -167,28 +161,19 @@ def run(target: Target, say: Say, *, tries: int) -> Section:
         course.overload()
         page.bring_to_front()
         page.evaluate(_WATCH, _ROBOT)
-        took = _press(course, page, tries, say)
-    section = Section("stop", "Stop under full overload")
-    section.table(
-        f"{tries} presses",
-        ["from the press until", f"within {WITHIN_MS} ms", "ms"],
-        [
-            [
-                what,
-                f"{_within(took[name])} of {tries}",
-                f"{Spread.of(took[name]).text(0)}, at most {max(took[name]):.0f}",
-            ]
-            for name, what in _WORDS.items()
-        ],
-    )
-    late = tries - _within(took["taken"])
+        for number in range(1, tries + 1):
+            for name, ms in _press(course, page).items():
+                took[name].append(ms)
+            say(f"{number}: " + ", ".join(f"{name} {values[-1]:.0f} ms" for name, values in took.items()))
+    section, rows = Section("stop", "Stop under full overload"), []
+    for name, values in took.items():
+        within = f"{sum(value <= WITHIN_MS for value in values)} of {tries}"
+        rows.append([_WORDS[name], within, f"{Spread.of(values).text(0)}, at most {max(values):.0f}"])
+        section.raw[name] = {**asdict(Spread.of(values)), "most": max(values)}
+    section.table(f"{tries} presses", ["from the press until", f"within {WITHIN_MS} ms", "ms"], rows)
+    late = sum(value > WITHIN_MS for value in took["taken"])
     section.ratio(f"stops that the server took after {WITHIN_MS} ms", late, 0, unit=f"of {tries}")
-    section.raw = {name: {**asdict(Spread.of(values)), "most": max(values)} for name, values in took.items()}
     return section
-
-
-def _within(values: list[float]) -> int:
-    return sum(value <= WITHIN_MS for value in values)
 
 
 SECTION = Declared(

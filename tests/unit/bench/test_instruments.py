@@ -43,7 +43,7 @@ def test_a_lap_has_every_sample_of_its_second():
 
 def tried(*heard: tuple[float, float]) -> Try:
     """The failure is at 10 s; each message is a time and a speed."""
-    return Try("x", 1, Heard(10.0, 0.0, 0.0), [Heard(at, 0.0, speed) for at, speed in heard], lease_s=0.5)
+    return Try(10.0, [Heard(at, 0.0, speed) for at, speed in heard])
 
 
 @pytest.mark.parametrize(
