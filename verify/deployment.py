@@ -26,8 +26,6 @@ from verify.questions.identity import POLICY
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
-
-_POLL_S = 10.0
 # cdk.json may say otherwise for the operator's own deployment: what must go again keeps nothing.
 _OF_ITS_OWN = {
     "stage": DEV,
@@ -58,13 +56,7 @@ class Deployment:
     """The project's stacks under a namespace of their own; the CDK's logs go into ``folder``."""
 
     def __init__(
-        self,
-        cloud: Cloud,
-        folder: Path,
-        say: Say,
-        *,
-        run: Callable[..., None] = run,
-        poll_s: float = _POLL_S,
+        self, cloud: Cloud, folder: Path, say: Say, *, run: Callable[..., None] = run, poll_s: float = 10.0
     ) -> None:
         self._cloud, self._folder, self._say = cloud, folder, say
         self._run, self._poll_s = run, poll_s
@@ -93,18 +85,14 @@ class Deployment:
 
     def _wait(self) -> None:
         """CloudFormation goes on after the CDK was ended, and deletes no stack that it is changing."""
-        until(
-            lambda: not any(map(self._is_changing, STACKS)),
-            "the end of CloudFormation's work",
-            within_s=_DEPLOY_S,
-            poll_s=self._poll_s,
-        )
 
-    def _is_changing(self, noun: str) -> bool:
-        found = self._stack(noun)
-        status = "" if found is None else str(found["StackStatus"])
-        # A change set that was never executed: such a stack is empty.
-        return status.endswith("IN_PROGRESS") and status != "REVIEW_IN_PROGRESS"
+        def changing(noun: str) -> bool:
+            status = str((self._stack(noun) or {}).get("StackStatus", ""))
+            # A change set that was never executed: such a stack is empty.
+            return status.endswith("IN_PROGRESS") and status != "REVIEW_IN_PROGRESS"
+
+        what, most = "the end of CloudFormation's work", _DEPLOY_S
+        until(lambda: not any(map(changing, STACKS)), what, within_s=most, poll_s=self._poll_s)
 
     def _stack(self, noun: str) -> Mapping[str, Any] | None:
         return stack(self._cloud, f"{self._cloud.namespace}-{noun}")

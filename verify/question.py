@@ -53,9 +53,9 @@ class Verdict(enum.Enum):
 class Question:
     """One behaviour of AWS that the code relies on, and how a deployment is asked about it.
 
-    ``name`` is ``subject.detail``; ``assumed`` is one to three sentences; ``relied_on_by`` are files of the
-    repository. ``source`` names AWS' page; "" means that AWS does not document the behaviour. ``expected`` is
-    the assumption as JSON values. ``not_embedded`` says why the embedded cloud cannot be asked; "" if it can.
+    ``name`` is ``subject.detail``; ``assumed`` is one to three sentences. ``source`` names AWS' page; ""
+    means that AWS does not document the behaviour. ``expected`` is the assumption as JSON values.
+    ``not_embedded`` says why the embedded cloud cannot be asked; "" if it can.
 
     ``ask`` returns the answer in the form of ``expected``, without secrets and without names or times that
     change between runs; keys that begin with `NOTE` are not compared. It raises `CannotAskError` if it cannot
@@ -65,7 +65,6 @@ class Question:
     name: str
     assumed: str
     expected: Seen
-    relied_on_by: tuple[str, ...]
     ask: Ask
     source: str = ""
     phase: str = FIRST
@@ -77,25 +76,15 @@ class Question:
         return self.name.partition(".")[0]
 
 
-def question(
-    name: str, *, expected: Seen, code: str, aws: str = "", phase: str = FIRST, not_embedded: str = ""
-) -> Callable[[Ask], Question]:
+def question(name: str, *, expected: Seen, aws: str = "", **more: str) -> Callable[[Ask], Question]:
     """Make a question of the function that asks it; the function's docstring is the assumption.
 
-    ``code`` are the files that rely on it and ``aws`` the pages that document it, with spaces between.
+    ``aws`` are the pages that document it, with spaces between.
     """
 
     def decorate(ask: Ask) -> Question:
-        return Question(
-            name=name,
-            assumed=" ".join((ask.__doc__ or "").split()),
-            expected=expected,
-            relied_on_by=tuple(code.split()),
-            ask=ask,
-            source=pages(aws),
-            phase=phase,
-            not_embedded=not_embedded,
-        )
+        assumed = " ".join((ask.__doc__ or "").split())
+        return Question(name=name, assumed=assumed, expected=expected, ask=ask, source=pages(aws), **more)
 
     return decorate
 
@@ -135,19 +124,19 @@ def ask(
         return Answer(question=question, verdict=Verdict.NOT_ASKED, reason=question.not_embedded)
     began = clock()
 
-    def ended(verdict: Verdict, reason: str) -> Answer:
-        return Answer(question=question, verdict=verdict, reason=reason, took_s=clock() - began)
+    def ended(verdict: Verdict, **more: Any) -> Answer:
+        return Answer(question=question, verdict=verdict, took_s=clock() - began, **more)
 
     try:
         with Lab(target) as lab:
             seen = json.loads(json.dumps(question.ask(lab)))
     except CannotAskError as error:
-        return ended(Verdict.NOT_ASKED, str(error))
+        return ended(Verdict.NOT_ASKED, reason=str(error))
     except Exception as error:  # noqa: BLE001 - an answer of another form is one too, and the next are asked
-        return ended(Verdict.FAILED, f"{type(error).__name__}: {error}")
+        return ended(Verdict.FAILED, reason=f"{type(error).__name__}: {error}")
     expected = question.expected if expected is None else expected
-    verdict = Verdict.AS_ASSUMED if compared(seen) == compared(expected) else Verdict.DIFFERS
-    return Answer(question=question, verdict=verdict, expected=expected, seen=seen, took_s=clock() - began)
+    same = compared(seen) == compared(expected)
+    return ended(Verdict.AS_ASSUMED if same else Verdict.DIFFERS, expected=expected, seen=seen)
 
 
 def compared(answer: Seen) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from iort_station.cloud import Cloud
-from iort_station.cost.prices import AS_OF
 from iort_station.errors import StationError
 from local.deployment import ROOT
 from local.processes import LocalError
@@ -42,6 +41,8 @@ from verify.questions import ALL
 from verify.questions.live import keys_lent
 
 OUT = ROOT / "build" / "verify"
+# Of all questions, at the list prices of 2026; alarms and metrics are most of it.
+DOLLARS = 0.26
 _STYLES = {
     Verdict.AS_ASSUMED: "green",
     Verdict.DIFFERS: "red",
@@ -65,26 +66,22 @@ def main() -> None:
 
 def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Deployment | None = None) -> int:
     """Return the exit status; ``cloud`` and ``deployment`` replace those made from the options."""
-    console = Console()
-    began = time.monotonic()
+    console, began = Console(), time.monotonic()
 
     def say(text: str) -> None:
         # A terminal that has gone must not end the putting back.
         with suppress(OSError):
-            console.print(
-                f"{time.monotonic() - began:6.1f} s    {escape(text)}", highlight=False, style="dim"
-            )
+            seconds = time.monotonic() - began
+            console.print(f"{seconds:6.1f} s    {escape(text)}", highlight=False, style="dim")
 
     answers: list[Answer] = []
-    region = ""
-    leftovers: list[str] = []
-    findings: list[str] = []
+    region, leftovers, findings = "", list[str](), list[str]()
     with wound_up(console) as putting_back:
         if options.target == AWS:
             cloud = (cloud or Cloud(namespace=options.namespace)).check()
             options.out.mkdir(parents=True, exist_ok=True)
             deployment = deployment or Deployment(cloud, options.out, say)
-            findings.extend(_looked(cloud, console))
+            findings = _looked(cloud, console)
             if not options.yes:
                 confirm(console, _announced(cloud), InstrumentError)
         try:
@@ -122,16 +119,12 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                     left_over=leftovers,
                 )
                 report.write(options.out, described, answers)
-            with suppress(OSError):
-                for line in leftovers:
-                    console.print(f"left over: {line}", style="red", markup=False)
-    console.print(f"{report.summary(answers)}: {options.out / 'report.md'}", highlight=False)
+            for line in leftovers:
+                say(f"left over: {line}")
+    say(f"{report.summary(answers)}: {options.out / 'report.md'}")
     if options.keep:
         shutil.copyfile(options.out / "report.json", report.KEPT)
-        console.print(
-            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.report` writes "
-            "docs/explanation/assumptions.md"
-        )
+        say(f"kept in {report.KEPT}: `python -m verify.report` writes docs/explanation/assumptions.md")
     verdicts = {answer.verdict for answer in answers}
     return 2 if Verdict.FAILED in verdicts or leftovers else int(Verdict.DIFFERS in verdicts)
 
@@ -148,29 +141,29 @@ def _asked(questions: Sequence[Question], phase: str, target: Target, console: C
             f"[{_STYLES[answer.verdict]}]{answer.verdict.value}[/]  {answer.took_s:.1f} s",
             highlight=False,
         )
-        for key, want, got in report.differences(answer) if answer.verdict is Verdict.DIFFERS else ():
-            console.print(report.redacted(f"      {key}: expected {want}, got {got}"), markup=False)
-        if answer.reason:
-            console.print(report.redacted(f"      {answer.reason}"), markup=False)
+        lines = [answer.reason] if answer.reason else []
+        if answer.verdict is Verdict.DIFFERS:
+            lines = [f"{key}: expected {want}, got {got}" for key, want, got in report.differences(answer)]
+        for line in lines:
+            console.print(report.redacted(f"      {line}"), markup=False)
         yield answer
 
 
 def _looked(cloud: Cloud, console: Console) -> list[str]:
     """The preflight's lines for the report. Raises `InstrumentError` if the deployment would fail."""
-    found = preflight.look(cloud, Settings(namespace=cloud.namespace))
-    lines = list(map(str, found))
-    for text in lines:
-        console.print(report.redacted(text), markup=False, highlight=False)
-    if preflight.stopped(found):
+    findings = preflight.look(cloud, Settings(namespace=cloud.namespace))
+    lines = list(map(str, findings))
+    console.print(report.redacted("\n".join(lines)), markup=False, highlight=False)
+    if preflight.stopped(findings):
         raise InstrumentError("nothing was created: the preflight says what to do")
     return lines
 
 
 def _announced(cloud: Cloud) -> str:
     return (
-        f"This takes about an hour and costs {report.told(report.estimate())} at the list prices of "
-        f"{AS_OF}. It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with "
-        "all their data. A key of the account's own is scheduled for deletion, which AWS does not charge for."
+        f"This takes about an hour and costs about ${DOLLARS:.2f} at list prices. It creates the stacks of "
+        f"namespace {cloud.namespace}, asks them, and removes them with all their data. A key of the "
+        "account's own is scheduled for deletion, which AWS does not charge for."
     )
 
 

@@ -1,6 +1,6 @@
 """Checks an account for causes of a failed deployment, beforehand and read-only.
 
-    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json | --derive [--unchecked]]
+    python -m verify.preflight [-c key=value ...] [--profile NAME] [--derive [--unchecked]]
 
 It reads settings like app.py, takes from the account those that are not given, and ignores other options of
 the CDK. Exit status 1 means that the deployment would fail. `make deploy` runs it first, and hands to the
@@ -14,7 +14,6 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from iort_contract.limits import ContractError
@@ -42,17 +41,11 @@ def stopped(findings: Sequence[Finding]) -> bool:
     return any(finding.verdict is Verdict.STOPS for finding in findings)
 
 
-def as_json(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """The findings in the report's form."""
-    return [{**asdict(finding), "verdict": finding.verdict.value} for finding in findings]
-
-
 def options(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the command line; `make deploy` passes ARGS both to the CDK and to this."""
     parser = argparse.ArgumentParser(prog="verify.preflight", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-c", "--context", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--profile", help="profile of the AWS configuration")
-    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument(
         "--derive", action="store_true", help="print the CDK's arguments for what the account decides"
     )
@@ -72,9 +65,8 @@ def show(findings: Sequence[Finding], console: Console) -> None:
     """Print one line per finding, and below it the remedy."""
     for finding in findings:
         style = _STYLES[finding.verdict]
-        console.print(
-            f"{finding.verdict.value:8} {finding.item}: {finding.found}", style=style, soft_wrap=True
-        )
+        text = f"{finding.verdict.value:8} {finding.item}: {finding.found}"
+        console.print(text, style=style, soft_wrap=True)
         if finding.do:
             console.print(f"{'':8} -> {finding.do}", soft_wrap=True)
 
@@ -90,10 +82,7 @@ def main() -> None:
     except (ContractError, SettingsError) as error:
         sys.exit(f"preflight: {error}")
     findings = [] if asked.unchecked else look(clients, settings)
-    if asked.json:
-        sys.stdout.write(json.dumps(as_json(findings), indent=2) + "\n")
-    else:
-        show(findings, Console(file=sys.stderr if asked.derive else sys.stdout))
+    show(findings, Console(file=sys.stderr if asked.derive else sys.stdout))
     if asked.derive:
         derived = " ".join(f"-c {key}={value}" for key, value in answers.items())
         sys.stderr.write(f"by the account: {derived or 'nothing'}\n")

@@ -14,7 +14,7 @@ from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import UNRESERVED, Settings
 from verify.preflight.deployed import resources
-from verify.preflight.finding import Clients, Found, fine, item, known, listed, stops, warning
+from verify.preflight.finding import Clients, Finding, fine, item, known, listed, stops, warning
 
 # The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
 # manifest.
@@ -35,8 +35,8 @@ QUOTAS = {
 CONNECTS_QUOTA = "Connect requests per second per account"
 
 
-@item("credentials", "sts GetCallerIdentity")
-def credentials(clients: Clients, _settings: Settings) -> Found:
+@item("credentials")
+def credentials(clients: Clients, _settings: Settings) -> Finding:
     """Check the credentials and the region."""
     try:
         sts = clients.client("sts")
@@ -48,8 +48,8 @@ def credentials(clients: Clients, _settings: Settings) -> Found:
     return fine(f"account {answer['Account']}, region {sts.meta.region_name}, as {answer['Arn']}")
 
 
-@item("bootstrap", f"ssm GetParameter {BOOTSTRAP_PARAMETER}")
-def bootstrap(clients: Clients, _settings: Settings) -> Found:
+@item("bootstrap")
+def bootstrap(clients: Clients, _settings: Settings) -> Finding:
     """Check that the CDK's bootstrap stack exists, and is new enough for our templates."""
     ssm = clients.client("ssm")
     answer = known("ParameterNotFound", ssm.get_parameter, Name=BOOTSTRAP_PARAMETER)
@@ -61,8 +61,8 @@ def bootstrap(clients: Clients, _settings: Settings) -> Found:
     return fine(f"version {version}, needed is {BOOTSTRAP}")
 
 
-@item("AWS IoT's log", "iot GetV2LoggingOptions")
-def iot_log(clients: Clients, settings: Settings) -> Found:
+@item("AWS IoT's log")
+def iot_log(clients: Clients, settings: Settings) -> Finding:
     """Check that the region's one setting is free if `iort_log_level` needs it."""
     options = known("NotConfiguredException", clients.client("iot").get_v2_logging_options) or {}
     # CloudFormation's handler treats a disabled log as free.
@@ -74,8 +74,8 @@ def iot_log(clients: Clients, settings: Settings) -> Found:
     return _held(clients, settings, "AWS::IoT::Logging", said, remedy)
 
 
-@item("Device Defender's audit", "iot DescribeAccountAuditConfiguration")
-def audit(clients: Clients, settings: Settings) -> Found:
+@item("Device Defender's audit")
+def audit(clients: Clients, settings: Settings) -> Finding:
     """Check that the region's one configuration is free if `device_defender` needs it."""
     # CloudFormation's handler also decides by the role: without configuration, AWS answers without one.
     configured = bool(clients.client("iot").describe_account_audit_configuration().get("roleArn"))
@@ -87,7 +87,7 @@ def audit(clients: Clients, settings: Settings) -> Found:
     return _held(clients, settings, "AWS::IoT::AccountAuditConfiguration", said, remedy)
 
 
-def _held(clients: Clients, settings: Settings, kind: str, said: str, remedy: str) -> Found:
+def _held(clients: Clients, settings: Settings, kind: str, said: str, remedy: str) -> Finding:
     """The finding on a setting that the region has only once, and that is set."""
     if any(one.kind == kind for one in resources(clients, f"{settings.namespace}-account")):
         return fine(f"{said}, by this deployment")
@@ -96,8 +96,8 @@ def _held(clients: Clients, settings: Settings, kind: str, said: str, remedy: st
     )
 
 
-@item("Lambda's concurrency", "lambda GetAccountSettings")
-def concurrency(clients: Clients, settings: Settings) -> Found:
+@item("Lambda's concurrency")
+def concurrency(clients: Clients, settings: Settings) -> Finding:
     """Check that Lambda 1's reservation leaves enough for the others."""
     lambda_ = clients.client("lambda")
     limit = lambda_.get_account_settings()["AccountLimit"]
@@ -123,24 +123,8 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
     return fine(text)
 
 
-@item("CloudFront", "cloudfront ListDistributions, where `site` is set")
-def cloudfront(clients: Clients, settings: Settings) -> Found:
-    """Check that CloudFront answers; no read-only call tells if it would create a distribution."""
-    if not settings.site:
-        return fine("not wanted (site=false)")
-    if resources(clients, f"{settings.namespace}-site"):
-        return fine("the stack site is deployed")
-    clients.client("cloudfront").list_distributions(MaxItems="1")
-    return warning(
-        "it answers; its verification of the account cannot be read",
-        "if the stack site fails with 'Your account must be verified', ask AWS Support",
-    )
-
-
-@item(
-    "AWS IoT's quotas", "service-quotas ListServiceQuotas and ListAWSDefaultServiceQuotas, iot ListTopicRules"
-)
-def quotas(clients: Clients, settings: Settings) -> Found:
+@item("AWS IoT's quotas")
+def quotas(clients: Clients, settings: Settings) -> Finding:
     """Check that our rules fit, and how many robots the quotas allow."""
     service = clients.client("service-quotas")
     values: dict[str, float] = {}
@@ -171,8 +155,8 @@ def quotas(clients: Clients, settings: Settings) -> Found:
     return fine(text)
 
 
-@item("spending", "the settings")
-def spending(_clients: Clients, settings: Settings) -> Found:
+@item("spending")
+def spending(_clients: Clients, settings: Settings) -> Finding:
     """Say loudly who hears of costs, and what bounds them."""
     lacking = {
         "alarm_email": "nobody hears of an alarm",
@@ -193,8 +177,8 @@ def spending(_clients: Clients, settings: Settings) -> Found:
     )
 
 
-@item("policy versions", "iot ListPolicyVersions of the robots' and the claims' policy")
-def policy_versions(clients: Clients, settings: Settings) -> Found:
+@item("policy versions")
+def policy_versions(clients: Clients, settings: Settings) -> Finding:
     """Check that a changed policy has room for another version."""
     ask = partial(known, "ResourceNotFoundException", clients.client("iot").list_policy_versions)
     names = (fleet_name(settings.namespace), claim_name(settings.namespace))
@@ -212,4 +196,4 @@ def policy_versions(clients: Clients, settings: Settings) -> Found:
     )
 
 
-ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas, spending, policy_versions)
+ITEMS = (bootstrap, iot_log, audit, concurrency, quotas, spending, policy_versions)

@@ -15,7 +15,7 @@ from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace, rule_name
 from iort_station.errors import StationError
 from stacks.settings import NEW_ACCOUNT, PROD, Settings
-from verify.preflight.finding import Clients, Found, fine, item, known, listed, stops, warning
+from verify.preflight.finding import Clients, Finding, fine, item, known, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = (
@@ -63,8 +63,8 @@ def resources(clients: Clients, name: str) -> list[Resource]:
     ]
 
 
-@item("stacks", "cloudformation DescribeStacks of every stack of the namespace")
-def stacks(clients: Clients, settings: Settings) -> Found:
+@item("stacks")
+def stacks(clients: Clients, settings: Settings) -> Finding:
     """Check that every existing stack can be updated."""
     stacks = {name: stack(clients, name) for name in (f"{settings.namespace}-{noun}" for noun in STACKS)}
     states = {name: str(found["StackStatus"]) for name, found in stacks.items() if found is not None}
@@ -85,11 +85,8 @@ def _todo(state: str) -> str:
     return "somebody else's deployment is running: wait for its end" if state.endswith("IN_PROGRESS") else ""
 
 
-@item(
-    "names",
-    "iot Describe.../GetPolicy/ListTopicRules, cloudwatch ListDashboards: names that are part of the design",
-)
-def names(clients: Clients, settings: Settings) -> Found:
+@item("names")
+def names(clients: Clients, settings: Settings) -> Finding:
     """Check that fixed names are free if the stack that creates them does not exist."""
     taken: list[str] = []
     for noun, look in {"fleet": _things, "ingest": _rules, "monitoring": _dashboards}.items():
@@ -129,37 +126,6 @@ def _dashboards(clients: Clients, namespace: str) -> Iterator[str]:
     yield from sorted(f"dashboard {name}" for name in {one["DashboardName"] for one in entries} & ours)
 
 
-@item("kept data", "dynamodb ListTables, s3 ListBuckets, sqs ListQueues, logs DescribeLogGroups")
-def kept(clients: Clients, settings: Settings) -> Found:
-    """Look for leftovers of an earlier deployment. The CDK's names end randomly, so they never collide."""
-    known = {one.physical_id for noun in STACKS for one in resources(clients, f"{settings.namespace}-{noun}")}
-    known |= {name.rsplit("/", 1)[-1] for name in known if name.startswith("http")}
-    left = sorted(name for name in _holders(clients, settings.namespace) if name not in known)
-    if not left:
-        return fine("no leftovers")
-    shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
-    return warning(
-        f"of an earlier deployment, without conflict: {shown}",
-        "a new deployment begins empty: delete them to save costs, or move what they hold by a script",
-    )
-
-
-def _holders(clients: Clients, namespace: str) -> Iterator[str]:
-    """Tables, buckets, queues and log groups with the names that the CDK gives to our stacks."""
-    client = clients.client
-    prefix = f"{namespace}-"
-    queues = listed(client("sqs"), "list_queues", "QueueUrls", QueueNamePrefix=prefix)
-    groups = listed(client("logs"), "describe_log_groups", "logGroups", logGroupNamePrefix=prefix)
-    names = (
-        *listed(client("dynamodb"), "list_tables", "TableNames"),
-        *(bucket["Name"] for bucket in client("s3").list_buckets()["Buckets"]),
-        *(url.rsplit("/", 1)[-1] for url in queues),
-        *(group["logGroupName"] for group in groups),
-    )
-    prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
-    return (name for name in names if name.startswith(prefixes))
-
-
 def has_pubnub_keys(clients: Clients, namespace: str) -> bool:
     """Whether something is stored where PubNub's keys belong. It stays encrypted."""
     ask = clients.client("ssm").get_parameter
@@ -176,8 +142,8 @@ def transport(clients: Clients, namespace: str) -> str | None:
     return str(outputs.get("LiveTransport", PUBNUB))
 
 
-@item("live messages", "ssm GetParameter /<namespace>/pubnub, cloudformation DescribeStacks")
-def live_messages(clients: Clients, settings: Settings) -> Found:
+@item("live messages")
+def live_messages(clients: Clients, settings: Settings) -> Finding:
     """Say which way live messages will take, and warn if it is another one than now."""
     name, wanted = pubnub_parameter(settings.namespace), settings.live_transport
     stored, now = has_pubnub_keys(clients, settings.namespace), transport(clients, settings.namespace)
@@ -194,8 +160,8 @@ def live_messages(clients: Clients, settings: Settings) -> Found:
     return fine(text)
 
 
-@item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
-def changes(clients: Clients, settings: Settings) -> Found:
+@item("changed settings")
+def changes(clients: Clients, settings: Settings) -> Finding:
     """Check that the settings may follow those of the deployed stacks."""
     storage = f"{settings.namespace}-storage"
     deployed = stack(clients, storage)
@@ -249,7 +215,7 @@ def _used_by(importers: list[str]) -> str:
     return f"{', '.join(names)} {'imports' if len(names) == 1 else 'import'}"
 
 
-ITEMS = (stacks, names, kept, live_messages, changes)
+ITEMS = (stacks, names, live_messages, changes)
 
 
 def account_concurrency(clients: Clients, _namespace: str) -> str:

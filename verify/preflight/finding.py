@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -36,50 +35,38 @@ class Clients(Protocol):
         """A boto3 client."""
 
 
-class Found(NamedTuple):
-    """An item's result; ``do`` is the remedy."""
+class Finding(NamedTuple):
+    """What an item of the preflight has found; ``do`` is the remedy."""
 
     verdict: Verdict
-    text: str
-    do: str = ""
-
-
-# Nothing to do; the operator should know; the deployment would fail, or lose something.
-fine, warning, stops = (partial(Found, verdict) for verdict in Verdict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """One item of the preflight: what was ``asked`` and ``found``, the verdict, and the remedy, ``do``."""
-
-    item: str
-    asked: str
     found: str
-    verdict: Verdict
     do: str = ""
+    item: str = ""
 
     def __str__(self) -> str:
         done = f" -> {self.do}" if self.do else ""
         return f"{self.verdict.value}: {self.item}: {self.found}{done}"
 
 
+# Nothing to do; the operator should know; the deployment would fail, or lose something.
+fine, warning, stops = (partial(Finding, verdict) for verdict in Verdict)
 Item = Callable[[Clients, Settings], Finding]
 
 
-def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found]], Item]:
-    """Turn a function's result into a finding. A missing answer of AWS is a warning and never stops: the
-    deployment itself may need other permissions."""
+def item(name: str) -> Callable[[Item], Item]:
+    """Name a function's finding. A missing answer of AWS is a warning and never stops: the deployment itself
+    may need other permissions."""
 
-    def wrap(look: Callable[[Clients, Settings], Found]) -> Item:
+    def wrap(look: Item) -> Item:
         @wraps(look)
         def ask(clients: Clients, settings: Settings) -> Finding:
             try:
-                found = look(clients, settings)
+                finding = look(clients, settings)
             except ClientError as error:
-                found = _not_answered(error)
+                finding = _not_answered(error)
             except (BotoCoreError, StationError) as error:
-                found = warning(f"not answered: {error}", "look at the network and the region")
-            return Finding(item=name, asked=asked, found=found.text, verdict=found.verdict, do=found.do)
+                finding = warning(f"not answered: {error}", "look at the network and the region")
+            return finding._replace(item=name)
 
         return ask
 
@@ -107,11 +94,10 @@ def code(error: ClientError) -> str:
     return str(error.response["Error"]["Code"])
 
 
-def _not_answered(error: ClientError) -> Found:
+def _not_answered(error: ClientError) -> Finding:
     if code(error) not in _DENIED:
         return warning(f"not answered: {error}", "ask it by hand, or continue without it")
-    said = _ACTION.search(str(error))
-    action = said[1] if said else error.operation_name
-    return warning(
-        f"not answered: the permission {action} is missing", f"allow {action}, or go on without it"
-    )
+    named = _ACTION.search(str(error))
+    action = named[1] if named else error.operation_name
+    text = f"not answered: the permission {action} is missing"
+    return warning(text, f"allow {action}, or go on without it")

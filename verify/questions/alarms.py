@@ -61,7 +61,6 @@ _NOTIFIED = {
 @question(
     "alarms.set_state",
     aws="cloudwatch-api:API_SetAlarmState",
-    code="stacks/monitoring.py stacks/processing.py",
     expected=_NOTIFIED,
 )
 def set_state(lab: Lab) -> Seen:
@@ -91,7 +90,6 @@ def set_state(lab: Lab) -> Seen:
 @question(
     "alarms.acknowledged",
     aws="cloudwatch-api:API_TagResource",
-    code="station/iort_station/operations/alarms.py",
     expected={"by": _BY, "kept": True},
 )
 def acknowledged(lab: Lab) -> Seen:
@@ -118,7 +116,6 @@ set_state_with_key = replace(
     ),
     expected={**_NOTIFIED, "topic_has_key": True},
     source=pages("https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns"),
-    relied_on_by=("stacks/parts.py",),
     phase=CHANGED,
     not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
 )
@@ -127,7 +124,6 @@ set_state_with_key = replace(
 @question(
     "alarms.metrics_insights",
     aws="cloudwatch:alarm-evaluation",
-    code="stacks/monitoring.py",
     expected={
         "alarms": len(_INSIGHTS),
         "evaluation": ["as it should"],
@@ -163,7 +159,6 @@ def metrics_insights(lab: Lab) -> Seen:
 
 @question(
     "alarms.alert",
-    code="functions/alert.py stacks/storage.py contract/iort_contract/catalog/rules.py",
     expected={
         "subject": "NAMESPACE: ROBOT, fault 5, MOSFET over-temperature",
         "first_line": "ROBOT: fault 5, MOSFET over-temperature",
@@ -211,7 +206,6 @@ def _count(lab: Lab, since: datetime) -> float:
     "logs.metric",
     aws="""cloudwatch:CloudWatch_Embedded_Metric_Format_Specification
     lambda:monitoring-cloudwatchlogs-log-level""",
-    code="functions/shared/metrics.py stacks/parts.py stacks/monitoring.py local/emulator/fixes/metrics.py",
     expected={"counted": True},
 )
 def metric(lab: Lab) -> Seen:
@@ -249,8 +243,6 @@ def handler(event, context):
 
 @question(
     "logs.lines",
-    code="""stacks/monitoring.py functions/shared/metrics.py station/iort_station/operations/cloudwatch.py
-    local/patches/log_records.patch""",
     expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
 )
 def lines(lab: Lab) -> Seen:

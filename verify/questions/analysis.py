@@ -66,7 +66,6 @@ def _broken(lab: Lab, name: str) -> Iterator[None]:
 @question(
     "analysis.no_robot",
     aws="states:state-map-inline",
-    code="stacks/states.py functions/plan.py",
     expected={"state": SUCCEEDED, "drives": 0, "findings": 0},
 )
 def no_robot(lab: Lab) -> Seen:
@@ -84,7 +83,6 @@ def no_robot(lab: Lab) -> Seen:
 @question(
     "analysis.empty_plan",
     aws="states:input-output-itemreader",
-    code="stacks/states.py functions/plan.py functions/evaluate.py",
     expected={"state": SUCCEEDED, "drives": 0, "findings": 0},
 )
 def empty_plan(lab: Lab) -> Seen:
@@ -97,7 +95,6 @@ def empty_plan(lab: Lab) -> Seen:
 @question(
     "analysis.one_drive",
     aws="states:state-map-distributed states:iam-policies-eg-dist-map",
-    code="stacks/states.py stacks/analysis.py functions/analyse.py",
     expected={"state": SUCCEEDED, "drives": 1, "done": 1, "samples": [_SAMPLES], "failed": 0},
 )
 def one_drive(lab: Lab) -> Seen:
@@ -117,7 +114,6 @@ def one_drive(lab: Lab) -> Seen:
 @question(
     "analysis.failing_drive",
     aws="states:concepts-error-handling",
-    code="stacks/states.py functions/present.py functions/shared/analysis.py",
     expected={"state": SUCCEEDED, "failed": 1, "next": SUCCEEDED, "failed_then": 0, "samples": [_SAMPLES]},
 )
 def failing_drive(lab: Lab) -> Seen:
@@ -135,7 +131,6 @@ def failing_drive(lab: Lab) -> Seen:
 @question(
     "analysis.stopped",
     aws="states-api:API_StopExecution states:redrive-map-run",
-    code="station/iort_station/operations/analysis.py stacks/states.py functions/plan.py",
     expected={"stopped": "ABORTED", "watched": True, "next": SUCCEEDED, "samples": [_SAMPLES]},
 )
 def stopped(lab: Lab) -> Seen:
@@ -193,7 +188,6 @@ def _schedule_soon(lab: Lab, schedule: str) -> Mapping[str, Any]:
 @question(
     "schedules.archive",
     aws="scheduler:schedule-types scheduler:setting-up",
-    code="stacks/parts.py stacks/archive.py",
     expected={"called": True},
 )
 def archive_scheduled(lab: Lab) -> Seen:
@@ -214,7 +208,6 @@ def archive_scheduled(lab: Lab) -> Seen:
 @question(
     "schedules.analysis",
     aws="scheduler:schedule-types scheduler:managing-targets-templated",
-    code="stacks/analysis.py",
     expected={"runs": 1, "input_as_scheduled": True},
 )
 def analysis_scheduled(lab: Lab) -> Seen:

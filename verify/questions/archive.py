@@ -85,7 +85,6 @@ def _keys(lab: Lab, robot: str) -> list[dict[str, Any]]:
 @question(
     "archive.hour_twice",
     aws="sqs:standard-queues-at-least-once-delivery",
-    code="functions/shared/archive_writer.py stacks/archive.py",
     expected={"batches": _BATCHES, "same_row": True, "written_once": True},
 )
 def hour_twice(lab: Lab) -> Seen:
@@ -104,7 +103,6 @@ def hour_twice(lab: Lab) -> Seen:
 @question(
     "archive.late_batch",
     aws="s3:conditional-writes",
-    code="functions/shared/archive_writer.py functions/shared/archive.py",
     expected={
         "batches": _BATCHES + 1,
         "same_object": True,
@@ -134,7 +132,6 @@ def late_batch(lab: Lab) -> Seen:
 @question(
     "archive.read_back",
     aws="s3-api:API_GetObject",
-    code="analysis/iort_analysis/archive/hours.py station/iort_station/data/recorded.py",
     expected={"in_table": 0, "same_samples": True, "samples": _BATCHES},
 )
 def read_back(lab: Lab) -> Seen:
@@ -155,7 +152,6 @@ def read_back(lab: Lab) -> Seen:
 @question(
     "archive.pyarrow_arm64",
     aws="lambda:foundation-arch",
-    code="stacks/parts.py scripts/setup.py analysis/iort_analysis/archive/writing.py",
     expected={"architectures": ["arm64"], "written_by_pyarrow": True},
     not_embedded="the embedded cloud runs the functions with its host's processor and packages",
 )
@@ -177,7 +173,6 @@ _NAMES = sorted({*ENVELOPE, *PRESENCE, *ADMISSION, TOPIC, ROBOT, RECEIVED_MS, EX
 @question(
     "dynamodb.expiry",
     aws="dynamodb:TTL",
-    code="stacks/storage.py",
     expected=dict.fromkeys(_TABLES, EXPIRES_S),
     not_embedded="the emulator's CloudFormation does not give a table its TimeToLiveSpecification",
 )
@@ -199,7 +194,6 @@ def expiry(lab: Lab) -> Seen:
 @question(
     "dynamodb.reserved_words",
     aws="dynamodb:ReservedWords",
-    code="functions/presence.py functions/admit.py station/iort_station/fleet/registry.py",
     expected={"refused": [BATCH, "online"]},
 )
 def reserved_words(lab: Lab) -> Seen:
@@ -221,7 +215,6 @@ def reserved_words(lab: Lab) -> Seen:
 @question(
     "dynamodb.failed_condition",
     aws="dynamodb-api:API_UpdateItem",
-    code="functions/admit.py functions/shared/quotas.py functions/alert.py",
     expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
 )
 def failed_condition(lab: Lab) -> Seen:

@@ -21,7 +21,6 @@ from verify.question import Seen, question
 @question(
     "broker.session_taken_over",
     aws="iot:mqtt",
-    code="device/iort_agent/mqtt/aws.py",
     expected={"second_connects": True, "first_is_ended": True, "first_is_told": "SESSION_TAKEN_OVER"},
 )
 def session_taken_over(lab: Lab) -> Seen:
@@ -38,7 +37,6 @@ def session_taken_over(lab: Lab) -> Seen:
 @question(
     "broker.another_client_id",
     aws="iot:thing-policy-variables",
-    code="stacks/fleet.py device/iort_agent/mqtt/failures.py",
     expected={"neighbours": True, "one_that_nobody_has": True},
 )
 def another_client_id(lab: Lab) -> Seen:
@@ -53,7 +51,6 @@ def another_client_id(lab: Lab) -> Seen:
 @question(
     "broker.foreign_topic",
     aws="iot:mqtt",
-    code="stacks/fleet.py device/iort_agent/mqtt/dispatch.py",
     expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
 )
 def foreign_topic(lab: Lab) -> Seen:
@@ -98,7 +95,6 @@ def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
 @question(
     "broker.publishes_a_second",
     aws="quotas:iot-core",
-    code="device/iort_agent/mqtt/rate_limiter.py",
     expected={"at_90_a_second": {"answers": ["SUCCESS"], "unanswered": False, "session_ended": False}},
 )
 def publishes_a_second(lab: Lab) -> Seen:
@@ -119,8 +115,6 @@ _AWS_MESSAGE_BYTES = 128 * 1024
 @question(
     "payloads.live_no_json",
     aws="iot:binary-payloads",
-    code="""contract/iort_contract/catalog/rules.py functions/live.py
-    local/patches/unreadable_payload.patch""",
     expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
 )
 def live_no_json(lab: Lab) -> Seen:
@@ -138,7 +132,6 @@ def live_no_json(lab: Lab) -> Seen:
 
 @question(
     "payloads.record_no_json",
-    code="stacks/ingest.py stacks/monitoring.py",
     expected={"stored": 0, "refused_by": ["rule"]},
 )
 def record_no_json(lab: Lab) -> Seen:
@@ -164,7 +157,6 @@ def record_no_json(lab: Lab) -> Seen:
 
 @question(
     "payloads.pong_no_json",
-    code="device/iort_agent/lanes/pings.py",
     expected={"the_next_ping_is_answered": True},
 )
 def pong_no_json(lab: Lab) -> Seen:
@@ -184,7 +176,6 @@ def pong_no_json(lab: Lab) -> Seen:
 @question(
     "payloads.largest_message",
     aws="quotas:iot-core iot:mqtt",
-    code="contract/iort_contract/limits.py local/patches/message_size.patch",
     expected={"ours": "SUCCESS"},
 )
 def largest_message(lab: Lab) -> Seen:

@@ -32,7 +32,6 @@ def _file(content: bytes, name: str) -> File:
     "files.in_one",
     aws="""s3:using-presigned-url s3:conditional-requests
     https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch""",
-    code="functions/upload.py device/iort_agent/files/upload.py",
     expected={
         "other_bytes": 400,
         "other_bytes_told": True,
@@ -71,7 +70,6 @@ def in_one(lab: Lab) -> Seen:
 @question(
     "files.in_parts",
     aws="s3-api:API_CompletedPart s3:checking-object-integrity",
-    code="functions/upload.py",
     expected={
         "other_bytes": 400,
         "parts": [_STORED, _STORED],
@@ -111,7 +109,6 @@ def in_parts(lab: Lab) -> Seen:
 @question(
     "files.closed",
     aws="s3:using-presigned-url s3:access-control-block-public-access",
-    code="stacks/storage.py device/iort_agent/files/upload.py",
     expected={
         "expired": 403,
         "unsigned": {"GET": 403, "PUT": 403},

@@ -49,7 +49,6 @@ def handler(event, context):
 
 @question(
     "functions.runtime",
-    code="functions/upload.py stacks/parts.py functions/live.py",
     expected={
         "parameters_that_boto3_does_not_know": [],
         "environment": list(_ENVIRONMENT),
@@ -77,7 +76,6 @@ def runtime(lab: Lab) -> Seen:
 @question(
     "functions.python",
     aws="lambda:lambda-runtimes",
-    code="stacks/parts.py scripts/setup.py",
     expected={"runs_as_named": True},
     not_embedded="the embedded cloud runs the functions with its host's Python",
 )
@@ -120,7 +118,6 @@ def _limit(lab: Lab, name: str) -> None:
 @question(
     "functions.ten_at_once",
     aws="lambda:lambda-concurrency lambda:invocation-async-error-handling",
-    code="stacks/settings.py stacks/states.py stacks/processing.py",
     expected={"more_than_ten_at_once": False, "throttled": True, "events_run": _CALLS},
 )
 def ten_at_once(lab: Lab) -> Seen:
@@ -163,7 +160,6 @@ _RAISING = "def handler(event, context):\n    raise ValueError('not JSON')\n"
 @question(
     "functions.failed_invocation",
     aws="lambda:invocation-async-retain-records",
-    code="functions/quarantine.py stacks/processing.py",
     expected={
         "source": True,
         "topic": True,

@@ -22,8 +22,6 @@ POLICY = "verify-policy"
 @question(
     "renewal.rotated",
     aws="iot:provision-wo-cert iot:life-cycle-events",
-    code="""device/iort_agent/verbs/provision.py station/iort_station/fleet/identity.py
-    functions/presence.py""",
     expected={
         "certificates_until_it_settles": 2,
         "revoked": 1,
@@ -59,7 +57,6 @@ def rotated(lab: Lab) -> Seen:
 @question(
     "removal.policy_deleted_after_detach",
     aws="iot-api:API_DeletePolicy",
-    code="scripts/destroy.py",
     expected={"deleted_within_six_minutes": True},
 )
 def policy_deleted_after_detach(lab: Lab) -> Seen:
@@ -90,7 +87,6 @@ def policy_deleted_after_detach(lab: Lab) -> Seen:
 @question(
     "removal.robot_removed",
     aws="iot:mqtt iot-api:API_DeleteCertificate",
-    code="station/iort_station/fleet/robots.py station/iort_station/fleet/identity.py",
     expected={"session_ended": True, "connects_again": False},
 )
 def robot_removed(lab: Lab) -> Seen:
@@ -107,7 +103,6 @@ def robot_removed(lab: Lab) -> Seen:
 @question(
     "removal.certificate_deactivated",
     aws="iot-api:API_UpdateCertificate",
-    code="station/iort_station/fleet/identity.py device/iort_agent/mqtt/failures.py",
     expected={"connects_before": True, "connects_after": False},
 )
 def certificate_deactivated(lab: Lab) -> Seen:
@@ -133,7 +128,6 @@ def _document(number: int) -> str:
 @question(
     "policies.sixth_version",
     aws="iot-api:API_CreatePolicyVersion",
-    code="stacks/fleet.py verify/preflight/deployed.py",
     expected={"versions": _VERSIONS, "sixth": "VersionsLimitExceededException"},
     not_embedded="ministack keeps any number of a policy's versions",
 )
@@ -158,7 +152,6 @@ def sixth_version(lab: Lab) -> Seen:
 @question(
     "policies.six_edits",
     aws="cfn:aws-resource-iot-policy",
-    code="stacks/fleet.py",
     expected={"edits": ["UPDATE_COMPLETE"] * _EDITS, "at_most_five_versions": True, "newest_holds": True},
 )
 def six_edits(lab: Lab) -> Seen:
@@ -197,7 +190,6 @@ def six_edits(lab: Lab) -> Seen:
 @question(
     "removal.connected_robot",
     aws="iot-api:API_DeletePolicy",
-    code="scripts/destroy.py verify/deployment.py station/iort_station/fleet/robots.py",
     phase=ENDED,
     expected={"session_ended": True, "left_over": []},
     not_embedded="the embedded cloud ends with its process, and has no stacks to destroy then",

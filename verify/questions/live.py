@@ -62,7 +62,6 @@ def _keys(cloud: Cloud) -> PubNubKeys | None:
 
 @question(
     "live.to_subscriber",
-    code="functions/live.py functions/shared/pubnub_client.py contract/iort_contract/cloud.py",
     expected={
         "stale_heard": False,
         "robot": True,
@@ -111,7 +110,6 @@ def to_subscriber(lab: Lab) -> Seen:
 
 @question(
     "live.lease",
-    code="device/iort_agent/lanes/viewers.py stacks/fleet.py",
     expected={"subscribed": "GRANTED_QOS_1", "heard": True, "to_another": "NOT_AUTHORIZED"},
 )
 def lease(lab: Lab) -> Seen:

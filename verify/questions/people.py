@@ -90,7 +90,6 @@ def _expected(*, log: bool, view: bool, command: bool) -> Seen:
 @question(
     "people.viewer",
     aws="iot:iam-users-groups-roles iot:protocols",
-    code="stacks/fleet.py station/iort_station/fleet/roles.py",
     expected=_expected(log=True, view=True, command=False),
 )
 def viewer(lab: Lab) -> Seen:
@@ -102,7 +101,6 @@ def viewer(lab: Lab) -> Seen:
 @question(
     "people.driver",
     aws="iot:iam-users-groups-roles iot:protocols",
-    code="stacks/fleet.py station/iort_station/fleet/roles.py",
     expected=_expected(log=True, view=True, command=True),
 )
 def driver(lab: Lab) -> Seen:
@@ -113,7 +111,6 @@ def driver(lab: Lab) -> Seen:
 @question(
     "people.signed_address",
     aws="iot:iam-users-groups-roles",
-    code="station/iort_station/fleet/roles.py station/web/src/link/socket_address.ts",
     expected={"signed": 101, "not_signed": 403},
 )
 def signed_address(lab: Lab) -> Seen:
@@ -141,7 +138,6 @@ def signed_address(lab: Lab) -> Seen:
 @question(
     "people.everybody",
     aws="iot:cog-iot-policies cognito:iam-roles",
-    code="stacks/fleet.py station/web/src/link/socket_address.ts",
     phase=CHANGED,
     expected=_expected(log=False, view=False, command=False),
 )

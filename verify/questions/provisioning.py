@@ -81,8 +81,6 @@ def _provisioned(lab: Lab, robot: str, folder: Path, file: Path) -> dict[str, An
 @question(
     "provisioning.claim_for_minutes",
     aws="iot:provision-wo-cert iot:pre-provisioning-hook",
-    code="""station/iort_station/fleet/identity.py functions/admit.py device/iort_agent/verbs/provision.py
-    stacks/fleet.py local/patches/certificate_from_csr.patch""",
     expected=_DONE,
 )
 def claim_for_minutes(lab: Lab) -> Seen:
@@ -95,7 +93,6 @@ def claim_for_minutes(lab: Lab) -> Seen:
 @question(
     "provisioning.claim_that_lasts",
     aws="iot:provision-wo-cert iot:pre-provisioning-hook",
-    code="station/iort_station/fleet/identity.py functions/admit.py stacks/fleet.py",
     expected=_DONE,
 )
 def claim_that_lasts(lab: Lab) -> Seen:
@@ -109,7 +106,6 @@ def claim_that_lasts(lab: Lab) -> Seen:
 
 @question(
     "provisioning.claim_known_by",
-    code="functions/admit.py station/iort_station/fleet/registry.py",
     expected={"by_one_of_both": True},
 )
 def claim_known_by(lab: Lab) -> Seen:
@@ -133,7 +129,6 @@ def claim_known_by(lab: Lab) -> Seen:
 
 @question(
     "provisioning.registered_again",
-    code="device/iort_agent/verbs/provision.py functions/admit.py",
     expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
 )
 def registered_again(lab: Lab) -> Seen:
@@ -156,7 +151,6 @@ def registered_again(lab: Lab) -> Seen:
 @question(
     "provisioning.name_taken",
     aws="iot:pre-provisioning-hook",
-    code="functions/admit.py",
     expected={"first": "", "second_is_refused": True, "certificates": 1},
 )
 def name_taken(lab: Lab) -> Seen:

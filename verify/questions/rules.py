@@ -44,7 +44,6 @@ def _live(number: int, values: Mapping[str, float]) -> bytes:
 @question(
     "rules.as_catalogued",
     aws="iot:iot-create-rule",
-    code="contract/iort_contract/catalog/rules.py stacks/ingest.py",
     expected={name: [True, 1, True] for name in RULES},
 )
 def as_catalogued(lab: Lab) -> Seen:
@@ -63,7 +62,6 @@ def as_catalogued(lab: Lab) -> Seen:
 @question(
     "rules.record_spoofed",
     aws="iot:iot-sql-select iot:dynamodb-v2-rule-action",
-    code="contract/iort_contract/catalog/rules.py functions/shared/seconds.py",
     expected={
         "own_partition": 1,
         "victims_partition": 0,
@@ -93,7 +91,6 @@ def record_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.live_spoofed",
     aws="iot:iot-sql-select iot:binary-payloads",
-    code="contract/iort_contract/catalog/rules.py functions/live.py",
     expected={"as_its_own": True, "received_by_the_clouds_clock": True, "as_the_victims": 0},
 )
 def live_spoofed(lab: Lab) -> Seen:
@@ -125,7 +122,6 @@ def _ping(lab: Lab, path: str) -> Seen:
 @question(
     "rules.pong_spoofed",
     aws="iot:iot-sql-select iot:republish-rule-action",
-    code="contract/iort_contract/catalog/rules.py stacks/ingest.py",
     expected={"received_by_the_clouds_clock": True, "the_rest_as_sent": True},
 )
 def pong_spoofed(lab: Lab) -> Seen:
@@ -136,7 +132,6 @@ def pong_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.echo_spoofed",
     aws="iot:iot-sql-select iot:binary-payloads",
-    code="contract/iort_contract/catalog/rules.py functions/echo.py",
     expected={"received_by_the_clouds_clock": True, "the_rest_as_sent": True},
 )
 def echo_spoofed(lab: Lab) -> Seen:
@@ -147,7 +142,6 @@ def echo_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.upload_spoofed",
     aws="iot:iot-sql-select iot:binary-payloads",
-    code="contract/iort_contract/catalog/rules.py functions/upload.py",
     expected={"key_is_its_own": True, "names_the_victim": False},
 )
 def upload_spoofed(lab: Lab) -> Seen:
@@ -163,7 +157,6 @@ def upload_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.ask_spoofed",
     aws="iot:iot-sql-select iot:binary-payloads",
-    code="contract/iort_contract/catalog/rules.py functions/answer.py",
     expected={"answered_its_own": True, "counted_as_its_own": True, "counted_as_the_victims": False},
 )
 def ask_spoofed(lab: Lab) -> Seen:
@@ -187,7 +180,6 @@ def ask_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.alerts_spoofed",
     aws="iot:iot-sql-select",
-    code="contract/iort_contract/catalog/rules.py functions/alert.py",
     expected={"own_alerts": 2, "victims_alerts": 0},
 )
 def alerts_spoofed(lab: Lab) -> Seen:
@@ -205,7 +197,6 @@ def alerts_spoofed(lab: Lab) -> Seen:
 @question(
     "rules.version_spoofed",
     aws="iot:iot-sql-select iot:reserved-topics",
-    code="contract/iort_contract/catalog/rules.py functions/presence.py",
     expected={"own": "9.9.9", "victims": None},
 )
 def version_spoofed(lab: Lab) -> Seen:
@@ -261,7 +252,6 @@ def _heard(pair: Pair, topic: str, payload: bytes) -> str:
 @question(
     "rule_errors.document",
     aws="iot:rule-error-handling iot:iot-basic-ingest",
-    code="functions/quarantine.py contract/iort_contract/topics.py",
     expected={
         "source": "rule NAME",
         "robot_is_the_topics": True,
@@ -298,7 +288,6 @@ def document(lab: Lab) -> Seen:
 @question(
     "rule_errors.star_beside_a_key",
     aws="iot:iot-sql-select",
-    code="docs/decisions/security/0033-no-mixed-keys.md",
     expected={"other_keys_stay": True},
 )
 def star_beside_a_key(lab: Lab) -> Seen:

@@ -79,7 +79,6 @@ def _reader(lab: Lab, robot: str, name: str, then: str) -> Callable[[], list[Map
 @question(
     "stream.bisected",
     aws="lambda:services-dynamodb-errors",
-    code="stacks/processing.py functions/quarantine.py local/emulator/fixes/stream_model.py",
     expected={
         "given_up": [_POISONED],
         "reasons": ["Lambda 2 failed: RetryAttemptsExhausted"],
@@ -124,7 +123,6 @@ def bisected(lab: Lab) -> Seen:
 @question(
     "stream.put_off",
     aws="lambda:with-sqs sqs:sqs-fair-queues",
-    code="functions/later.py functions/shared/share.py stacks/processing.py",
     expected={"told": True, "stored": _EXPENSIVE, "summarised": _EXPENSIVE},
 )
 def put_off(lab: Lab) -> Seen:
@@ -146,7 +144,6 @@ def put_off(lab: Lab) -> Seen:
 @question(
     "stream.reported",
     aws="lambda:services-ddb-batchfailurereporting",
-    code="functions/summarize.py stacks/processing.py local/emulator/fixes/stream_model.py",
     expected={"times_reported": 1, "comes_next": [_REPORTED], "again_before_it": [], "in_quarantine": 0},
 )
 def reported(lab: Lab) -> Seen:
@@ -179,7 +176,6 @@ def _summarized(lab: Lab, robot: str) -> int:
 
 @question(
     "quarantine.refused_batch",
-    code="functions/summarize.py functions/shared/queues.py functions/quarantine.py",
     expected={
         "summarized": 2,
         "refused": 1,
@@ -207,7 +203,6 @@ def refused_batch(lab: Lab) -> Seen:
 @question(
     "quarantine.replayed",
     aws="iot:iot-basic-ingest",
-    code="station/iort_station/operations/quarantine.py functions/quarantine.py",
     expected={"before": 0, "fate": "replayed", "summarized": 1, "left": 0},
 )
 def replayed(lab: Lab) -> Seen:

@@ -14,7 +14,6 @@ def test_the_embedded_cloud_passes_the_preflight(embedded):
     assert "account 000000000000" in said["credentials"]
     assert said["stacks"] == "8 of 10 are there, each can be updated"
     assert said["names"] == "free, or used by this deployment"
-    assert said["kept data"] == "no leftovers"
     assert said["changed settings"] == "none that must not be"
 
 

@@ -129,7 +129,7 @@ def test_leftovers_after_a_failure_are_reported(embedded, tmp_path, capsys):
 
 
 def question(name, seen, ask):
-    return Question(name=name, assumed="It is.", expected=seen, relied_on_by=("app.py",), ask=ask)
+    return Question(name=name, assumed="It is.", expected=seen, ask=ask)
 
 
 def test_a_run_lends_pubnub_keys_to_every_question(embedded, tmp_path):

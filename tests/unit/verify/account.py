@@ -65,7 +65,6 @@ NEW = {
         "auditCheckConfigurations": {"LOGGING_DISABLED_CHECK": {"enabled": False}}
     },
     "GetAccountSettings": limits(),
-    "ListDistributions": {"DistributionList": {"Quantity": 0}},
     "ListServiceQuotas": {"Quotas": []},
     "ListAWSDefaultServiceQuotas": {"Quotas": QUOTAS},
     "ListTopicRules": {"rules": []},
@@ -77,10 +76,6 @@ NEW = {
     "DescribeProvisioningTemplate": absent,
     "ListPolicyVersions": absent,
     "ListDashboards": {"DashboardEntries": []},
-    "ListTables": {"TableNames": []},
-    "ListBuckets": {"Buckets": []},
-    "ListQueues": {},
-    "DescribeLogGroups": {"logGroups": []},
     "ListExports": {"Exports": []},
     "ListImports": lambda **asked: Refused(
         "ValidationError", f"Export '{asked['ExportName']}' is not imported by any stack."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.unit.verify.account import QUOTAS, Account, Refused, denied, limits, quota, settings, stack_answers
+from tests.unit.verify.account import QUOTAS, Account, Refused, limits, quota, settings, stack_answers
 from verify.preflight import account, deployed
 from verify.preflight.finding import Verdict
 
@@ -48,8 +48,6 @@ MAIL, SITE, LOGGED = {"alarm_email": "a@b.org"}, {"site": True}, {"iot_log_level
 DEFENDER, AUDITED = {"device_defender": True}, {"DescribeAccountAuditConfiguration": {"roleArn": ROLE}}
 PROD = {"stage": "prod", "account_concurrency": 105, **BY_PUBNUB}
 RESERVED = {"GetFunctionConcurrency": {"ReservedConcurrentExecutions": 5}}
-BATCHES = {"ListTables": {"TableNames": ["iort-storage-Batches-A", "another-storage-Batches"]}}
-LAST = "https://sqs.eu-west-1.amazonaws.com/1/iort-quarantine-Last-A"
 STORAGE = stack_answers({"storage": "UPDATE_COMPLETE"})
 OF_PROD = stack_answers({"storage": "UPDATE_COMPLETE"}, tags=[("stage", "prod")])
 STUCK = (
@@ -109,9 +107,6 @@ CASES = [
         "100 of them unreserved",
     ),
     ("concurrency", PROD | {"account_concurrency": 104}, executions(104, 104), FINE, "0 are to be reserved"),
-    ("cloudfront", {}, {"ListDistributions": denied("cloudfront:ListDistributions")}, FINE, "not wanted"),
-    ("cloudfront", SITE, {}, WARNING, "cannot be read"),
-    ("cloudfront", SITE, holding("site", "AWS::S3::Bucket", "Page", "iort-site-page"), FINE, "deployed"),
     ("quotas", {}, {}, FINE, "first limit: "),
     ("quotas", {}, {"ListServiceQuotas": {"Quotas": [quota(PUBLISHES, 500)]}}, WARNING, f"{PUBLISHES}, 500"),
     (
@@ -149,33 +144,6 @@ CASES = [
         "without their stack: dashboard iort-platform",
     ),
     ("names", {}, {"GetPolicy": {"policyName": "a"}} | stack_answers(ALL), FINE, "used by this deployment"),
-    ("kept", {}, {}, FINE, "no leftovers"),
-    (
-        "kept",
-        {},
-        {
-            **BATCHES,
-            "ListBuckets": {"Buckets": [{"Name": "iort-storage-files-a"}]},
-            "ListQueues": {"QueueUrls": [LAST]},
-            "DescribeLogGroups": {"logGroups": [{"logGroupName": "iort-fleet-AdmitLog-A"}]},
-        },
-        WARNING,
-        "iort-fleet-AdmitLog-A, iort-quarantine-Last-A, iort-storage-Batches-A, iort-storage-files-a",
-    ),
-    (
-        "kept",
-        {},
-        {"ListQueues": {"QueueUrls": [LAST]}} | holding("quarantine", "Q", "L", LAST),
-        FINE,
-        "no left",
-    ),
-    (
-        "kept",
-        {},
-        BATCHES | holding("storage", "T", "Batches", "iort-storage-Batches-A"),
-        FINE,
-        "no leftovers",
-    ),
     ("live_messages", {}, {}, FINE, "by AWS IoT (live_transport=iot); PubNub's keys are not stored"),
     ("live_messages", {}, STORED, FINE, "by AWS IoT (live_transport=iot); PubNub's keys are stored"),
     ("live_messages", BY_PUBNUB, STORED, FINE, "by PubNub"),
