@@ -19,7 +19,7 @@ from stacks.acknowledged import Acknowledged, acknowledge
 from stacks.analysis import Analysis
 from stacks.archive import Archive
 from stacks.fleet import Fleet
-from stacks.ingest import Ingest, refuse_what_the_embedded_cloud_drops
+from stacks.ingest import Ingest
 from stacks.monitoring import Monitoring
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
@@ -49,7 +49,6 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
             account.add_stack_dependency(other)
     for key, value in {"project": settings.namespace, "stage": settings.stage, **settings.tags}.items():
         Tags.of(app).add(key, value)
-    refuse_what_the_embedded_cloud_drops(app)
     return acknowledge(app, settings)
 
 

@@ -52,28 +52,6 @@ PROVISIONING = (
     | {(f"iot:{action}", f"{IOT}:policy/iort-robot") for action in ("GetPolicy", "ListTargetsForPolicy")}
     | {(f"iot:{action}", "*") for action in ANY_PROVISIONING}
 )
-# AWS' managed policy for registering things, version 3 of 2020-10-05, which allows all of it on "*":
-# "AWS managed policies", AWSIoTThingsRegistration.
-THINGS_REGISTRATION = {
-    *("AddThingToBillingGroup", "AddThingToThingGroup", "AttachPolicy", "AttachPrincipalPolicy"),
-    *("AttachThingPrincipal", "CreateCertificateFromCsr", "CreatePolicy", "CreateThing"),
-    *("DescribeBillingGroup", "DescribeCertificate", "DescribeThing", "DescribeThingGroup"),
-    *("DescribeThingType", "DetachPolicy", "DetachThingPrincipal", "GetPolicy", "ListAttachedPolicies"),
-    *("ListPolicyPrincipals", "ListPrincipalPolicies", "ListPrincipalThings", "ListTargetsForPolicy"),
-    *("ListThingGroupsForThing", "ListThingPrincipals", "RegisterCertificate", "RegisterThing"),
-    *("RemoveThingFromBillingGroup", "RemoveThingFromThingGroup", "UpdateCertificate", "UpdateThing"),
-    "UpdateThingGroupsForThing",
-}
-# The actions that our role lacks, with the reason.
-NOT_REGISTERED = {
-    "AddThingToBillingGroup": "the template names no billing group",
-    "CreateCertificateFromCsr": "a robot asks for it itself, by MQTT; this is for tasks of many things",
-    "CreatePolicy": "the template names a policy that exists; who makes one could allow everything",
-    "DescribeBillingGroup": "the template names no billing group",
-    "RegisterCertificate": "the certificates are AWS' own, registered when they are made",
-    "RemoveThingFromBillingGroup": "the template names no billing group",
-}
-
 # Permissions of the audit's checks: all certificates and policies.
 AUDIT_READS = {action for role, action in EVERY_RESOURCE if role == "AuditRole"}
 LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
@@ -98,186 +76,112 @@ READS_DRIVES = {
     ("s3:GetObject", f"Files.Arn/{ARCHIVE_PREFIX}*"),
     ("dynamodb:GetItem", "Robots.Arn"),
 }
-# For every role: each action on each resource, and who may assume it.
 # People of the account, if their own policy lets them assume the role.
 PEOPLE = "arn:${AWS::Partition}:iam::${AWS::AccountId}:root"
 
 
-def listens(robots: str = "") -> set[tuple[str, str]]:
-    """The permissions to hear robots' live messages."""
+def person(name: str, *lanes: str) -> set[tuple[str, str]]:
+    """The permissions to connect, to hear robots' live messages, and to send to every robot on ``lanes``."""
     return {
-        ("iot:Subscribe", f"{IOT}:topicfilter/live/iort/{robots}*"),
-        ("iot:Receive", f"{IOT}:topic/live/iort/{robots}*"),
+        ("iot:Connect", f"{IOT}:client/iort-{name}-*"),
+        ("iot:Subscribe", f"{IOT}:topicfilter/live/iort/*"),
+        ("iot:Receive", f"{IOT}:topic/live/iort/*"),
+        *(("iot:Publish", f"{IOT}:topic/{lane}/iort/*") for lane in lanes),
     }
 
 
-def publishes(*lanes: str) -> set[tuple[str, str]]:
-    """The permission to send messages to every robot."""
-    return {("iot:Publish", f"{IOT}:topic/{lane}/iort/*") for lane in lanes}
-
-
-def connects(name: str) -> set[tuple[str, str]]:
-    """The permission to connect under this name."""
-    return {("iot:Connect", f"{IOT}:client/iort-{name}-*")}
-
+# By function, beside the writing of its own log.
+OF_FUNCTIONS = {
+    "Live": DESTINATION | {("ssm:GetParameter", f"{IOT.replace(':iot:', ':ssm:')}:parameter/iort/pubnub")},
+    "Summarize": DESTINATION
+    | SUMMARIZES
+    | {
+        ("dynamodb:DescribeStream", "Batches.StreamArn"),
+        ("dynamodb:GetRecords", "Batches.StreamArn"),
+        ("dynamodb:GetShardIterator", "Batches.StreamArn"),
+        ("dynamodb:ListStreams", "*"),
+        ("sqs:SendMessage", "PutOff.Arn"),
+        ("iot:UpdateThingShadow", f"{IOT}:thing/*/{SHADOW}"),
+    },
+    "Later": DESTINATION
+    | SUMMARIZES
+    | {("dynamodb:GetItem", "Batches.Arn")}
+    | {(f"sqs:{action}", "PutOff.Arn") for action in CONSUME},
+    "Archive": {("dynamodb:Query", "Batches.Arn"), ("dynamodb:UpdateItem", "Batches.Arn")}
+    | {
+        (f"dynamodb:{action}", "Archive.Arn")
+        for action in ("GetItem", "PutItem", "UpdateItem", "DeleteItem", "Query")
+    }
+    | {("dynamodb:Scan", "Robots.Arn"), ("s3:ListBucket", "Files.Arn")}
+    | {
+        (f"s3:{action}", f"Files.Arn/{ARCHIVE_PREFIX}*")
+        for action in ("DeleteObject", "GetObject", "PutObject")
+    }
+    | {(f"sqs:{action}", "ArchiveTasks.Arn") for action in ("SendMessage", *CONSUME)},
+    "Echo": DESTINATION | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
+    "Quarantine": {
+        ("dynamodb:UpdateItem", "Quarantine.Arn"),
+        ("dynamodb:GetRecords", "Batches.StreamArn"),
+        ("dynamodb:GetShardIterator", "Batches.StreamArn"),
+        *((f"sqs:{action}", "Rejected.Arn") for action in CONSUME),
+    },
+    "Query": {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Batches.Arn")}
+    | {("dynamodb:GetItem", "Robots.Arn")}
+    | {(f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")},
+    "Upload": DESTINATION
+    | {
+        (f"s3:{action}", f"Files.Arn/{FILES_PREFIX}*")
+        for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
+    }
+    | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
+    | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
+    "Answer": DESTINATION
+    | {("dynamodb:Query", "Findings.Arn"), ("dynamodb:UpdateItem", "Robots.Arn")}
+    | {("iot:Publish", f"{IOT}:topic/answer/iort/*/*")}
+    | {("s3:GetObject", f"Files.Arn/{FILES_PREFIX}*/{ASK_FOLDER}/*")}
+    | {
+        (f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}{ASK_FOLDER}/*") for action in ("GetObject", "PutObject")
+    },
+    "Admit": {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:DescribeCertificate", f"{IOT}:cert/*")},
+    "Presence": DESTINATION | {("dynamodb:UpdateItem", "Robots.Arn")},
+    "Alert": DESTINATION | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
+    "Plan": READS_DRIVES
+    | {
+        ("dynamodb:Scan", "Robots.Arn"),
+        ("dynamodb:Query", "Findings.Arn"),
+        ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
+    },
+    "Analyse": READS_DRIVES
+    | {("dynamodb:PutItem", "Findings.Arn"), ("s3:PutObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")},
+    "Evaluate": {
+        ("dynamodb:Query", "Findings.Arn"),
+        ("s3:ListBucket", "Files.Arn"),
+        ("s3:GetObject", f"Files.Arn/{ANALYSIS_PREFIX}*"),
+        ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
+    },
+    "Present": {(f"dynamodb:{action}", "Findings.Arn") for action in ("Query", "PutItem", "DeleteItem")}
+    | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")}
+    | {("s3:ListBucket", "Files.Arn"), ("s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")},
+}
+# The topic rules' roles beside the sending of what fails.
+OF_RULES = {
+    "Record": {("dynamodb:PutItem", "Batches.Arn")},
+    "Pong": {("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")},
+    **{name: set() for name in ("Live", "Echo", "Upload", "Ask", "Fault", "Battery", "Presence", "Version")},
+}
 
 # What everybody gets from the page on the web.
-PUBLIC = connects("viewer") | listens()
+PUBLIC = person("viewer")
+# For every role: who may assume it, and each action on each resource.
 ROLES = {
-    "Viewer": (PEOPLE, connects("viewer") | listens() | publishes("view")),
-    "Driver": (PEOPLE, connects("driver") | listens() | publishes("view", "cmd")),
-    "LiveRole": (
-        "lambda.amazonaws.com",
-        {(action, "LiveLog.Arn") for action in LOG}
-        | DESTINATION
-        | {
-            (
-                "ssm:GetParameter",
-                "arn:${AWS::Partition}:ssm:${AWS::Region}:${AWS::AccountId}:parameter/iort/pubnub",
-            )
-        },
-    ),
-    "SummarizeRole": (
-        "lambda.amazonaws.com",
-        {(action, "SummarizeLog.Arn") for action in LOG}
-        | SUMMARIZES
-        | {
-            ("dynamodb:DescribeStream", "Batches.StreamArn"),
-            ("dynamodb:GetRecords", "Batches.StreamArn"),
-            ("dynamodb:GetShardIterator", "Batches.StreamArn"),
-            ("dynamodb:ListStreams", "*"),
-            ("sqs:SendMessage", "PutOff.Arn"),
-            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{SHADOW}"),
-        }
-        | DESTINATION,
-    ),
-    "LaterRole": (
-        "lambda.amazonaws.com",
-        {(action, "LaterLog.Arn") for action in LOG}
-        | SUMMARIZES
-        | {("dynamodb:GetItem", "Batches.Arn")}
-        | {(f"sqs:{action}", "PutOff.Arn") for action in CONSUME}
-        | DESTINATION,
-    ),
-    "ArchiveRole": (
-        "lambda.amazonaws.com",
-        {(action, "ArchiveLog.Arn") for action in LOG}
-        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:UpdateItem", "Batches.Arn")}
-        | {
-            (f"dynamodb:{action}", "Archive.Arn")
-            for action in ("GetItem", "PutItem", "UpdateItem", "DeleteItem", "Query")
-        }
-        | {("dynamodb:Scan", "Robots.Arn"), ("s3:ListBucket", "Files.Arn")}
-        | {
-            (f"s3:{action}", f"Files.Arn/{ARCHIVE_PREFIX}*")
-            for action in ("DeleteObject", "GetObject", "PutObject")
-        }
-        | {(f"sqs:{action}", "ArchiveTasks.Arn") for action in ("SendMessage", *CONSUME)},
-    ),
+    "Viewer": (PEOPLE, person("viewer", "view")),
+    "Driver": (PEOPLE, person("driver", "view", "cmd")),
+    **{
+        f"{name}Role": ("lambda.amazonaws.com", {(action, f"{name}Log.Arn") for action in LOG} | grants)
+        for name, grants in OF_FUNCTIONS.items()
+    },
+    **{f"ingest/{name}Role": ("iot.amazonaws.com", {REJECT} | grants) for name, grants in OF_RULES.items()},
     "ScheduleRole": ("scheduler.amazonaws.com", {("lambda:InvokeFunction", "Archive.Arn")}),
-    "EchoRole": (
-        "lambda.amazonaws.com",
-        {(action, "EchoLog.Arn") for action in LOG}
-        | DESTINATION
-        | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
-    ),
-    "QuarantineRole": (
-        "lambda.amazonaws.com",
-        {(action, "QuarantineLog.Arn") for action in LOG}
-        | {
-            ("dynamodb:UpdateItem", "Quarantine.Arn"),
-            ("dynamodb:GetRecords", "Batches.StreamArn"),
-            ("dynamodb:GetShardIterator", "Batches.StreamArn"),
-            ("sqs:ReceiveMessage", "Rejected.Arn"),
-            ("sqs:DeleteMessage", "Rejected.Arn"),
-            ("sqs:ChangeMessageVisibility", "Rejected.Arn"),
-            ("sqs:GetQueueAttributes", "Rejected.Arn"),
-            ("sqs:GetQueueUrl", "Rejected.Arn"),
-        },
-    ),
-    "QueryRole": (
-        "lambda.amazonaws.com",
-        {(action, "QueryLog.Arn") for action in LOG}
-        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Batches.Arn")}
-        | {("dynamodb:GetItem", "Robots.Arn")}
-        | {(f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")},
-    ),
-    "UploadRole": (
-        "lambda.amazonaws.com",
-        {(action, "UploadLog.Arn") for action in LOG}
-        | DESTINATION
-        | {
-            (f"s3:{action}", f"Files.Arn/{FILES_PREFIX}*")
-            for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
-        }
-        | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
-        | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
-    ),
-    "AnswerRole": (
-        "lambda.amazonaws.com",
-        {(action, "AnswerLog.Arn") for action in LOG}
-        | DESTINATION
-        | {("dynamodb:Query", "Findings.Arn"), ("dynamodb:UpdateItem", "Robots.Arn")}
-        | {("iot:Publish", f"{IOT}:topic/answer/iort/*/*")}
-        | {("s3:GetObject", f"Files.Arn/{FILES_PREFIX}*/{ASK_FOLDER}/*")}
-        | {
-            (f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}{ASK_FOLDER}/*")
-            for action in ("GetObject", "PutObject")
-        },
-    ),
-    "AdmitRole": (
-        "lambda.amazonaws.com",
-        {(action, "AdmitLog.Arn") for action in LOG}
-        | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:DescribeCertificate", f"{IOT}:cert/*")},
-    ),
-    "PresenceRole": (
-        "lambda.amazonaws.com",
-        {(action, "PresenceLog.Arn") for action in LOG}
-        | DESTINATION
-        | {("dynamodb:UpdateItem", "Robots.Arn")},
-    ),
-    "AlertRole": (
-        "lambda.amazonaws.com",
-        {(action, "AlertLog.Arn") for action in LOG}
-        | DESTINATION
-        | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
-    ),
-    "PlanRole": (
-        "lambda.amazonaws.com",
-        {(action, "PlanLog.Arn") for action in LOG}
-        | READS_DRIVES
-        | {
-            ("dynamodb:Scan", "Robots.Arn"),
-            ("dynamodb:Query", "Findings.Arn"),
-            ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
-        },
-    ),
-    "AnalyseRole": (
-        "lambda.amazonaws.com",
-        {(action, "AnalyseLog.Arn") for action in LOG}
-        | READS_DRIVES
-        | {
-            ("dynamodb:PutItem", "Findings.Arn"),
-            ("s3:PutObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*"),
-        },
-    ),
-    "EvaluateRole": (
-        "lambda.amazonaws.com",
-        {(action, "EvaluateLog.Arn") for action in LOG}
-        | {
-            ("dynamodb:Query", "Findings.Arn"),
-            ("s3:ListBucket", "Files.Arn"),
-            ("s3:GetObject", f"Files.Arn/{ANALYSIS_PREFIX}*"),
-            ("s3:PutObject", f"Files.Arn/{PLANS_PREFIX}*"),
-        },
-    ),
-    "PresentRole": (
-        "lambda.amazonaws.com",
-        {(action, "PresentLog.Arn") for action in LOG}
-        | {(f"dynamodb:{action}", "Findings.Arn") for action in ("Query", "PutItem", "DeleteItem")}
-        | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")}
-        | {("s3:ListBucket", "Files.Arn"), ("s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")},
-    ),
     "MachineRole": (
         "states.amazonaws.com",
         {("lambda:InvokeFunction", f"{name}.Arn") for name in ("Plan", "Analyse", "Evaluate", "Present")}
@@ -300,16 +204,6 @@ ROLES = {
         "iot.amazonaws.com",
         {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
     ),
-    "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Batches.Arn")}),
-    "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
-    "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/AskRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/FaultRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/BatteryRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
 # The attributes of a robot's row that each function may change.
 KEEPS = {
