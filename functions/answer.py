@@ -11,7 +11,7 @@ from functions.shared import clients
 from functions.shared.clients import variables
 from functions.shared.metrics import emit
 from functions.shared.questions import WORK, Bodies, RefusedError, Work, check_size
-from functions.shared.queues import DeadLetterQueue, refused_event
+from functions.shared.queues import quarantined
 from functions.shared.quotas import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
 from iort_contract.catalog.questions import QUESTIONS, Question
@@ -42,36 +42,29 @@ _log.setLevel(logging.INFO)
 
 
 class Desk(NamedTuple):
-    """What an answer takes: the answers themselves, the robots' quotas, the bucket, the way to the robot, and
-    the queue before the quarantine, which says if it took a text."""
+    """What an answer takes: the answers themselves, the robots' quotas, the bucket, the way to the robot."""
 
     work: Mapping[str, Work]
     quota_of: Callable[[Question], Quota]
     bodies: Bodies
     reply: Callable[[Topic, Answer], None]
-    keep: Callable[[str], bool]
 
 
-def serve(event: Mapping[str, Any], function_arn: str, desk: Desk, now_s: float) -> None:
-    """Answer a rule's event.
-
-    A malformed question goes to the quarantine; `ContractError` if the queue does not take it, so that
-    Lambda sends it there. Any other error is told to the robot, and raised again.
-    """
+def serve(event: Mapping[str, Any], desk: Desk, now_s: float) -> None:
+    """Answer a rule's event. Any error is told to the robot, and raised: `ContractError` for a malformed
+    question, which the quarantine keeps."""
     topic = parse_topic(event[TOPIC])
     message = event_message(event)
     request_id = ask_id(message)
     try:
-        try:
-            ask = decode_ask(message)
-        except ContractError as error:
-            if not desk.keep(refused_event(function_arn, event, str(error))):
-                raise
-            raise RefusedError(MALFORMED, str(error)) from error
+        ask = decode_ask(message)
         body = _answered(topic, ask, ask.deadline_us(event[RECEIVED_MS]), desk, now_s)
     except RefusedError as error:
         _refuse(topic, request_id, error.refusal, desk)
         return
+    except ContractError as error:
+        _refuse(topic, request_id, Refusal(MALFORMED, str(error)), desk)
+        raise
     except Exception as error:
         _refuse(topic, request_id, Refusal(FAILED, type(error).__name__), desk)
         raise
@@ -145,13 +138,15 @@ def _quota_of(question: Question) -> Quota:
     )
 
 
+@quarantined
+def _serve(event: Mapping[str, Any]) -> None:
+    bodies = Bodies(clients.s3(), variables(AnswerEnvironment).files_bucket, clients.s3_for_robots())
+    serve(event, Desk(WORK, _quota_of, bodies, _reply), time.time())
+
+
 def handler(event: dict[str, Any], context: Any) -> dict[str, Any] | None:
     """Entry point of the rule ask, and of an operator."""
     if TOPIC not in event:
         return operators(event)
-    given = variables(AnswerEnvironment)
-    queue = DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue)
-    bodies = Bodies(clients.s3(), given.files_bucket, clients.s3_for_robots())
-    desk = Desk(WORK, _quota_of, bodies, _reply, queue.keep)
-    serve(event, context.invoked_function_arn, desk, time.time())
+    _serve(event, context)
     return None

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
-from functions.shared import clients
 from functions.shared.clients import variables
 from functions.shared.metrics import Gathered, emit
 from functions.shared.pubnub_client import NotConfiguredError, PublishError, StoredPublisher
-from functions.shared.queues import DeadLetterQueue, refused_event
+from functions.shared.queues import quarantined
 from functions.shared.quotas import RateLimiter
 from iort_contract.catalog.environments import LiveEnvironment
 from iort_contract.catalog.vesc import absent
@@ -25,49 +23,6 @@ from iort_contract.messages.live import LiveSample, decode_live, live_update
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import parse_topic
 
-_ROBOTS = 1000
-_WINDOW_MS = 15_000
-
-
-@dataclass
-class _Run:
-    """The fastest message of the current window and of the previous one."""
-
-    boot: str
-    began_ms: int
-    fastest_us: int
-    fastest_before_us: int
-
-
-class DelayEstimator:
-    """Compares each message with the fastest of its run in the last 15 to 30 s.
-
-    Both contain the difference between the car's clock and the cloud's, so it cancels out. It misses a delay
-    that all messages of half a minute share, and that of the first message of a run or of a new environment.
-    It serves the cars that do not know their clock offset (`iort_contract.LiveSample`). After a car's clock
-    is set back, its messages look late until the window has passed. Each environment keeps one, for the
-    thousand robots that sent last, and the latest run of each: robots know each other's run names, and must
-    not act for another.
-    """
-
-    def __init__(self) -> None:
-        self._runs: OrderedDict[str, _Run] = OrderedDict()
-
-    def excess_us(self, robot: str, boot: str, sent_us: int, received_ms: int) -> int:
-        """Note a message of a robot's run; return its delay above the fastest, in microseconds."""
-        leg_us = received_ms * 1000 - sent_us
-        run = self._runs.pop(robot, None)
-        if run is None or run.boot != boot:
-            run = _Run(boot, received_ms, leg_us, leg_us)
-        self._runs[robot] = run
-        if len(self._runs) > _ROBOTS:
-            self._runs.popitem(last=False)
-        if received_ms - run.began_ms >= _WINDOW_MS:
-            run.began_ms, run.fastest_before_us, run.fastest_us = received_ms, run.fastest_us, leg_us
-        run.fastest_us = min(run.fastest_us, leg_us)
-        return leg_us - min(run.fastest_us, run.fastest_before_us)
-
-
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 
@@ -76,7 +31,7 @@ _log.setLevel(logging.INFO)
 REFUSALS, REFUSALS_A_SECOND = 20, 1.0
 
 
-class RefusedError(Exception):
+class RefusedError(ContractError):
     """A live message that is malformed."""
 
 
@@ -86,25 +41,20 @@ class Lane:
 
     ``fields`` are those on the dashboard, by stream; a stream not named sends all. ``publish`` sends to
     PubNub.
-    ``keep`` puts a refused message into the quarantine's queue, and returns whether the queue took it.
     """
 
     fields: Mapping[str, list[str]]
     publish: Callable[[str, dict[str, Any]], None]
-    keep: Callable[[str], bool]
-    estimator: DelayEstimator = field(default_factory=DelayEstimator)
     counted: Gathered = field(default_factory=lambda: Gathered("live"))
     refusals: RateLimiter = field(
         default_factory=lambda: RateLimiter(burst=REFUSALS, a_second=REFUSALS_A_SECOND)
     )
 
-    def serve(self, event: Any, now_us: int, function_arn: str) -> None:
-        """`show` a message, or put it into the quarantine's queue.
+    def serve(self, event: Any, now_us: int) -> None:
+        """`show` a message.
 
-        A failed invocation may cost its environment, and all robots wait for the next one. So this fails only
-        if the queue does not take the message; Lambda then sends it to the same queue. While a robot's
-        refusals are used up, its messages are skipped, good or bad. About one a second is still looked at, so
-        that a repaired robot is seen again at once.
+        While a robot's refusals are used up, its messages are skipped, good or bad. About one a second is
+        still looked at, so that a repaired robot is seen again at once.
         """
         robot, now_s = _robot(event), now_us / 1e6
         if self.refusals.left(robot, now_s) < 1:
@@ -113,12 +63,11 @@ class Lane:
         try:
             self.show(event, now_us)
         except RefusedError as error:
-            reason = str(error)
-            if self.refusals.spend(robot, now_s, 1) < 1:
-                reason += "; so many were refused that the next are not looked at, metric LiveCutOff"
-                _log.warning("live messages of %s are skipped for a while", robot)
-            if not self.keep(refused_event(function_arn, event, reason)):
+            if self.refusals.spend(robot, now_s, 1) >= 1:
                 raise
+            _log.warning("live messages of %s are skipped for a while", robot)
+            more = "so many were refused that the next are not looked at, metric LiveCutOff"
+            raise RefusedError(f"{error}; {more}") from error
 
     def show(self, event: Mapping[str, Any], now_us: int) -> None:
         """Publish one live message, or count why not. A live message is never retried.
@@ -137,7 +86,7 @@ class Lane:
         if live.offset_us is not None:
             uplink_ms = max(0.0, received_ms - (live.sent_us + live.offset_us) / 1000)
             way_ms = max(0.0, (now_us - live.sent_us - live.offset_us) / 1000)
-        if age_ms(topic.robot, live, received_ms, now_us, self.estimator) > LIVE_MAX_AGE_MS:
+        if age_ms(live, received_ms, now_us) > LIVE_MAX_AGE_MS:
             # Stale messages are late ones: the alarm must count them, or it would never go off.
             self.counted.add(now_us / 1e6, LiveStale=1, CarToLambdaMs=way_ms)
             return
@@ -168,19 +117,15 @@ class Lane:
         )
 
 
-def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, estimator: DelayEstimator) -> float:
-    """How old a robot's sample is, regardless of the car's clock.
+def age_ms(live: LiveSample, received_ms: int, now_us: int) -> float:
+    """How old a sample is.
 
     A car that knows its clock offset sends it in the message, so the whole way is measured on one clock. For
-    other cars the age is the time in the car plus the time in the cloud, each by its own clock, plus the
-    network's delay above its usual minimum.
+    other cars the age is the time in the car plus the time in the cloud, each by its own clock.
     """
     if live.offset_us is not None:
         return (now_us - live.t_us - live.offset_us) / 1000
-    in_car_us = live.sent_us - live.t_us
-    in_cloud_us = now_us - received_ms * 1000
-    excess_us = estimator.excess_us(robot, live.boot, live.sent_us, received_ms)
-    return (in_car_us + excess_us + in_cloud_us) / 1000
+    return (live.sent_us - live.t_us + now_us) / 1000 - received_ms
 
 
 def _robot(event: Any) -> str:
@@ -193,14 +138,10 @@ def _robot(event: Any) -> str:
 def lane() -> Lane:
     """The lane of this environment."""
     given = variables(LiveEnvironment)
-    publisher = StoredPublisher(given.pubnub_parameter)
-
-    def keep(body: str) -> bool:
-        return DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue).keep(body)
-
-    return Lane(given.live_fields, publisher.publish, keep)
+    return Lane(given.live_fields, StoredPublisher(given.pubnub_parameter).publish)
 
 
-def handler(event: dict[str, Any], context: Any) -> None:
+@quarantined
+def handler(event: Any) -> None:
     """Entry point of the live rule's Lambda action."""
-    lane().serve(event, time.time_ns() // 1000, context.invoked_function_arn)
+    lane().serve(event, time.time_ns() // 1000)

@@ -6,7 +6,7 @@ import base64
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import ClientError
@@ -14,7 +14,7 @@ from botocore.exceptions import ClientError
 from functions.shared import clients
 from functions.shared.clients import variables
 from functions.shared.metrics import emit
-from functions.shared.queues import DeadLetterQueue, refused_event
+from functions.shared.queues import quarantined
 from functions.shared.quotas import DAY, Quota
 from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.checks import json_object
@@ -224,32 +224,38 @@ def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
         yield first, last
 
 
-def serve(
-    event: Mapping[str, Any],
-    function_arn: str,
-    *,
-    bucket: Bucket,
-    quota: Quota,
-    reply: Callable[[Topic, FileAnswer], None],
-    keep: Callable[[str], bool],
-) -> None:
-    """Answer a request by ``reply``. A malformed one is refused; without an id it cannot be answered, and
-    goes to the quarantine's queue by ``keep``. Raises `ContractError` if the queue does not take it, so that
-    Lambda sends it there."""
-    topic = parse_topic(event[TOPIC])
+def _reply(topic: Topic, found: FileAnswer) -> None:
+    answers = build_topic(PONG, topic.robot, FILE, topic.namespace)
+    clients.iot_data().publish(topic=answers, qos=1, payload=encode_file_answer(found))
+
+
+@quarantined
+def handler(event: Mapping[str, Any]) -> None:
+    """Entry point of the upload rule's Lambda action.
+
+    A malformed request is refused; without an id it cannot be answered, and goes to the quarantine.
+    """
+    given, topic = variables(UploadEnvironment), parse_topic(event[TOPIC])
     envelope: dict[str, Any] = {}
     try:
         envelope = json_object(event_message(event), "file request")
         request = decode_file_request(envelope)
     except ContractError as error:
-        _log.warning("refused a request of %s: %s", topic.robot, error)
         emit("upload", FilesRefused=1)
         request_id = file_request_id(envelope)
-        if request_id is not None:
-            reply(topic, FileAnswer(request_id, refused=str(error)))
-        elif not keep(refused_event(function_arn, event, str(error))):
+        if request_id is None:
             raise
+        _log.warning("refused a request of %s: %s", topic.robot, error)
+        _reply(topic, FileAnswer(request_id, refused=str(error)))
         return
+    bucket = Bucket(clients.s3(), given.files_bucket, clients.s3_for_robots())
+    quota = Quota(
+        clients.dynamodb(),
+        table=given.robots_table,
+        named=(FILES_DAY, FILES_BYTES),
+        period=DAY,
+        most=given.upload_bytes_a_day,
+    )
     found = answer(topic.robot, request, bucket, quota, time.time())
     done = found.stored and request.parts_sha256 is not None
     emit(
@@ -259,28 +265,4 @@ def serve(
         FilesStored=int(done),
         StoredBytes=request.file.size if done else 0,
     )
-    reply(topic, found)
-
-
-def _reply(topic: Topic, found: FileAnswer) -> None:
-    answers = build_topic(PONG, topic.robot, FILE, topic.namespace)
-    clients.iot_data().publish(topic=answers, qos=1, payload=encode_file_answer(found))
-
-
-def handler(event: dict[str, Any], context: Any) -> None:
-    """Entry point of the upload rule's Lambda action."""
-    given = variables(UploadEnvironment)
-    serve(
-        event,
-        context.invoked_function_arn,
-        bucket=Bucket(clients.s3(), given.files_bucket, clients.s3_for_robots()),
-        quota=Quota(
-            clients.dynamodb(),
-            table=given.robots_table,
-            named=(FILES_DAY, FILES_BYTES),
-            period=DAY,
-            most=given.upload_bytes_a_day,
-        ),
-        reply=_reply,
-        keep=lambda body: DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue).keep(body),
-    )
+    _reply(topic, found)

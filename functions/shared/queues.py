@@ -1,15 +1,20 @@
-"""Sends many messages to an SQS queue in few calls."""
+"""Sends many messages to an SQS queue in few calls, and what was refused to the quarantine's."""
 
 from __future__ import annotations
 
 import base64
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import wraps
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from functions.shared import clients
+from functions.shared.clients import variables
+from iort_contract.catalog.environments import EchoEnvironment
+from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, ITEM_BASE64, REASON, TOPIC
 
 if TYPE_CHECKING:
@@ -76,15 +81,6 @@ class DeadLetterQueue:
         messages = [{"MessageBody": message(one)} for one in refused]
         return [refused[place] for place in sorted(send_all(self._client, self._queue_url, messages))]
 
-    def keep(self, body: str) -> bool:
-        """Send one body made by `message` or `refused_event`; return whether the queue took it."""
-        try:
-            self._client.send_message(QueueUrl=self._queue_url, MessageBody=body)
-        except (BotoCoreError, ClientError) as error:
-            _log.warning("the queue did not take a refused message: %s", error)
-            return False
-        return True
-
 
 def message(refused: Refused) -> str:
     """The queue's message. The item is in base64, since its text may hold characters that SQS refuses.
@@ -99,17 +95,32 @@ def message(refused: Refused) -> str:
     return body
 
 
-def refused_event(function_arn: str, event: Any, reason: str) -> str:
-    """The queue's message for an event that a function refused without failing.
+def quarantined(serve: Callable[[Any], None]) -> Callable[[Any, Any], None]:
+    """A handler of a rule's events. What ``serve`` refuses by `ContractError` goes to the quarantine.
 
-    It has the form of Lambda's record of a failed invocation ("Destination event format")."""
-    return json.dumps(
-        {
-            "requestContext": {"functionArn": function_arn, "condition": "Refused"},
-            "requestPayload": event,
-            "responsePayload": {"errorMessage": reason[:1000]},
-        }
-    )
+    The invocation does not fail then, since a failure may cost the environment, and the next event waits for
+    another one. It fails if the queue does not take the event: Lambda then sends it to the same queue.
+    """
+
+    @wraps(serve)
+    def handler(event: Any, context: Any) -> None:
+        try:
+            serve(event)
+        except ContractError as error:
+            # The form of Lambda's record of a failed invocation: "Destination event format".
+            record = {
+                "requestContext": {"functionArn": context.invoked_function_arn, "condition": "Refused"},
+                "requestPayload": event,
+                "responsePayload": {"errorMessage": str(error)[:1000]},
+            }
+            queue_url = variables(EchoEnvironment).rejected_queue
+            try:
+                clients.sqs(at_once=True).send_message(QueueUrl=queue_url, MessageBody=json.dumps(record))
+            except (BotoCoreError, ClientError) as failure:
+                _log.warning("the queue did not take a refused message: %s", failure)
+                raise error from failure
+
+    return handler
 
 
 def _body(reason: str, item: Mapping[str, Any]) -> str:

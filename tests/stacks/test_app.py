@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 from aws_cdk import App, assertions
 
-from iort_contract.catalog import environments
-from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
-from iort_contract.cloud import pubnub_parameter
-from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.page import HEADERS, pubnub_address, security_policy
 from iort_station.cost.usage import Usage
 from stacks.account import Account
-from stacks.parts import PlatformStack, function
 from stacks.settings import ROOT, Settings, SettingsError
 from tests.stacks.templates import layers, name
 from tests.stacks.test_monitoring import FUNCTIONS
@@ -116,6 +110,7 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         True,
     )
     assert settings(embedded="false").embedded is False
+    assert [settings(iot_log_level=level).iot_log_level for level in ("off", "debug")] == ["", "debug"]
     assert given.reserved_for_live == 0
     assert settings().reserved_for_live == 0 == Usage().live_concurrency
     large = {"stage": "prod", "account_concurrency": 105}
@@ -168,6 +163,8 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"tags": "aws:x=1"}, ["tags", "'aws:x=1'"]),
         ({"tags": {"team": 7}}, ["tags", "7"]),
         ({"layer": "build/nowhere"}, ["build/nowhere", "make layer"]),
+        ({"iot_log_level": "loud"}, ["iot_log_level", "'loud'", "off, error, warn, info or debug"]),
+        ({"function_logs": "none"}, ["function_logs", "'none'", "own or all"]),
     ],
 )
 def test_the_error_of_a_wrong_value_names_key_value_and_allowed_values(settings, context, words):
@@ -190,28 +187,6 @@ def kinds(**settings):
     return {one["Type"] for one in resources.values() if one["Type"].startswith("AWS::IoT::")}
 
 
-def test_every_scheduled_check_is_enabled(synthesized, reader):
-    (audit,) = synthesized.resources("AWS::IoT::AccountAuditConfiguration").values()
-    (daily,) = synthesized.resources("AWS::IoT::ScheduledAudit").values()
-    enabled = {
-        name.lower()
-        for name, check in audit["AuditCheckConfigurations"].items()
-        if check == {"Enabled": True}
-    }
-    assert enabled == {name.replace("_", "").lower() for name in daily["TargetCheckNames"]}
-    assert {"unauthenticatedcognitoroleoverlypermissivecheck"} < enabled
-    assert len(enabled) == 12
-    assert daily["Frequency"] == "DAILY"
-    assert audit["AccountId"] == {"Ref": "AWS::AccountId"}
-    assert reader.text(audit["RoleArn"]) == "AuditRole.Arn"
-
-
-def test_aws_iot_logs_errors(synthesized, reader):
-    (log,) = synthesized.resources("AWS::IoT::Logging").values()
-    assert log["DefaultLogLevel"] == "ERROR"
-    assert reader.text(log["RoleArn"]) == "LogRole.Arn"
-
-
 def test_each_account_wide_setting_is_optional():
     """This stack would fail in an account that already has them configured."""
     assert kinds() == set()
@@ -229,98 +204,6 @@ def test_no_stack_depends_on_the_account_stack(deployment):
     before = {stack: app.stacks.keys() & manifest[stack]["dependencies"] for stack in app.stacks}
     assert before.pop("iort-account") == app.stacks.keys() - {"iort-account"}
     assert not any("iort-account" in each for each in before.values())
-
-
-def test_the_embedded_cloud_has_no_account_wide_settings(deployment):
-    app = deployment(embedded=True, site_robots=["*"], device_defender=True, iot_log_level="error")
-    assert not any(app.resources(kind) for kind in KINDS)
-
-
-@pytest.mark.parametrize(("given", "level"), [("off", ""), ("debug", "debug")])
-def test_the_log_level_is_read_from_the_context(tmp_path, given, level):
-    app = App(context={"iot_log_level": given, **layers(tmp_path)})
-    assert Settings.from_context(app).iot_log_level == level
-
-
-def test_an_unknown_log_level_is_refused(tmp_path):
-    with pytest.raises(
-        SettingsError, match=r"iot_log_level must be off, error, warn, info or debug, got 'loud'"
-    ):
-        Settings.from_context(App(context={"iot_log_level": "loud", **layers(tmp_path)}))
-
-
-# The page on the web: only CloudFront reads the bucket, and responses have security headers.
-
-
-@pytest.fixture(scope="module")
-def site() -> dict[str, Any]:
-    from aws_cdk import App
-
-    from stacks.site import Site
-
-    app = App()
-    Site(app, Settings(live_transport="pubnub"))
-    template: dict[str, Any] = app.synth().get_stack_by_name("iort-site").template
-    return template
-
-
-def of(site: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    return [each["Properties"] for each in site["Resources"].values() if each["Type"] == kind]
-
-
-def test_the_site_has_neither_assets_nor_functions(site):
-    assert {each["Type"] for each in site["Resources"].values()} == {
-        "AWS::S3::Bucket",
-        "AWS::S3::BucketPolicy",
-        "AWS::CloudFront::Distribution",
-        "AWS::CloudFront::OriginAccessControl",
-        "AWS::CloudFront::ResponseHeadersPolicy",
-    }
-
-
-def test_only_this_distribution_reads_the_private_bucket(site):
-    (bucket,) = of(site, "AWS::S3::Bucket")
-    assert all(bucket["PublicAccessBlockConfiguration"].values())
-    (policy,) = of(site, "AWS::S3::BucketPolicy")
-    allowed = [each for each in policy["PolicyDocument"]["Statement"] if each["Effect"] == "Allow"]
-    assert [(each["Action"], each["Principal"]) for each in allowed] == [
-        ("s3:GetObject", {"Service": "cloudfront.amazonaws.com"})
-    ]
-    (distribution,) = (
-        n for n, r in site["Resources"].items() if r["Type"] == "AWS::CloudFront::Distribution"
-    )
-    assert {"Ref": distribution} in allowed[0]["Condition"]["StringEquals"]["AWS:SourceArn"]["Fn::Join"][1]
-
-
-def test_the_site_uses_tls_and_the_headers_of_the_pages_own_server(site):
-    (distribution,) = of(site, "AWS::CloudFront::Distribution")
-    behaviour = distribution["DistributionConfig"]["DefaultCacheBehavior"]
-    assert behaviour["ViewerProtocolPolicy"] == "redirect-to-https"
-    assert behaviour["AllowedMethods"] == ["GET", "HEAD"]
-    (headers,) = of(site, "AWS::CloudFront::ResponseHeadersPolicy")
-    security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
-    policy = security["ContentSecurityPolicy"]["ContentSecurityPolicy"]
-    assert policy == security_policy(pubnub_address())
-    assert security["ReferrerPolicy"]["ReferrerPolicy"] == HEADERS["Referrer-Policy"]
-    assert security["ContentTypeOptions"]["Override"] is True
-    assert security["StrictTransportSecurity"]["AccessControlMaxAgeSec"] == 365 * 86_400
-    custom = headers["ResponseHeadersPolicyConfig"]["CustomHeadersConfig"]["Items"]
-    assert {each["Header"]: each["Value"] for each in custom} == {
-        "Cross-Origin-Resource-Policy": HEADERS["Cross-Origin-Resource-Policy"]
-    }
-
-
-def test_without_pubnub_the_page_connects_to_aws_iot_and_cognito_of_its_region_only(deployment, reader):
-    template = deployment(drivers=True, site=True, site_robots=["car1"]).templates["site"]
-    (headers,) = of(template, "AWS::CloudFront::ResponseHeadersPolicy")
-    security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
-    aws = "${AWS::Region}.${AWS::URLSuffix}"
-    wanted = security_policy(f"https://cognito-identity.{aws}", f"wss://*.iot.{aws}")
-    assert reader.text(security["ContentSecurityPolicy"]["ContentSecurityPolicy"]) == wanted
-
-
-def test_the_site_is_optional(synthesized):
-    assert "site" not in synthesized.templates
 
 
 # Both ends of every wire agree: handlers and assets, variables and their readers, rules and topics.
@@ -358,66 +241,6 @@ def test_every_function_module_with_a_handler_is_deployed(functions):
     assert {function["Handler"] for function in functions.values()} == modules
 
 
-def test_a_function_reads_its_variables_in_one_place():
-    """The others are one of Lambda itself, and one of the embedded cloud, for robots in a network."""
-    others = ('"AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ', 'os.environ.get("ROBOTS_S3_ENDPOINT")')
-    for path in FUNCTIONS:
-        text = path.read_text()
-        for other in others:
-            text = text.replace(other, "")
-        read = "environ[" in text or "os.environ" in text or "getenv" in text
-        assert read == (path.name == "clients.py"), path
-
-
-def test_the_variables_have_the_values_that_the_functions_expect(functions, reader):
-    def given(function, kind):
-        variables = functions[function]["Environment"]["Variables"]
-        return kind.read({key: reader.text(value) for key, value in variables.items()})
-
-    name = DEFAULT_NAMESPACE
-    later = environments.LaterEnvironment(
-        name, "Archive", "Batches", "Summary", "Robots", "Rejected", robot_metrics=False
-    )
-    files = environments.UploadEnvironment(name, "Files", "Robots", "Rejected", 50 * 10**9)
-    query = environments.QueryEnvironment(name, "Batches", "Robots", "Files")
-    answer = environments.AnswerEnvironment(name, "Robots", "Findings", "Files", "Rejected")
-    fields = {VESC_STREAM: list(VESC_FIELDS)}
-    parameter = pubnub_parameter()
-    assert given("Later", environments.LaterEnvironment) == later
-    assert given("Summarize", environments.SummarizeEnvironment) == environments.SummarizeEnvironment(
-        **vars(later), put_off_queue="PutOff", record_bytes_a_day=5 * 10**9
-    )
-    assert given("Echo", environments.EchoEnvironment) == environments.EchoEnvironment(name, "Rejected")
-    assert given("Upload", environments.UploadEnvironment) == files
-    assert given("Query", environments.QueryEnvironment) == query
-    assert given("Answer", environments.AnswerEnvironment) == answer
-    assert given("Live", environments.LiveEnvironment) == environments.LiveEnvironment(
-        name, parameter, fields, "Rejected"
-    )
-
-
-def test_functions_log_their_own_lines_and_lambdas_errors(synthesized, functions):
-    for made in functions.values():
-        logging = made["LoggingConfig"]
-        assert (logging["LogFormat"], logging["SystemLogLevel"]) == ("JSON", "WARN")
-        # A metric's line names no level and counts as INFO: "Log-level filtering", Lambda Developer Guide.
-        assert logging["ApplicationLogLevel"] == "INFO"
-
-
-def test_lambdas_own_lines_are_logged_on_request(tmp_path):
-    app = App(context={"function_logs": "all", **layers(tmp_path)})
-    stack = PlatformStack(app, "x", Settings.from_context(app))
-    function(stack, "Echo", environments.Environment("iort"))
-    (made,) = (
-        resource["Properties"]
-        for resource in app.synth().stacks[0].template["Resources"].values()
-        if resource["Type"] == "AWS::Lambda::Function"
-    )
-    assert made["LoggingConfig"].keys() == {"LogGroup"}
-    with pytest.raises(SettingsError, match="function_logs must be own or all, got 'none'"):
-        Settings.from_context(App(context={"function_logs": "none", **layers(tmp_path)}))
-
-
 # One snapshot a stack and stage: a change of what is deployed shows. Update: pytest --snapshot-update.
 
 STACKS = (
@@ -427,12 +250,23 @@ STACKS = (
 _ASSET = re.compile(r"[0-9a-f]{64}")
 
 
+@pytest.fixture(scope="module")
+def public(deployment):
+    """The page on the web, for anybody."""
+    return deployment(site=True, site_robots=["car1"], function_logs="all")
+
+
 def test_the_stacks_are_these(synthesized):
     assert set(synthesized.templates) == set(STACKS)
 
 
-@pytest.mark.parametrize("stack", STACKS)
-@pytest.mark.parametrize("stage", ["synthesized", "production"])
+@pytest.mark.parametrize(
+    ("stage", "stack"),
+    [
+        *itertools.product(("synthesized", "production"), STACKS),
+        *(("public", stack) for stack in ("fleet", "site", "quarantine")),
+    ],
+)
 def test_template(request, snapshot, stack, stage):
     templates = request.getfixturevalue(stage).templates
     template = {k: v for k, v in templates[stack].items() if k not in ("Parameters", "Rules")}

@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from functions import answer
-from functions.quarantine import entries
 from functions.shared.questions import WORK, Bodies, RefusedError
 from functions.shared.quotas import HOUR, Quota
 from iort_contract.catalog.environments import AnswerEnvironment
@@ -47,7 +46,6 @@ from testkit.dynamodb import FILES, FINDINGS, ROBOTS
 
 NOW_S = 1_700_000_000.0
 NOW_US, NOW_MS = int(NOW_S * 1e6), int(NOW_S * 1000)
-ARN = "arn:aws:lambda:eu-west-1:000000000000:function:answer"
 ID = "0123456789abcdef"
 ECHO = Question("echo", "the body", 2, max_question_bytes=2 * MAX_INLINE_BYTES, max_answer_bytes=10**6)
 
@@ -67,18 +65,17 @@ def registered(dynamodb):
 
 
 class Served:
-    """One environment of the function, with its answers and its dead letters."""
+    """One environment of the function, with its answers."""
 
     def __init__(self, s3, dynamodb):
         self.dynamodb = dynamodb
-        self.said, self.kept, self.takes = [], [], True
+        self.said = []
         self.work = lambda _robot, body: body
-        self.desk = answer.Desk(
-            dict.fromkeys(QUESTIONS, self._worked), self._quota, Bodies(s3, FILES), self._reply, self._keep
-        )
+        work = dict.fromkeys(QUESTIONS, self._worked)
+        self.desk = answer.Desk(work, self._quota, Bodies(s3, FILES), self._reply)
 
     def __call__(self, asked, *, now_s=NOW_S, **event_of):
-        answer.serve(event(asked, **event_of), ARN, self.desk, now_s)
+        answer.serve(event(asked, **event_of), self.desk, now_s)
         return self.said[-1][1].body if self.said else None
 
     def _worked(self, robot, body):
@@ -90,11 +87,6 @@ class Served:
 
     def _reply(self, topic, found):
         self.said.append((topic.robot, decode_answer(encode_answer(found))))
-
-    def _keep(self, body):
-        if self.takes:
-            self.kept.append(body)
-        return self.takes
 
 
 @pytest.fixture
@@ -217,27 +209,14 @@ asks = st.dictionaries(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(asks.map(lambda said: json.dumps(said).encode()) | st.binary(max_size=20))
-def test_every_malformed_question_is_kept_and_told_if_it_has_an_id(serve, message):
+def test_every_malformed_question_is_refused_and_told_if_it_has_an_id(serve, message):
     serve.said.clear()
-    serve.kept.clear()
-    serve(message)
-    (body,) = serve.kept
-    (entry,) = entries(body, list)
-    assert (entry.source, entry.robot, entry.payload) == ("function answer", "car", message)
+    with pytest.raises(ContractError):
+        serve(message)
     assert all(found.body.reason == MALFORMED for _, found in serve.said)
 
 
-def test_a_malformed_question_fails_the_invocation_if_the_queue_does_not_take_it(serve):
-    serve.takes = False
-    with pytest.raises(ContractError):
-        serve(b"{}")
-
-
 # --- the questions that ship ------------------------------------------------------------------------
-
-
-class Context:
-    invoked_function_arn = ARN
 
 
 @pytest.fixture
@@ -259,25 +238,25 @@ def test_the_calibration_has_each_parameter_of_its_newest_drive(deployed):
     parameters(deployed, 1_000_000, old=1.0, both=1.0)
     parameters(deployed, 2_000_000, both=2.0)
     asked = {"robot": "car", "question": CALIBRATION.name, "body": {}}
-    found = answer.handler(asked, Context)["body"]["parameters"]
+    found = answer.operators(asked)["body"]["parameters"]
     assert {name: (one["value"], one["drive"][:16]) for name, one in found.items()} == {
         "old": (1.0, "0000000001000000"),
         "both": (2.0, "0000000002000000"),
     }
-    assert answer.handler({**asked, "robot": "car2"}, Context)["refused"] == NO_DATA
+    assert answer.operators({**asked, "robot": "car2"})["refused"] == NO_DATA
     missing = {"mass": "16 s are too short"}
     nothing = AnalysedDrive(DriveKey("car3", 1, "00c0ffee"), 2, "nightly", 1, {}, missing, {})
     FindingsTable(deployed, FINDINGS).put_drive(nothing)
-    refused = answer.handler({**asked, "robot": "car3"}, Context)
+    refused = answer.operators({**asked, "robot": "car3"})
     assert (refused["refused"], "16 s are too short" in str(refused)) == (NO_DATA, True)
-    assert answer.handler({**asked, "question": "nobody"}, Context)["refused"] == UNKNOWN
+    assert answer.operators({**asked, "question": "nobody"})["refused"] == UNKNOWN
 
 
 HALL = (Path(__file__).parents[3] / "docs/examples/hall.csv").read_text()
 
 
 def raceline(**body):
-    return answer.handler({"robot": "car", "question": RACELINE.name, "body": body}, Context)
+    return answer.operators({"robot": "car", "question": RACELINE.name, "body": body})
 
 
 def test_the_raceline_uses_the_questions_limits_then_the_calibration_then_defaults(deployed):
@@ -319,17 +298,16 @@ def test_what_is_no_track_or_car_is_refused_with_the_reason(deployed, body, told
     assert told in refused["text"]
 
 
-def test_the_handler_answers_a_robot(deployed):
-    from moto.backends import get_backend
-    from moto.core import DEFAULT_ACCOUNT_ID
-
+def test_the_handler_answers_a_robot_and_an_operator(deployed, invoke, published):
     asked = encode_ask(ask(valid_ms=60_000))
     parameters(deployed, 1_000_000, resistance=1.0)
     now_ms = 4_000_000_000_000
-    answer.handler(rule_event(asked, build_topic(ASK, "car", "calibration"), now_ms), Context)
-    ((topic, payload),) = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"].published_payloads
+    invoke(answer.handler, rule_event(asked, build_topic(ASK, "car", "calibration"), now_ms))
+    ((topic, payload),) = published()
     assert topic == build_topic(ANSWER, "car", "calibration")
     assert decode_answer(payload).body["parameters"]["resistance"]["value"] == 1.0
+    again = invoke(answer.handler, {"robot": "car", "question": "calibration", "body": {}})
+    assert again["body"] == decode_answer(payload).body
 
 
 def test_every_question_of_the_catalogue_has_its_work():

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions import echo
-from iort_contract.catalog.environments import EchoEnvironment
 from iort_contract.limits import ContractError
 from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.live import decode_pong, encode_ping
@@ -38,36 +37,24 @@ def test_the_pong_has_the_pings_content(robot, namespace, ping_id, padding):
 
 
 @pytest.mark.parametrize(
-    "topic", ["ping/iort/car", "ping/iort/ca+r/lambda", "ping/iort/#/lambda", "", None, 7]
+    "bad",
+    [
+        *(
+            {**event(), TOPIC: topic}
+            for topic in ("ping/iort/car", "ping/iort/ca+r/lambda", "ping/iort/#/lambda", "", None, 7)
+        ),
+        *(
+            rule_event(message, build_topic(PING, "car", LAMBDA), 1)
+            for message in (b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000)
+        ),
+    ],
 )
-def test_an_invalid_topic_is_refused(topic):
-    with pytest.raises(ContractError, match=r"topic|robot"):
-        echo.pong({**event(), TOPIC: topic})
+def test_what_is_no_ping_is_refused(bad):
+    with pytest.raises(ContractError, match=r"topic|robot|ping is"):
+        echo.pong(bad)
 
 
-@pytest.mark.parametrize("message", [b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000])
-def test_an_invalid_ping_goes_to_the_quarantine_and_fails_nothing(message):
-    bad, sent, bodies = rule_event(message, build_topic(PING, "car", LAMBDA), 1), [], []
-    echo.serve(bad, "arn", publish=lambda *pong: sent.append(pong), keep=lambda body: not bodies.append(body))
-    (body,) = map(json.loads, bodies)
-    assert body["requestPayload"] == bad
-    assert "ping is" in body["responsePayload"]["errorMessage"]
-    assert sent == []
-    with pytest.raises(ContractError, match="ping is"):
-        echo.serve(bad, "arn", publish=lambda *pong: sent.append(pong), keep=lambda _body: False)
-
-
-def test_the_handler_publishes_through_boto3(aws, capsys, monkeypatch):
-    from moto.backends import get_backend
-    from moto.core import DEFAULT_ACCOUNT_ID
-
-    class Context:
-        invoked_function_arn = "arn"
-
-    for name, value in EchoEnvironment("iort", "queue").variables().items():
-        monkeypatch.setenv(name, value)
-    echo.handler(event(), Context)
-    backend = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"]
-    topic, payload = echo.pong(event())
-    assert backend.published_payloads == [(topic, payload)]
+def test_the_handler_publishes_and_counts(invoke, published, capsys):
+    invoke(echo.handler, event())
+    assert published() == [echo.pong(event())]
     assert json.loads(capsys.readouterr().out)["PongsSent"] == 1

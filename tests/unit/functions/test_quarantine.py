@@ -10,14 +10,16 @@ from botocore.exceptions import ClientError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from functions import presence
+from functions import answer, echo, live, presence, upload
 from functions.quarantine import Entry, Store, Stream, entries, process
+from functions.shared.clients import variables
 from functions.shared.queues import DeadLetterQueue, Refused, message
 from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix
+from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
-from iort_contract.messages.envelope import event_message
+from iort_contract.messages.envelope import event_message, rule_event
 from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
 from iort_contract.tables import (
     AGENT_VERSION,
@@ -41,6 +43,7 @@ from testkit.dynamodb import QUARANTINE, TOPIC_OF_CAR
 from tests.rule_sql import evaluate
 from verify.lab import spoofed
 
+NOW_MS = 1_700_000_000_123
 REFUSAL = "DynamoDBv2Action: The provided key element does not match the schema"
 RAW = b"\xff\x00not JSON, not even text"
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
@@ -93,6 +96,17 @@ def invocation(event, error="boom"):
 def records(info):
     assert info == INFO
     return [{"dynamodb": {"SequenceNumber": str(n), "NewImage": image(n)}} for n in (2, 3)]
+
+
+# The variables of the functions that refuse events.
+DEPLOYED = {
+    "ROBOTS_TABLE": "robots",
+    "FINDINGS_TABLE": "findings",
+    "FILES_BUCKET": "files",
+    "UPLOAD_BYTES_A_DAY": "1",
+    "PUBNUB_PARAMETER": "/iort/pubnub",
+    "LIVE_FIELDS": "{}",
+}
 
 
 def none(_info):
@@ -185,6 +199,27 @@ def test_equal_messages_share_one_entry_and_different_ones_do_not():
         for reason in ("because", "because of something else")
     }
     assert len(ids) == 12
+
+
+REFUSING = {echo: (PING, LAMBDA), upload: (PING, FILE), answer: (ASK, "calibration"), live: (LIVE, "vesc")}
+
+
+@pytest.mark.parametrize("function", REFUSING, ids=lambda one: one.__name__)
+def test_what_a_function_refuses_is_kept_and_fails_only_without_the_queue(
+    function, invoke, rejected, monkeypatch
+):
+    for name, value in DEPLOYED.items():
+        monkeypatch.setenv(name, value)
+    lane, name = REFUSING[function]
+    event = rule_event(b"\xff", build_topic(lane, "car", name), NOW_MS)
+    invoke(function.handler, event)
+    (entry,) = rejected()
+    assert (entry.source, entry.robot) == (f"function {function.__name__.rpartition('.')[2]}", "car")
+    assert (entry.payload, entry.reason[:9]) == (b"\xff", "Refused: ")
+    monkeypatch.setenv("REJECTED_QUEUE", "https://sqs.eu-west-1.amazonaws.com/0/none")
+    variables.cache_clear()
+    with pytest.raises(ContractError):
+        invoke(function.handler, event)
 
 
 # --- into the table ---------------------------------------------------------------------------------
@@ -390,7 +425,6 @@ def test_deferred_batches_that_failed_are_kept_by_their_keys():
 
 # No rule mistakes a key of a robot's message for a key that the cloud adds.
 
-NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000
 RETENTION_S = 3600
 BATCH = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2, previous=()))
