@@ -61,7 +61,7 @@ class Account(PlatformStack):
         super().__init__(app, "account", settings)
         if settings.device_defender:
             self._audit()
-        if settings.iot_log_level:
+        if settings.iot_log_level != "off":
             self._log(settings.iot_log_level)
 
     def _audit(self) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, NoReturn
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V, RULES, Call, Rule
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parent.parent
 
-DEV, PROD = "dev", "prod"
+DEV: Final = "dev"
+PROD: Final = "prod"
 _RESERVED_FOR_LIVE = 5
 # "PutFunctionConcurrency": a reservation must leave this many executions to all other functions.
 UNRESERVED = 100
 # A new account's executions: "Lambda quotas" says that they are fewer than 1,000, and new accounts report 10.
 # And the least that a queue's mapping takes: "Configuring scaling behavior for SQS event source mappings".
 NEW_ACCOUNT, LEAST_OF_A_QUEUE = 10, 2
-OWN_LOGS, ALL_LOGS = "own", "all"
+ALL_LOGS: Final = "all"
 # The robots of a public page, if it shows all.
 ALL_ROBOTS = ["*"]
 # AWS IoT ends a connection with more subscriptions.
@@ -43,7 +44,6 @@ A_ROBOTS_MOST = CONNECTION_BYTES_S // 1024 + CONNECTION_MESSAGES_S
 _WRITES = {"Batches": 50, "Summary": 20}
 # These tables grow by events, not by samples. Refused messages wait in their queue instead.
 _WRITES_OF_ALL = {"Robots": 500, "Archive": 500, "Quarantine": 200, "Findings": 500}
-_EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
 _TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
@@ -52,50 +52,6 @@ _TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
 class SettingsError(ValueError):
     """A context value that the stacks cannot use; the text names the key, the value and the allowed
     values."""
-
-
-def _whole(low: int, high: int) -> BeforeValidator:
-    def read(value: Any) -> int:
-        # The CDK CLI passes every -c as text, cdk.json a number of either kind.
-        text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise ValueError(f"must be a whole number from {low} to {high}")
-        return int(text)
-
-    return BeforeValidator(read)
-
-
-def _one_of(*allowed: str) -> BeforeValidator:
-    def read(value: Any) -> str:
-        if value not in allowed:
-            raise ValueError(f"must be {', '.join(allowed[:-1])} or {allowed[-1]}")
-        return str(value)
-
-    return BeforeValidator(read)
-
-
-def _above_zero(value: Any) -> float:
-    try:
-        number = 0.0 if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = 0.0
-    if not 0 < number < float("inf"):
-        raise ValueError("must be a number above 0")
-    return number
-
-
-def _true_or_false(value: Any) -> bool:
-    if str(value).lower() not in ("true", "false"):
-        raise ValueError("must be true or false")
-    return str(value).lower() == "true"
-
-
-def _email(value: Any) -> str | None:
-    if value is None:
-        return None
-    if not _EMAIL.fullmatch(str(value)):
-        raise ValueError("must be one e-mail address")
-    return str(value)
 
 
 def _robots(value: Any) -> list[str]:
@@ -111,31 +67,18 @@ def _robots(value: Any) -> list[str]:
     return sorted({check_robot(name) for name in names})
 
 
-def _address(value: Any) -> str:
-    if not re.fullmatch(r"https?://[^\s#?]+/", str(value)):
-        raise ValueError("must be a page's address, such as https://page.example.org/")
-    return str(value)
-
-
 def _tags(value: Any) -> dict[str, str]:
     """Parse tags: an object in cdk.json, ``team=lab,cost-centre=7`` on the command line."""
     pairs = value
     if isinstance(value, str):
-        pairs = dict(pair.split("=", 1) for pair in value.split(",")) if _is_pairs(value) else None
+        split = [pair.partition("=") for pair in value.split(",")]
+        pairs = {key: text for key, is_, text in split} if all(is_ for _, is_, _ in split) else None
     if not isinstance(pairs, Mapping) or not all(
         isinstance(text, str) and _TAG_KEY.fullmatch(str(key)) and _TAG_VALUE.fullmatch(text)
         for key, text in pairs.items()
     ):
         raise ValueError("must be key=value,key=value with AWS' tags")
     return dict(pairs)
-
-
-def _is_pairs(text: str) -> bool:
-    return all("=" in pair for pair in text.split(","))
-
-
-Flag = Annotated[bool, BeforeValidator(_true_or_false)]
-Positive = Annotated[float, BeforeValidator(_above_zero)]
 
 
 class AtOnce(NamedTuple):
@@ -155,7 +98,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    stage: Annotated[str, _one_of(DEV, PROD)] = Field(
+    stage: Literal["dev", "prod"] = Field(
         default=DEV,
         description="`dev`: everything goes with its stack. `prod`: tables, queues, logs, files and the key "
         "stay when the stack goes; tables have point-in-time recovery and deletion protection, stacks "
@@ -168,114 +111,121 @@ class Settings(BaseModel):
     tags: Annotated[dict[str, str], BeforeValidator(_tags)] = Field(
         default={}, description="`team=lab,cost-centre=7`: on every resource, beside `project` and `stage`"
     )
-    retention_days: Annotated[int, _whole(1, 3650)] = Field(
+    retention_days: Annotated[int, Field(ge=1, le=3650)] = Field(
         default=DEFAULT_RETENTION_DAYS, description="lifetime of telemetry and summaries"
     )
-    archive: Flag = Field(
+    archive: bool = Field(
         default=True,
         description="finished hours of telemetry go to Parquet in the bucket before they expire, and stay: "
         "[the archive](archive.md). `false`: no more hours do",
     )
-    files_days: Annotated[int, _whole(0, 3650)] = Field(
-        default=365, description="lifetime of uploaded files; 0: for good"
-    )
-    fleet_robots: Annotated[int, _whole(1, 100_000)] = Field(
+    files_days: int = Field(ge=0, le=3650, default=365, description="lifetime of uploaded files; 0: for good")
+    fleet_robots: Annotated[int, Field(ge=1, le=100_000)] = Field(
         default=20,
         description="how many robots drive at once: the tables take that many writes a second, and no more "
         "([what that bounds](../explanation/security.md#what-one-can-spend-at-most))",
     )
-    record_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
+    record_gb_a_day: Annotated[int, Field(ge=1, le=10_000)] = Field(
         default=5,
         description="what a robot may record a day, in 1e9 bytes; above it an alarm goes off. AWS IoT has no "
         "limit of a day, so nothing is refused",
     )
-    upload_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
+    upload_gb_a_day: Annotated[int, Field(ge=1, le=10_000)] = Field(
         default=50, description="a robot's daily upload limit, in 1e9 bytes"
     )
-    live_transport: Annotated[str, _one_of(PUBNUB, IOT)] = Field(
-        default=IOT,
+    live_transport: Literal["pubnub", "iot"] = Field(
+        default="iot",
         description="how live messages reach the page: `iot` by AWS IoT's own WebSockets, so that Lambda 1 "
         "has nothing to do, or `pubnub` by Lambda 1 and PubNub "
         "([the difference](page.md#two-ways-to-the-page)). "
         "Without a value `make deploy` takes PubNub if its keys are stored, and AWS IoT otherwise; a plain "
         "`cdk deploy` takes AWS IoT",
     )
-    drivers: Flag = Field(
+    drivers: bool = Field(
         default=False,
         description="makes the role of [drivers](../explanation/security.md#viewers-and-drivers), who drive "
         "from the page. `false`: nobody drives from a browser",
     )
-    live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
+    live_concurrency: Annotated[int, Field(ge=0, le=1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
         "in `prod` with PubNub where `account_concurrency` allows it, otherwise nothing "
         "([why](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
     )
-    account_concurrency: Annotated[int, _whole(NEW_ACCOUNT, 100_000)] = Field(
+    account_concurrency: Annotated[int, Field(ge=NEW_ACCOUNT, le=100_000)] = Field(
         default=NEW_ACCOUNT,
         description="the executions that the account's functions may have at once, from which the limits of "
         "all work follow that nobody waits for; `make deploy` asks Lambda, and without a value it is a new "
         "account's ([how](../how-to/deploy.md#lambdas-limit-in-a-new-account))",
     )
-    customer_key: Flag = Field(
+    customer_key: bool = Field(
         default=False,
         description="one key of the account's own, rotated every year, for tables, queues, files, topic and "
         "logs ([decision 11](../decisions/security/0011-one-key-through-services.md)): $1 a month and $0.03 "
         "per 10,000 requests. It goes in two steps: [how](../how-to/deploy.md#a-key-of-ones-own)",
     )
-    keep_customer_key: Flag = Field(
+    keep_customer_key: bool = Field(
         default=False, description="keeps that key without using it, for data that it has encrypted"
     )
-    alarm_email: Annotated[str | None, BeforeValidator(_email)] = Field(
+    alarm_email: str | None = Field(
+        pattern=r"^[^@\s,]+@[^@\s,]+\.[^@\s,]+$",
         default=None,
         description="receives alarms, alerts and the budget's mails; AWS asks this address for its consent "
         "once",
     )
-    budget_usd: Annotated[int, _whole(0, 1_000_000)] = Field(
+    budget_usd: Annotated[int, Field(ge=0, le=1_000_000)] = Field(
         default=0,
         description="a monthly budget of the account, 0 for none: a mail at 80 % spent, and when the "
         "forecast passes all of it. A budget by tag counts nothing until the tag is activated in the "
         "billing console",
     )
-    low_voltage_v: Positive = Field(
-        default=LOW_VOLTAGE_V, description="a low battery: three lithium cells; 14 for four"
+    low_voltage_v: float = Field(
+        gt=0,
+        allow_inf_nan=False,
+        default=LOW_VOLTAGE_V,
+        description="a low battery: three lithium cells; 14 for four",
     )
-    high_temperature_degc: Positive = Field(
-        default=80.0, description="a hot controller, on its board or MOSFETs; a VESC throttles from 85 degC"
+    high_temperature_degc: float = Field(
+        gt=0,
+        allow_inf_nan=False,
+        default=80.0,
+        description="a hot controller, on its board or MOSFETs; a VESC throttles from 85 degC",
     )
-    stream_behind_s: Positive = Field(default=60.0, description="how far Lambda 2 may be behind")
-    car_to_lambda_ms: Positive = Field(default=2_000.0, description="live samples older than this are late")
-    function_logs: Annotated[str, _one_of(OWN_LOGS, ALL_LOGS)] = Field(
-        default=OWN_LOGS, description="`all` keeps Lambda's own lines about every invocation, too: see below"
+    stream_behind_s: float = Field(
+        gt=0, allow_inf_nan=False, default=60.0, description="how far Lambda 2 may be behind"
     )
-    robot_metrics: Flag = Field(
+    car_to_lambda_ms: float = Field(
+        gt=0, allow_inf_nan=False, default=2_000.0, description="live samples older than this are late"
+    )
+    function_logs: Literal["own", "all"] = Field(
+        default="own", description="`all` keeps Lambda's own lines about every invocation, too: see below"
+    )
+    robot_metrics: bool = Field(
         default=False, description="every robot's health as metrics of its own: see below"
     )
-    device_defender: Flag = Field(default=False, description="a daily audit of the account's AWS IoT")
-    iot_log_level: Annotated[
-        str,
-        _one_of("off", "error", "warn", "info", "debug"),
-        AfterValidator(lambda level: level.replace("off", "")),
-    ] = Field(
-        default="",
+    device_defender: bool = Field(default=False, description="a daily audit of the account's AWS IoT")
+    iot_log_level: Literal["off", "error", "warn", "info", "debug"] = Field(
+        default="off",
         description="AWS IoT's own log: `error`, `warn`, `info` or `debug` "
         "([how](../how-to/alarms.md#aws-iots-own-log))",
     )
-    nightly_analysis: Flag = Field(
+    nightly_analysis: bool = Field(
         default=True,
         description="analyses the last two days' drives every night at 03:00 UTC; `false` leaves it to "
         "[`iort analyse`](../explanation/analysis.md)",
     )
-    page_url: Annotated[str, BeforeValidator(_address)] = Field(
-        default=PAGE_URL, description="where the page is, for the links in mails about findings"
+    page_url: str = Field(
+        pattern=r"^https?://[^\s#?]+/$",
+        default=PAGE_URL,
+        description="where the page is, for the links in mails about findings",
     )
-    site: Flag = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
+    site: bool = Field(default=False, description="the page on the web: [how](page.md#on-the-web)")
     site_robots: Annotated[list[str], BeforeValidator(_robots)] = Field(
         default=[],
         description="the robots that everybody sees on the page on the web, as `car1,car2`, at most 50, or "
         "`*` for all. Needed with `site` and `live_transport=iot`; with PubNub, its access token says which",
     )
-    embedded: Flag = Field(
+    embedded: bool = Field(
         default=False, description="for the embedded cloud, with the caller's own credentials"
     )
     layer: Annotated[Path, BeforeValidator(lambda folder: ROOT / folder)] = Field(
@@ -357,7 +307,7 @@ class Settings(BaseModel):
     @property
     def account_wide(self) -> bool:
         """Whether any setting of the whole account is on."""
-        return not self.embedded and (self.device_defender or bool(self.iot_log_level))
+        return not self.embedded and (self.device_defender or self.iot_log_level != "off")
 
     @classmethod
     def from_context(cls, app: App) -> Settings:
@@ -396,7 +346,8 @@ CONTEXT_KEYS = Settings.model_fields.keys() - {"live_fields"}
 
 def _refuse(error: ValidationError) -> NoReturn:
     first = error.errors()[0]
-    text = first["msg"].removeprefix("Value error, ")
+    text = re.sub(r"^\w+ should", "must", first["msg"]).removeprefix("Value error, ")
     # The contract's errors show the value, and name the key.
-    text = text if ", got " in text else f"{first['loc'][0]} {text}, got {first['input']!r}"
+    if first["type"] != "value_error" or ", got " not in text:
+        text = f"{first['loc'][0]} {text}, got {first['input']!r}"
     raise SettingsError(f"context {text}") from error

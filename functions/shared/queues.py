@@ -103,7 +103,7 @@ def quarantined(serve: Callable[[Any], None]) -> Callable[[Any, Any], None]:
     """
 
     @wraps(serve)
-    def handler(event: Any, context: Any) -> None:
+    def called(event: Any, context: Any) -> None:
         try:
             serve(event)
         except ContractError as error:
@@ -120,7 +120,7 @@ def quarantined(serve: Callable[[Any], None]) -> Callable[[Any, Any], None]:
                 _log.warning("the queue did not take a refused message: %s", failure)
                 raise error from failure
 
-    return handler
+    return called
 
 
 def _body(reason: str, item: Mapping[str, Any]) -> str:

@@ -68,8 +68,8 @@ def iot_log(clients: Clients, settings: Settings) -> Finding:
     # CloudFormation's handler treats a disabled log as free.
     configured = bool(options.get("roleArn")) and not options.get("disableAllLogs")
     said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
-    if not configured or not settings.iot_log_level or settings.embedded:
-        return fine(f"{said}; iot_log_level is {settings.iot_log_level or 'off'}")
+    if not configured or settings.iot_log_level == "off" or settings.embedded:
+        return fine(f"{said}; iot_log_level is {settings.iot_log_level}")
     remedy = "leave `iot_log_level` off, or disable it: `aws iot set-v2-logging-options --disable-all-logs`"
     return _held(clients, settings, "AWS::IoT::Logging", said, remedy)
 
