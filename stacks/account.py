@@ -32,7 +32,7 @@ _CHECKS = (
 )
 # What these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, without role aliases and the
 # services last accessed, which only the disabled checks read.
-_AUDIT_READS = (
+AUDIT_READS = (
     "cognito-identity:GetIdentityPoolRoles",
     "iam:GetPolicy",
     "iam:GetPolicyVersion",
@@ -66,7 +66,7 @@ class Account(PlatformStack):
 
     def _audit(self) -> None:
         role = parts.iot_role(self, "AuditRole")
-        role.add_to_policy(iam.PolicyStatement(actions=[*_AUDIT_READS], resources=["*"]))
+        role.add_to_policy(iam.PolicyStatement(actions=[*AUDIT_READS], resources=["*"]))
         on = iot.CfnAccountAuditConfiguration.AuditCheckConfigurationProperty(enabled=True)
         audit = iot.CfnAccountAuditConfiguration(
             self,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aws_cdk import Acknowledgment, App, CfnResource, Stack, Validations
+from aws_cdk import aws_iam as iam
 from constructs import IConstruct
 
 from iort_contract.topics import SHADOW
@@ -64,6 +65,10 @@ _FUNCTION = {
     "W3005": "the CDK writes the dependency",
 }
 _OWN_KEY = "encrypted with the service's own key; `customer_key` selects a key of the account"
+_OF_A_KEY = {
+    "kms:GenerateDataKey*": "the CDK's grant to a queue's sender, one key",
+    "kms:ReEncrypt*": "as kms:GenerateDataKey*",
+}
 _DEV = "stage dev is deleted with its stacks; stage prod has it"
 
 
@@ -92,6 +97,13 @@ def _decisions(resource: CfnResource, settings: Settings) -> Mapping[str, str]:
     if kind == "AWS::SQS::Queue" and getattr(resource, "redrive_policy", None) is None:
         end = "this queue is the last stop; an alarm tells the operator, who sends its messages back"
         decisions["Serverless-SQSRedrivePolicy"] = end
+    if isinstance(resource, iam.CfnPolicy):
+        granted = str(Stack.of(resource).resolve(resource.policy_document))
+        decisions |= {
+            f"AwsSolutions-IAM5[Action::{action}]": reason
+            for action, reason in _OF_A_KEY.items()
+            if action in granted
+        }
     if kind == "AWS::IoT::TopicRule":
         decisions["W3005"] = "IoT Core tests the role when it creates the rule, so role and policy come first"
     return decisions
@@ -134,11 +146,6 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
     files = f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03"
     every_robot = "who may watch or drive may do so with every robot of the fleet"
     a_robot = "the wildcard is the robot, which is known when the message arrives"
-    to_a_queue = {
-        "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
-        "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
-    }
-    files = f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03"
     a_run = {wide(f"{files}/analysis/plans/*"): "the wildcard is a run of the analysis, and its robots"}
     read = {wide(f"{files}/archive/*"): "the wildcard is the robot, its stream and the time of a drive"}
     return {
@@ -183,7 +190,6 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{iot}:cert/*"): "AWS assigns a certificate's id later; the function reads only its status"
         },
         "fleet/Provisioning": {"W3005": "RegisterThing tests role and policy, which must exist first"},
-        "fleet/PresenceRole/DefaultPolicy": {**to_a_queue},
         **{
             f"fleet/{person}/DefaultPolicy": {
                 wide(
@@ -211,10 +217,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
             wide(f"{iot}:topic/pong/{settings.namespace}/*/lambda"): a_robot,
-            **to_a_queue,
         },
-        "processing/LiveRole/DefaultPolicy": {**to_a_queue},
-        "processing/AlertRole/DefaultPolicy": {**to_a_queue},
         f"processing/Alarms/{settings.alarm_email}": {
             "Serverless-SNSRedrivePolicy": "nobody would read undelivered mails from a queue; "
             "the alarm keeps its state"
@@ -224,17 +227,14 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
                 "the wildcard is the robot, and the function signs only for the robot that asked"
             ),
             wide(f"{iot}:topic/pong/{settings.namespace}/*/file"): a_robot,
-            **to_a_queue,
         },
         "processing/AnswerRole/DefaultPolicy": {
             wide(f"{files}/robots/*/ask/*"): "the wildcard is the robot, and the function reads its own only",
             wide(f"{files}/results/ask/*"): "the wildcard is the robot that asked, and its question's id",
             wide(f"{iot}:topic/answer/{settings.namespace}/*/*"): f"{a_robot}, and its question",
-            **to_a_queue,
         },
         "archive/ArchiveRole/DefaultPolicy": {
             wide(f"{files}/archive/*"): "the wildcard is the archive's own objects",
-            **to_a_queue,
         },
         "archive/Tasks": {
             "Serverless-LambdaEventSourceMappingDestination": "as quarantine/Rejections: its dead-letter "
@@ -248,9 +248,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "processing/SummarizeRole/DefaultPolicy": {
             wide("*"): "dynamodb:ListStreams takes no resources; the CDK grants it with the stream",
             wide(f"{iot}:thing/*/{SHADOW}"): f"{a_robot}; only this one of its shadows",
-            **to_a_queue,
         },
-        "processing/LaterRole/DefaultPolicy": {**to_a_queue},
         "processing/PutOffs": {
             "Serverless-LambdaEventSourceMappingDestination": "as quarantine/Rejections: its dead-letter "
             "queue is the quarantine's"

