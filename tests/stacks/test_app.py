@@ -72,10 +72,8 @@ def test_a_wrong_value_gives_one_line(tmp_path, layer):
     returncode, _, err = finished(run(tmp_path, "out", retention_days="soon"))
     assert returncode == 1
     (line,) = [line for line in err.splitlines() if line.startswith("app.py")]
-    assert (
-        line
-        == "app.py: context retention_days must be a valid integer, unable to parse string as an integer, got 'soon'"
-    )
+    assert line.startswith("app.py: context retention_days must be a valid integer")
+    assert line.endswith("got 'soon'")
     assert "Traceback" not in err
     assert not list((tmp_path / "out").glob("*.template.json"))
 
