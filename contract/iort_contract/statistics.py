@@ -1,22 +1,22 @@
-"""Summarises a second of a stream from its batches. Pure functions.
+"""Summarises the seconds of a stream from its batches. Pure functions.
 
 In plain Python: the usual event has a batch of one second, and numpy would cost a Lambda function without it
-more than the whole event does. `iort_analysis.samples.seconds` says the same of hours at a time, by numpy.
+more than the whole event does.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections import deque
 from operator import sub
 from statistics import mean, median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Iterable, Iterator, Mapping, Sequence
 
 from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.catalog.vesc import ABSENT_FROM, absent
 from iort_contract.codec import Statistics, packed_second
-from iort_contract.limits import Value
+from iort_contract.limits import MAX_BATCH_SPAN_US, Value
 from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
 
@@ -77,6 +77,47 @@ def summarize_second(
         counts[ABSENT] = sum(absences.values())
     fields = {name: statistics_of(column) for name, column in {**without, **derive(without, vehicle)}.items()}
     return packed_second(counts, {name: known for name, known in fields.items() if known is not None})
+
+
+def summarize_seconds(
+    batches: Iterable[Batch], first: int, end: int, vehicle: Vehicle | None
+) -> Iterator[tuple[int, dict[str, Statistics]]]:
+    """The seconds from ``first`` until ``end`` that have samples, with their summaries.
+
+    ``batches`` are those of one stream in order of time: all that begin within `reach`, and the one before.
+    """
+    near: deque[Batch] = deque()
+    second = first
+    for batch in batches:
+        while second < end and batch.t_us > reach(second, second + 1)[1]:
+            yield from _summarized(second, near, vehicle)
+            second += 1
+            while len(near) > 1 and near[1].t_us < reach(second, end)[0]:
+                near.popleft()
+        near.append(batch)
+    for rest in range(second, end):
+        yield from _summarized(rest, near, vehicle)
+
+
+def reach(first: int, end: int) -> tuple[int, int]:
+    """The times between which batches begin that decide about seconds, both inclusive."""
+    return first * _SECOND_US - ASIDE_US - MAX_BATCH_SPAN_US, end * _SECOND_US + ASIDE_US
+
+
+def _summarized(
+    second: int, near: Iterable[Batch], vehicle: Vehicle | None
+) -> Iterator[tuple[int, dict[str, Statistics]]]:
+    batches = list(near)
+    ids = [batch.id for batch in batches]
+    missing = sum(
+        missing_before(own, ids, batch.previous)
+        for own, batch, before in zip(ids, batches, [None, *ids])
+        # Nearly always a batch follows on the one before.
+        if own.t_us // _SECOND_US == second and (before is None or before[1:] != (own.boot, own.seq - 1))
+    )
+    summary = summarize_second(second, batches, vehicle, missing)
+    if summary is not None:
+        yield second, summary
 
 
 def without_absent(

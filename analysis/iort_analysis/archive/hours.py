@@ -11,12 +11,9 @@ from heapq import merge
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar, cast
 
-import numpy as np
-
 from iort_analysis import ArchiveError
-from iort_analysis.samples.batches import Item, Part, RefusedItems, Wanted
-from iort_analysis.samples.blocks import join
-from iort_analysis.samples.seconds import Batches, batches_of
+from iort_analysis.samples.batches import Item, Part, RefusedItems, Wanted, batches_of
+from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import (
     HOUR,
     ArchivedHour,
@@ -30,7 +27,7 @@ from iort_contract.archive import (
 from iort_contract.checks import shown
 from iort_contract.dynamodb import Keys, TelemetryTable, plain
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import batch_id, run_ends
+from iort_contract.messages.batch import Batch, batch_id, run_ends
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, SAMPLES
 from iort_contract.topics import parse_topic
 
@@ -160,22 +157,22 @@ class HourFile:
         """The samples of the batches with these keys, in the order of the batches."""
         return list(self._file.pages(self._hour, wanted, keys=keys, messages=messages))
 
-    def batches(self, wanted: Wanted, keys: Keys) -> list[Batches]:
+    def batches(self, wanted: Wanted, keys: Keys) -> list[Batch]:
+        """The batches with these keys."""
         if self._row.batches and self._file.has_messages(self._hour):
             # Values that were not finite are counted as messages are decoded.
-            return [batches_of(within(self.items(), keys), wanted)]
-        heads = within(self.headers(), keys)
-        counts = [int(item[SAMPLES]["N"]) for item in heads]
-        plained = [plain(item) for item in heads]
-        return [
-            Batches(
-                [batch_id(item[BATCH]) for item in plained],
-                [int(item.get(NONFINITE, 0)) for item in plained],
-                [run_ends(item[PREVIOUS]) if PREVIOUS in item else None for item in plained],
-                np.cumsum([0, *counts]),
-                join([one.block for one in self.parts(wanted, messages=True, keys=keys)]),
-            )
-        ]
+            return list(batches_of(within(self.items(), keys), wanted))
+        block = join([part.block for part in self.parts(wanted, messages=True, keys=keys)])
+        times, columns = block.times_us.tolist(), {n: values(column) for n, column in block.columns.items()}
+        batches, first = [], 0
+        for item in map(plain, within(self.headers(), keys)):
+            key, rows = batch_id(item[BATCH]), slice(first, first + int(item[SAMPLES]))
+            previous = run_ends(item[PREVIOUS]) if PREVIOUS in item else None
+            own = {name: column[rows] for name, column in columns.items()}
+            nonfinite = int(item.get(NONFINITE, 0))
+            batches.append(Batch(key.boot, key.seq, times[rows], own, nonfinite, None, previous))
+            first = rows.stop
+        return batches
 
     def headers(self) -> list[Item]:
         """The batches without their samples, as stored items."""

@@ -22,13 +22,21 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeV
 
 from iort_analysis import ArchiveError
 from iort_analysis.archive.hours import Archive, HourFile, Stores, is_expiring, key_of, merged, within
-from iort_analysis.samples.batches import ATTRIBUTES, Item, Part, RefusedItems, Wanted, part, start_us
+from iort_analysis.samples.batches import (
+    ATTRIBUTES,
+    Item,
+    Part,
+    RefusedItems,
+    Wanted,
+    batches_of,
+    part,
+    start_us,
+)
 from iort_analysis.samples.blocks import Block, join
-from iort_analysis.samples.seconds import Batches, batches_of
 from iort_contract.archive import ArchivedHour, Hour, hour_of, parse_hour
 from iort_contract.dynamodb import Keys, starting_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import BatchId, batch_id
+from iort_contract.messages.batch import Batch, BatchId, batch_id
 from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 
 if TYPE_CHECKING:
@@ -159,17 +167,14 @@ class Stored:
         for found in self._found(keys, HourFile.headers, tuple(dict.fromkeys(attributes))):
             yield from within(found.content, keys) if isinstance(found, _Archived) else found
 
-    def batches(self, keys: Keys, wanted: Wanted = lambda _name: True) -> Iterator[Batches]:
-        """The batches with these keys; what is not one is left out."""
+    def batches(self, keys: Keys, wanted: Wanted = lambda _name: True) -> Iterator[Batch]:
+        """The batches with these keys, with the fields that are ``wanted``; what is not one is left out."""
 
-        def of_hour(hour: HourFile) -> list[Batches]:
+        def of_hour(hour: HourFile) -> list[Batch]:
             return hour.batches(wanted, keys)
 
         for found in self._found(keys, of_hour, (*ATTRIBUTES, PREVIOUS)):
-            if isinstance(found, _Archived):
-                yield from found.content
-            else:
-                yield batches_of(found, wanted)
+            yield from found.content if isinstance(found, _Archived) else batches_of(found, wanted)
 
     def after(self, t_us: int | None) -> BatchId | None:
         """The first batch from a time on; None is the oldest of all."""

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import chain, groupby, repeat
 from typing import Any, NamedTuple, TypeAlias
 
@@ -25,6 +27,7 @@ from iort_contract.messages.batch import (
     Envelope,
     Opened,
     batch_id,
+    decode_batch,
     decode_opened,
     open_envelope,
     read_envelope,
@@ -223,6 +226,15 @@ def part(
             block = _block(_opened(envelopes, refused, messages=messages), refused, wanted)
         found.append(block)
     return Part(join(found), start_us(items[-1]) if items else 0)
+
+
+def batches_of(items: Iterable[Item], wanted: Wanted = lambda _name: True) -> Iterator[Batch]:
+    """Stored items as batches of the fields that are ``wanted``; what is not a batch is left out."""
+    for item in items:
+        with suppress(ContractError):
+            batch = decode_batch(plain(item))
+            columns = {name: column for name, column in batch.columns.items() if wanted(name)}
+            yield replace(batch, columns=columns)
 
 
 def in_order(parts: Iterable[Part]) -> Iterator[Block]:

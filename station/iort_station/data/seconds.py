@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, islice
 from typing import Any
 
 from iort_analysis.archive.stored import Pages, ahead, only
 from iort_analysis.samples.batches import Item
 from iort_analysis.samples.blocks import Block, column_of, objects
-from iort_analysis.samples.seconds import reach, summarized
 from iort_contract import dynamodb, expression, tables
 from iort_contract.archive import Hour
 from iort_contract.catalog.derived import SOURCES
 from iort_contract.codec import flat_second
 from iort_contract.limits import MAX_BATCH_SPAN_US
+from iort_contract.statistics import reach, summarize_seconds
 from iort_station.cloud import Cloud
-from iort_station.data.conditions import derive, holds
+from iort_station.data.conditions import holds
 from iort_station.data.recorded import Reading, Recorded, Selection, summary_table, topic_of
 from iort_station.errors import unknown
 from iort_station.fleet import registry
 
 _SECOND_US = 1_000_000
+# Computed seconds come so many at a time.
+_SECONDS = 1000
 # The counts of a second.
 _COUNTS = (
     tables.SAMPLES,
@@ -100,7 +102,9 @@ def _computed(
     before = recorded.before(reach(first, end)[0])
     earlier = () if before is None else recorded.batches(only(before), wanted)
     batches = chain(earlier, recorded.batches(keys, wanted))
-    yield from summarized(batches, first, end, lambda columns: derive(columns, vehicle))
+    summaries = summarize_seconds(batches, first, end, vehicle)
+    while some := list(islice(summaries, _SECONDS)):
+        yield _block([{tables.SECOND: second, **flat_second(summary)} for second, summary in some])
 
 
 def _needs(selection: Selection) -> Callable[[str], bool]:
@@ -149,7 +153,10 @@ def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
 
 
 def _block_of_seconds(items: Sequence[Item]) -> Block:
-    rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
+    return _block([flat_second({name: _value(value) for name, value in item.items()}) for item in items])
+
+
+def _block(rows: Sequence[Mapping[str, Any]]) -> Block:
     names = dict.fromkeys(
         name for row in rows for name in row if name not in {tables.TOPIC, tables.SECOND, tables.EXPIRES_S}
     )

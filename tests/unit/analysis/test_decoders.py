@@ -16,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_analysis.drives.stretches import recorded
-from iort_analysis.samples.batches import RefusedItems, blocks, part
-from iort_analysis.samples.seconds import batches_of
+from iort_analysis.samples.batches import RefusedItems, batches_of, blocks, part
 from iort_contract.archive import ArchivedHour, Pending, archived_hour, parse_hour, parse_pending
 from iort_contract.codec import DICTIONARY, flat_second, packed, unpacked
 from iort_contract.dynamodb import plain
@@ -189,7 +188,7 @@ DECODERS: Mapping[str, Decoder] = {
     "messages of an item": of_items(lambda item: messages_of(plain(item), LAYOUTS), ITEMS),
     "columns of items": of_items(lambda item: columns([ITEMS[0], item, ITEMS[1]]), ITEMS),
     "columns of an item": of_items(lambda item: columns([item]), ITEMS),
-    "batches of items": of_items(lambda item: batches_of([ITEMS[0], item]), ITEMS, total=True),
+    "batches of items": of_items(lambda item: list(batches_of([ITEMS[0], item])), ITEMS, total=True),
     "drive": of_items(lambda item: recorded(DRIVE, T_US + 9999, "vesc", [ITEMS[0], item]), ITEMS, total=True),
     "batch id": of_texts(batch_id, f"{T_US}-{RUN}-3"),
     "run ends": of_texts(run_ends, f"{RUN}-3 1{RUN}-0", ""),
