@@ -7,7 +7,7 @@ arithmetic gives null and every comparison is false; division by zero gives null
 if it is neither null, zero nor empty. A comparison of a number with a text, or arithmetic with a text, is an
 error, since no sample could match.
 
-`evaluate` walks the tree; a `Calculus` says how to calculate: with one sample's values here, for the query
+`evaluate` walks the tree; `operations` say how to calculate: with one sample's values here, for the query
 function, and with numpy's columns in iort_station.data.conditions.
 """
 
@@ -16,8 +16,9 @@ from __future__ import annotations
 import ast
 import math
 import operator
-from functools import reduce
-from typing import Any, Callable, FrozenSet, Mapping, NamedTuple, Sequence, Union
+import sys
+from functools import partial, reduce
+from typing import Any, Callable, FrozenSet, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import check_field
 from iort_contract.limits import ContractError, Value
@@ -42,66 +43,21 @@ class ExpressionError(ValueError):
         self.position = position
 
 
-class Field(NamedTuple):
-    """The value of a field."""
+class Node(NamedTuple):
+    """A step of an expression.
 
-    name: str
+    ``kind`` is `FIELD` or `CONSTANT`, which have a name or a value as ``value``; or one of `ARITHMETIC`, of
+    `COMPARISONS` or of the other operations, which take the values of the nodes ``of``. With null, arithmetic
+    and `MAGNITUDE` are null, and a comparison is false.
+    """
 
-
-class Constant(NamedTuple):
-    """A number, text, True or False."""
-
-    value: float | str
-
-
-class Arithmetic(NamedTuple):
-    """An operation on two numbers; null if either is null."""
-
-    symbol: str
-    left: Node
-    right: Node
+    kind: str
+    of: tuple[Node, ...] = ()
+    value: float | str = ""
 
 
-class Magnitude(NamedTuple):
-    """The absolute value of a number."""
-
-    of: Node
-
-
-class Comparison(NamedTuple):
-    """A comparison of two values; false if either is null."""
-
-    symbol: str
-    left: Node
-    right: Node
-
-
-class IsNull(NamedTuple):
-    """Whether a value is null."""
-
-    of: Node
-
-
-class Every(NamedTuple):
-    """True if all parts are true."""
-
-    of: tuple[Node, ...]
-
-
-class Some(NamedTuple):
-    """True if any part is true."""
-
-    of: tuple[Node, ...]
-
-
-class Not(NamedTuple):
-    """True if the part is false."""
-
-    of: Node
-
-
-Node = Union[Field, Constant, Arithmetic, Magnitude, Comparison, IsNull, Every, Some, Not]
-
+FIELD, CONSTANT = "field", "constant"
+MAGNITUDE, IS_NULL, NOT, EVERY, SOME = "abs", "is null", "not", "and", "or"
 ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
     "+": operator.add,
     "-": operator.sub,
@@ -138,50 +94,43 @@ def parse(expression: str) -> Node:
     return _Reader(text).read(tree.body)
 
 
-def children(node: Node) -> tuple[Node, ...]:
-    """The nodes directly below a node."""
-    if isinstance(node, (Arithmetic, Comparison)):
-        return (node.left, node.right)
-    if isinstance(node, (Every, Some)):
-        return node.of
-    return () if isinstance(node, (Field, Constant)) else (node.of,)
-
-
 def names(node: Node) -> frozenset[str]:
     """The fields in a tree."""
-    if isinstance(node, Field):
-        return frozenset({node.name})
-    return frozenset().union(*map(names, children(node)))
+    if node.kind == FIELD:
+        return frozenset({str(node.value)})
+    return frozenset().union(*map(names, node.of))
 
 
-class Calculus(NamedTuple):
-    """How to calculate with values of one kind. ``truth`` gives what ``&``, ``|`` and ``^ True`` take."""
-
-    arithmetic: Callable[[str, Any, Any], Any]
-    magnitude: Callable[[Any], Any]
-    compare: Callable[[str, Any, Any], Any]
-    is_null: Callable[[Any], Any]
-    truth: Callable[[Any], Any]
+Operations = Mapping[str, Callable[..., Any]]
 
 
-def evaluate(node: Node, fields: Mapping[str, Any], how: Calculus) -> Any:
+def operations(
+    arithmetic: Callable[[str, Any, Any], Any],
+    compare: Callable[[str, Any, Any], Any],
+    magnitude: Callable[[Any], Any],
+    is_null: Callable[[Any], Any],
+    truth: Callable[[Any], Any],
+) -> Operations:
+    """Each kind of node's operation on values of one kind. ``truth`` gives what ``&``, ``|`` and ``^ True``
+    take."""
+    return {
+        **{symbol: partial(arithmetic, symbol) for symbol in ARITHMETIC},
+        **{symbol: partial(compare, symbol) for symbol in COMPARISONS},
+        MAGNITUDE: magnitude,
+        IS_NULL: is_null,
+        NOT: lambda value: truth(value) ^ True,
+        EVERY: lambda *values: reduce(operator.and_, map(truth, values)),
+        SOME: lambda *values: reduce(operator.or_, map(truth, values)),
+    }
+
+
+def evaluate(node: Node, fields: Mapping[str, Any], how: Operations) -> Any:
     """The value of a tree, or whether it is true, with the values of the fields."""
-    if isinstance(node, Field):
-        return fields[node.name]
-    if isinstance(node, Constant):
+    if node.kind == FIELD:
+        return fields[str(node.value)]
+    if node.kind == CONSTANT:
         return node.value
-    values = [evaluate(child, fields, how) for child in children(node)]
-    if isinstance(node, Arithmetic):
-        return how.arithmetic(node.symbol, *values)
-    if isinstance(node, Magnitude):
-        return how.magnitude(*values)
-    if isinstance(node, Comparison):
-        return how.compare(node.symbol, *values)
-    if isinstance(node, IsNull):
-        return how.is_null(*values)
-    if isinstance(node, Not):
-        return how.truth(*values) ^ True
-    return reduce(operator.and_ if isinstance(node, Every) else operator.or_, map(how.truth, values))
+    return how[node.kind](*[evaluate(part, fields, how) for part in node.of])
 
 
 def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bool]:
@@ -217,7 +166,7 @@ def _magnitude(value: Value) -> float | None:
     return abs(float(value)) if isinstance(value, (int, float)) else None
 
 
-_PLAIN = Calculus(_calculated, _magnitude, _compared, lambda value: value is None, bool)
+_PLAIN = operations(_calculated, _compared, _magnitude, lambda value: value is None, bool)
 
 
 def _kind(value: Value) -> str:
@@ -226,29 +175,28 @@ def _kind(value: Value) -> str:
 
 def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
     """The kinds of a node's values; empty if unknown, or if all are null."""
-    if isinstance(node, Field):
-        return of.get(node.name, frozenset())
-    return frozenset({_kind(node.value) if isinstance(node, Constant) else _NUMBER})
+    if node.kind == FIELD:
+        return of.get(str(node.value), frozenset())
+    return frozenset({_kind(node.value) if node.kind == CONSTANT else _NUMBER})
 
 
 def _mismatch(node: Node, of: _Kinds) -> str:
     """The error text if the condition mixes numbers and texts of these kinds; empty if it does not."""
-    parts = children(node)
-    kinds = frozenset().union(*(_kinds(part, of) for part in parts))
+    kinds = frozenset().union(*(_kinds(part, of) for part in node.of))
     said = ", ".join(
-        f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in parts if _kinds(part, of)
+        f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in node.of if _kinds(part, of)
     )
-    if isinstance(node, Comparison) and len(kinds) > 1:
+    if node.kind in COMPARISONS and len(kinds) > 1:
         return f"cannot compare a number with a text: {said}"
-    if isinstance(node, (Arithmetic, Magnitude)) and _TEXT in kinds:
+    if (node.kind in ARITHMETIC or node.kind == MAGNITUDE) and _TEXT in kinds:
         return f"cannot calculate with a text: {said}"
-    return next(filter(None, (_mismatch(part, of) for part in parts)), "")
+    return next(filter(None, (_mismatch(part, of) for part in node.of)), "")
 
 
 def _shown(node: Node) -> str:
-    if isinstance(node, Field):
-        return node.name
-    return repr(node.value) if isinstance(node, Constant) else "the result"
+    if node.kind == FIELD:
+        return str(node.value)
+    return repr(node.value) if node.kind == CONSTANT else "the result"
 
 
 class _Reader:
@@ -272,25 +220,25 @@ class _Reader:
             return self._field(node)
         if isinstance(node, ast.Constant):
             return self._constant(node)
-        made = self._made(node)
+        step = self._operation(node)
         # The kinds of fields are known only with the samples.
-        if problem := _mismatch(made, {}):
+        if problem := _mismatch(step, {}):
             raise self._error(problem, node)
-        return made
+        return step
 
-    def _made(self, node: ast.expr) -> Node:
+    def _operation(self, node: ast.expr) -> Node:
         if isinstance(node, ast.BoolOp):
             parts = tuple(map(self.read, node.values))
-            return Every(parts) if isinstance(node.op, ast.And) else Some(parts)
+            return Node(EVERY if isinstance(node.op, ast.And) else SOME, parts)
         if isinstance(node, ast.UnaryOp):
             if isinstance(node.op, ast.Not):
-                return Not(self.read(node.operand))
+                return Node(NOT, (self.read(node.operand),))
             if isinstance(node.op, ast.USub):
-                return Arithmetic("-", Constant(0), self.read(node.operand))
+                return Node("-", (Node(CONSTANT, value=0), self.read(node.operand)))
             if isinstance(node.op, ast.UAdd):
                 return self.read(node.operand)
         if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
-            return Arithmetic(_BINARY[type(node.op)], self.read(node.left), self.read(node.right))
+            return Node(_BINARY[type(node.op)], (self.read(node.left), self.read(node.right)))
         if isinstance(node, ast.Compare):
             return self._compare(node)
         if isinstance(node, ast.Call):
@@ -298,7 +246,7 @@ class _Reader:
         raise self._error("not part of the language: fields, numbers, texts, + - * / %, "
                           "abs(), comparisons, and, or, not", node)  # fmt: skip
 
-    def _field(self, node: ast.expr) -> Field:
+    def _field(self, node: ast.expr) -> Node:
         path: list[str] = []
         at = node
         while not isinstance(at, ast.Name):
@@ -313,52 +261,44 @@ class _Reader:
             at = at.value
         name = ".".join([at.id, *reversed(path)])
         try:
-            return Field(check_field(name))
+            return Node(FIELD, value=check_field(name))
         except ContractError as error:
             raise self._error(str(error), node) from error
 
-    def _constant(self, node: ast.Constant) -> Constant:
+    def _constant(self, node: ast.Constant) -> Node:
         value = node.value
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            try:
-                finite = math.isfinite(value)
-            except OverflowError:
-                finite = False
-            if not finite:
-                raise self._error("the number is too large", node)
-            return Constant(value)
-        if isinstance(value, (bool, str)):
-            return Constant(value)
         if value is None:
             raise self._error("None is only allowed as x is None, x is not None", node)
-        raise self._error("must be a number or a text", node)
+        if not isinstance(value, (bool, int, float, str)):
+            raise self._error("must be a number or a text", node)
+        # An integer may be larger than every float.
+        if not isinstance(value, str) and not abs(value) <= sys.float_info.max:
+            raise self._error("the number is too large", node)
+        return Node(CONSTANT, value=value)
 
     def _compare(self, node: ast.Compare) -> Node:
-        parts: list[Node] = []
-        left = node.left
-        for kind, right in zip(node.ops, node.comparators):
-            parts.append(self._pair(left, kind, right))
-            left = right
-        return parts[0] if len(parts) == 1 else Every(tuple(parts))
+        sides = zip([node.left, *node.comparators], node.ops, node.comparators)
+        pairs = tuple(self._pair(*side) for side in sides)
+        return pairs[0] if len(pairs) == 1 else Node(EVERY, pairs)
 
     def _pair(self, left: ast.expr, kind: ast.cmpop, right: ast.expr) -> Node:
         if isinstance(kind, (ast.Is, ast.IsNot)) and not _is_none(right):
             raise self._error("`is` only works with None; use ==", right)
         if isinstance(kind, (ast.Is, ast.IsNot, ast.Eq, ast.NotEq)) and (_is_none(left) or _is_none(right)):
-            null = IsNull(self.read(left if _is_none(right) else right))
-            return null if isinstance(kind, (ast.Is, ast.Eq)) else Not(null)
+            null = Node(IS_NULL, (self.read(left if _is_none(right) else right),))
+            return null if isinstance(kind, (ast.Is, ast.Eq)) else Node(NOT, (null,))
         if type(kind) in _COMPARE:
-            return Comparison(_COMPARE[type(kind)], self.read(left), self.read(right))
+            return Node(_COMPARE[type(kind)], (self.read(left), self.read(right)))
         if not isinstance(right, (ast.Tuple, ast.List)) or not right.elts:
             raise self._error("`in` needs values in brackets, such as in (1, 2)", right)
-        within = Some(tuple(self._pair(left, ast.Eq(), item) for item in right.elts))
-        return within if isinstance(kind, ast.In) else Not(within)
+        within = Node(SOME, tuple(self._pair(left, ast.Eq(), item) for item in right.elts))
+        return within if isinstance(kind, ast.In) else Node(NOT, (within,))
 
     def _call(self, node: ast.Call) -> Node:
         known = isinstance(node.func, ast.Name) and node.func.id == "abs"
         if not known or len(node.args) != 1 or node.keywords:
             raise self._error("the only function is abs(x)", node)
-        return Magnitude(self.read(node.args[0]))
+        return Node(MAGNITUDE, (self.read(node.args[0]),))
 
     def _error(self, problem: str, node: ast.expr) -> ExpressionError:
         # ast counts bytes of UTF-8.

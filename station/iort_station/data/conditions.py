@@ -53,9 +53,9 @@ def _finite(column: Column) -> Column:
 
 
 def _has_text(node: Node) -> bool:
-    if isinstance(node, expression.Constant):
+    if node.kind == expression.CONSTANT:
         return isinstance(node.value, str)
-    return any(map(_has_text, expression.children(node)))
+    return any(map(_has_text, node.of))
 
 
 # An array of numbers has NaN for null; a mask is an array of truths.
@@ -81,10 +81,10 @@ def _truth(value: Any, n: int | None = None) -> NDArray[np.bool_]:
     return np.asarray(mask if n is None else np.broadcast_to(mask, (n,)), dtype=np.bool_)
 
 
-_ARRAYS = expression.Calculus(
+_ARRAYS = expression.operations(
     _calculated,
-    lambda value: np.abs(_numbers(value)),
     _compared,
+    lambda value: np.abs(_numbers(value)),
     lambda value: np.isnan(_numbers(value)),
     _truth,
 )

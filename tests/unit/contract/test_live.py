@@ -205,7 +205,7 @@ def test_a_lease_is_decoded_as_it_was_encoded(lease: Lease) -> None:
     ("changed", "named"),
     [
         ({"viewer": "0" * 33}, "viewer"),
-        ({"rate_hz": math.nan}, "rate_hz must be 0.01 to 10, got nan"),
+        ({"rate_hz": math.nan}, "not JSON"),
         ({"rate_hz": 10.5}, "rate_hz"),
         # No float is so large.
         ({"rate_hz": 10**400}, "rate_hz"),
