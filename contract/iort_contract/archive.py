@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any, Iterable, Iterator, Mapping, NamedTuple
 
-from iort_contract.checks import checked, integer, text
+from iort_contract.checks import checked, text
 from iort_contract.dynamodb import Item, Keys, TelemetryTable, TopicTable, plain, starting_between
 from iort_contract.limits import ContractError
+from iort_contract.messages.envelope import read
 from iort_contract.tables import BATCH, ENVELOPE, TOPIC
 from iort_contract.topics import Topic
 
@@ -138,10 +139,7 @@ class ArchivedHour:
 
 def archived_hour(item: Mapping[str, Any]) -> ArchivedHour:
     """Decode a row of the manifest, as DynamoDB sends it; raises `ContractError`."""
-    row = plain(item)
-    kinds = ArchivedHour.__annotations__
-    values: Any = {name: (text if kinds[name] == "str" else integer)(row, name) for name in kinds}
-    return ArchivedHour(**values)
+    return read(ArchivedHour, plain(item))
 
 
 class ArchiveTable(TopicTable):

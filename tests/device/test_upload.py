@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
+from dataclasses import replace
 from pathlib import PurePath
 
 import pytest
@@ -224,7 +225,7 @@ def test_nothing_is_sent_unencrypted_or_to_an_untrusted_server(rig, small):
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
     with pytest.raises(UploadError, match="must be https"):
-        sender.put(address._replace(url=url.replace("https", "http")), local, 0, 11, rig.stop)
+        sender.put(replace(address, url=url.replace("https", "http")), local, 0, 11, rig.stop)
     assert rig.store.puts == []
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import replace
 
 from iort_contract.messages.files import FILES_PREFIX, PART_BYTES, File, part_range
 from testkit.waiting import until
@@ -56,9 +57,9 @@ def in_one(lab: Lab) -> Seen:
     seen = {
         "other_bytes": other_bytes,
         "other_bytes_told": code in ("BadDigest", "XAmzContentChecksumMismatch"),
-        "other_length": robot.put(address._replace(headers=longer), _SMALL + b"x"),
-        "without_condition": robot.put(address._replace(headers=twice), _SMALL),
-        "other_key": robot.put(address._replace(url=address.url.replace(".txt", ".bin")), _SMALL),
+        "other_length": robot.put(replace(address, headers=longer), _SMALL + b"x"),
+        "without_condition": robot.put(replace(address, headers=twice), _SMALL),
+        "other_key": robot.put(replace(address, url=address.url.replace(".txt", ".bin")), _SMALL),
         "stored": robot.put(address, _SMALL),
         "again": robot.put(address, _SMALL),
         "note_other_bytes": code,

@@ -7,18 +7,20 @@ the losses of every source by cause.
 from __future__ import annotations
 
 import json
-from typing import Mapping, NamedTuple, Optional, Union
+from dataclasses import dataclass
+from typing import Mapping, NamedTuple, Union
 
 from iort_contract.limits import ContractError, Value
+from iort_contract.messages.envelope import read
 
 # The interval of reports while nothing is lost. Batches are numbered, so a long interval is enough.
 ACCOUNT_EVERY_S = 30.0
-_NUMBERS = ("taken", "stored", "refused", "nulled", "first_seq", "next_seq")
 # The size limit of a text in a sample.
 _MAX_TEXT = 4096
 
 
-class StreamAccount(NamedTuple):
+@dataclass(frozen=True)
+class StreamAccount:
     """A stream's counts since the start of the run: samples ``taken``; samples ``stored`` in batches with
     sequence numbers from ``first_seq`` (inclusive) to ``next_seq`` (exclusive); ``refused`` samples, which no
     message can hold; and ``nulled`` values, which were not finite. The rest of the taken samples was in open
@@ -34,12 +36,12 @@ class StreamAccount(NamedTuple):
     first_seq: int
     next_seq: int
     ended: bool
-    durable: Optional[bool] = None  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+    durable: bool | None = None
     replayed: bool = False
 
     def sample(self) -> dict[str, Value]:
         """The account as a sample."""
-        return dict(self._asdict())
+        return dict(vars(self))
 
 
 class SourceAccount(NamedTuple):
@@ -91,18 +93,7 @@ def account(sample: Mapping[str, Value]) -> Account:
             return SourceAccount(str(sample["source"]), {str(name): int(n) for name, n in counts.items()})
         except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
             raise ContractError(f"a source's account cannot be decoded: {error}") from error
-    try:
-        numbers = {name: int(sample[name] or 0) for name in _NUMBERS}
-        durable = sample.get("durable")
-        return StreamAccount(
-            str(sample["stream"]),
-            **numbers,
-            ended=bool(sample["ended"]),
-            durable=None if durable is None else bool(durable),
-            replayed=bool(sample.get("replayed")),
-        )
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ContractError(f"a stream's account cannot be decoded: {error}") from error
+    return read(StreamAccount, {name: value for name, value in sample.items() if value is not None})
 
 
 def lost(counts: Mapping[str, int]) -> dict[str, int]:

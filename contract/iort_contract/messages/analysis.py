@@ -7,11 +7,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Callable, Mapping, NamedTuple
+from typing import Any, Mapping, NamedTuple
 
 from iort_contract.checks import checked, integer, shown, text
 from iort_contract.limits import ContractError
-from iort_contract.messages.envelope import number, read
+from iort_contract.messages.envelope import each, read
+from iort_contract.tables import T_US
 from iort_contract.topics import check_robot, check_stream
 
 # The share of repetitions in which an estimate's interval holds the truth.
@@ -108,12 +109,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
     return estimate._asdict()
 
 
-def decode_estimate(content: Any) -> Estimate:
-    """Decode an estimate; raises `ContractError`."""
-    if not isinstance(content, Mapping):
-        raise ContractError(f"estimate must be an object, got {shown(content)}")
-    value, low, high = (number(content, name) for name in ("value", "low", "high"))
-    return Estimate(value, low, high, text(content, "unit"))
+decode_estimate = partial(read, Estimate)
 
 
 @dataclass(frozen=True)
@@ -208,16 +204,10 @@ def decode_analysed(content: Mapping[str, Any]) -> AnalysedDrive:
         AnalysedDrive,
         {**content, "drive": content},
         drive=_drive,
-        estimates=partial(_each, decode_estimate),
-        missing=partial(_each, str),
-        repairs=partial(_each, lambda count: integer({"repairs": count}, "repairs")),
+        estimates=each(decode_estimate),
+        missing=each(str),
+        repairs=each(lambda count: integer({"repairs": count}, "repairs")),
     )
-
-
-def _each(decode: Callable[[Any], Any], content: Any) -> dict[str, Any]:
-    if not isinstance(content, Mapping):
-        raise ContractError(f"an analysed drive's row must have objects, got {shown(content)}")
-    return {name: decode(value) for name, value in content.items()}
 
 
 def _drive(content: Mapping[str, Any]) -> DriveKey:
@@ -254,13 +244,7 @@ def encode_note(note: Note) -> dict[str, Any]:
 
 def decode_note(content: Mapping[str, Any]) -> Note:
     """Decode a note; raises `ContractError`."""
-    note = Note(
-        check_robot(text(content, "robot")),
-        integer(content, "t_us"),
-        text(content, "text"),
-        text(content, "by"),
-        text(content, "salt"),
-    )
+    note = read(Note, {**content, T_US: content.get("t_us")})
     _check(note)
     return note
 
@@ -279,4 +263,5 @@ def _check(note: Note) -> None:
             raise ContractError(f"{name} must have {least} to {most} characters, got {len(value)}")
     if not 0 <= note.t_us < 10**16:
         raise ContractError(f"t_us must be microseconds since the epoch, got {shown(note.t_us)}")
+    check_robot(note.robot)
     check_note_id(note.id)

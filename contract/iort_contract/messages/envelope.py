@@ -7,7 +7,8 @@ from __future__ import annotations
 import base64
 import json
 from dataclasses import MISSING, fields
-from typing import Any, Callable, Mapping, TypeVar, Union
+from functools import lru_cache
+from typing import Any, Callable, Mapping, NamedTuple, TypeVar, Union
 
 from iort_contract.checks import check_version, integer, json_object, shown, text
 from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
@@ -18,19 +19,47 @@ M = TypeVar("M")
 _ENTRIES = {"t_us": T_US}
 
 
-def read(kind: type[M], envelope: Mapping[str, Any], **nested: Callable[[Any], Any]) -> M:
+class _Field(NamedTuple):
+    name: str
+    entry: str
+    required: bool
+    # None for a message within the message.
+    read: Callable[[Mapping[str, Any], str], Any] | None
+
+
+@lru_cache(maxsize=None)
+def _fields(kind: type[Any]) -> tuple[_Field, ...]:
+    """The fields of a message's dataclass or named tuple."""
+    defaults = getattr(kind, "_field_defaults", None)
+    if defaults is None:
+        defaults = {
+            field.name: field
+            for field in fields(kind)
+            if field.default is not MISSING or field.default_factory is not MISSING
+        }
+    # A named tuple has its annotations as references.
+    annotations = {name: str(getattr(of, "__forward_arg__", of)) for name, of in kind.__annotations__.items()}
+    return tuple(
+        _Field(name, _ENTRIES.get(name, name), name not in defaults, _READERS.get(of.split(" | ")[0]))
+        for name, of in annotations.items()
+    )
+
+
+def read(kind: type[M], envelope: Any, **nested: Callable[[Any], Any]) -> M:
     """The message in an envelope; raises `ContractError`. A missing entry has its field's default.
 
-    ``nested`` has the decoders of the fields that are messages themselves.
+    ``nested`` has the decoders of the fields that are messages themselves, or have another form.
     """
+    if not isinstance(envelope, Mapping):
+        raise ContractError(f"{kind.__name__} must be an object, got {shown(envelope)}")
     values = {}
-    for field in fields(kind):  # type: ignore[arg-type]  # a dataclass
-        entry = _ENTRIES.get(field.name, field.name)
-        if entry in envelope or (field.default is MISSING and field.default_factory is MISSING):
+    for field in _fields(kind):  # type: ignore[arg-type]  # a type is hashable
+        if field.required or field.entry in envelope:
             if field.name in nested:
-                values[field.name] = nested[field.name](envelope.get(entry))
+                values[field.name] = nested[field.name](envelope.get(field.entry))
             else:
-                values[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
+                assert field.read is not None, f"{kind.__name__}.{field.name} needs a decoder"
+                values[field.name] = field.read(envelope, field.entry)
     return kind(**values)
 
 
@@ -53,13 +82,13 @@ def codec(
     message that ``check`` refuses, and the second for everything that the first cannot have written."""
 
     def encode(message: M) -> bytes:
-        check(message)
         try:
             payload = to_json({"v": SCHEMA_VERSION, **entries(message)})
         except ContractError as error:
             raise ContractError(f"{what}: {error}") from error
         if len(payload) > MAX_MESSAGE_BYTES:
             raise ContractError(f"{what} must be at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
+        decode(payload)
         return payload
 
     def decode(payload: Wire) -> M:
@@ -93,7 +122,7 @@ def number(envelope: Mapping[str, Any], key: str) -> float:
 
 
 def _flag(envelope: Mapping[str, Any], key: str) -> bool:
-    value = envelope[key]
+    value = envelope.get(key)
     if not isinstance(value, bool):
         raise ContractError(f"{key} must be true or false, got {shown(value)}")
     return value
@@ -106,8 +135,7 @@ def _names(envelope: Mapping[str, Any], key: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-def mapping(envelope: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """An entry that is an object; raises `ContractError`."""
+def _mapping(envelope: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = envelope.get(key)
     if not isinstance(value, Mapping):
         raise ContractError(f"{key} must be an object, got {shown(value)}")
@@ -128,9 +156,22 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "bool": _flag,
     "bytes": _bytes,
     "tuple[str, ...]": _names,
-    "Mapping[str, Any]": mapping,
-    "Mapping[str, int]": mapping,
+    "Mapping[str, Any]": _mapping,
+    "Mapping[str, int]": _mapping,
+    "Mapping[str, Value]": _mapping,
+    "Any": lambda envelope, key: envelope.get(key),
 }
+
+
+def each(decode: Callable[[Any], Any]) -> Callable[[Any], dict[str, Any]]:
+    """A decoder of an object whose values ``decode`` takes."""
+
+    def decode_each(content: Any) -> dict[str, Any]:
+        if not isinstance(content, Mapping):
+            raise ContractError(f"must be an object, got {shown(content)}")
+        return {str(name): decode(value) for name, value in content.items()}
+
+    return decode_each
 
 
 def rule_event(message: bytes, topic: str, received_ms: int) -> dict[str, Any]:

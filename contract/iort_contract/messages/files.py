@@ -6,20 +6,12 @@ import calendar
 import re
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from iort_contract.checks import (
-    BOOT,
-    check_time,
-    check_version,
-    checked,
-    integer,
-    json_object,
-    shown,
-    whole_number,
-)
-from iort_contract.limits import SCHEMA_VERSION, ContractError
-from iort_contract.messages.envelope import codec, read, to_json
+from iort_contract.checks import BOOT, check_time, checked, shown, whole_number
+from iort_contract.limits import ContractError
+from iort_contract.messages.envelope import codec, each, read
 from iort_contract.topics import check_robot
 
 # Where robots upload to, in the files' bucket.
@@ -84,7 +76,8 @@ class FileRequest:
     parts_sha256: str | None = None
 
 
-class Address(NamedTuple):
+@dataclass(frozen=True)
+class Address:
     """Where to PUT a part (or the whole file), with exactly these headers."""
 
     part: int
@@ -157,58 +150,38 @@ def file_request_id(message: Mapping[str, Any]) -> str | None:
     return request_id if isinstance(request_id, str) and BOOT.fullmatch(request_id) else None
 
 
-def encode_file_answer(answer: FileAnswer) -> bytes:
-    """The answer as JSON, without empty entries."""
-    envelope: dict[str, Any] = {"v": SCHEMA_VERSION, "id": answer.id}
-    if answer.refused is not None:
-        envelope["refused"] = answer.refused
-        if answer.again_s is not None:
-            envelope["again_s"] = answer.again_s
-    else:
-        envelope.update(key=answer.key, stored=answer.stored)
-    if answer.have:
-        envelope["have"] = answer.have
-    if answer.addresses:
-        envelope["addresses"] = [address._asdict() for address in answer.addresses]
-    return to_json(envelope)
-
-
-def decode_file_answer(message: bytes | str) -> FileAnswer:
-    """Decode an answer; raises `ContractError` for everything that `encode_file_answer` cannot have
-    written."""
-    envelope = json_object(message, "file answer")
-    check_version(envelope)
-    given_id = checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")
-    if "refused" in envelope:
-        again_s = integer(envelope, "again_s") if "again_s" in envelope else None
-        if again_s is not None and not 0 <= again_s <= _MAX_WAIT_S:
-            raise ContractError(f"again_s must be 0 to {_MAX_WAIT_S}, got {again_s}")
-        return FileAnswer(given_id, refused=str(envelope["refused"]), again_s=again_s)
-    key, stored = envelope.get("key"), envelope.get("stored")
-    if not isinstance(key, str) or not isinstance(stored, bool):
-        raise ContractError("key must be a text, and stored true or false")
+def _ranges(content: Any) -> tuple[tuple[int, int], ...]:
     try:
-        have = tuple((int(first), int(last)) for first, last in envelope.get("have", ()))
-        addresses = tuple(
-            Address(int(to["part"]), str(to["url"]), {str(k): str(v) for k, v in to["headers"].items()})
-            for to in envelope.get("addresses", ())
-        )
-    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ContractError(f"have or addresses are invalid: {error}") from error
-    if any(later[0] <= earlier[1] for earlier, later in zip(have, have[1:])):
+        ranges = tuple((int(first), int(last)) for first, last in content)
+    except (ArithmeticError, TypeError, ValueError) as error:
+        raise ContractError(f"have must be ranges: {error}") from error
+    if any(later[0] <= earlier[1] for earlier, later in zip(ranges, ranges[1:])):
         raise ContractError("have must be ranges in order, without overlaps")
-    return FileAnswer(given_id, key, stored, have, addresses)
+    return ranges
+
+
+def _addresses(content: Any) -> tuple[Address, ...]:
+    if not isinstance(content, (list, tuple)):
+        raise ContractError(f"addresses must be a list, got {shown(content)}")
+    return tuple(read(Address, address, headers=each(str)) for address in content)
+
+
+def _check_file_answer(answer: FileAnswer) -> None:
+    checked(BOOT, answer.id, "id", "8 to 32 of 0-9 a-f")
+    if answer.again_s is not None:
+        whole_number("again_s", answer.again_s, 0, _MAX_WAIT_S)
+    if answer.refused is None and answer.key is None:
+        raise ContractError("an answer must have a key, or say why not")
+
+
+encode_file_answer, decode_file_answer = codec(
+    FileAnswer, "file answer", _check_file_answer, have=_ranges, addresses=_addresses
+)
 
 
 def check_sha256(value: object, what: str = "SHA-256") -> str:
     """Return the value if it is a SHA-256 in hex."""
     return checked(_SHA256, value, what, "64 of 0-9 a-f")
-
-
-def _file(content: Any) -> File:
-    if not isinstance(content, Mapping):
-        raise ContractError(f"file must be an object, got {shown(content)}")
-    return read(File, content)
 
 
 def _parts(content: Any) -> dict[int, Any]:
@@ -230,7 +203,7 @@ def _check_file_request(request: FileRequest) -> None:
 
 
 encode_file_request, decode_file_request = codec(
-    FileRequest, "file request", _check_file_request, file=_file, parts=_parts
+    FileRequest, "file request", _check_file_request, file=partial(read, File), parts=_parts
 )
 
 

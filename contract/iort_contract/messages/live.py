@@ -33,7 +33,7 @@ from iort_contract.limits import (
     ContractError,
     Value,
 )
-from iort_contract.messages.envelope import codec, to_json
+from iort_contract.messages.envelope import codec, read, to_json
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 from iort_contract.topics import VIEW, build_topic, check_robot, check_stream
 
@@ -85,21 +85,18 @@ def decode_live(message: bytes | str | Mapping[str, Any]) -> LiveSample:
     """Decode a live message; raises `ContractError` for everything that `encode_live` cannot write."""
     envelope = message if isinstance(message, Mapping) else json_object(message, "live message")
     check_version(envelope)
-    seq, nonfinite = integer(envelope, "seq"), integer(envelope, NONFINITE)
-    boot = check_header(envelope.get("boot"), seq, nonfinite)
-    sample = envelope.get("sample")
-    if not isinstance(sample, dict) or len(sample) > MAX_FIELDS:
-        raise ContractError(f"sample must be an object of at most {MAX_FIELDS} fields")
-    if wire_sample(sample)[1]:
-        odd = next(name for name, value in sample.items() if wire_column(name, (value,))[1])
+    live = read(LiveSample, {NONFINITE: None, **envelope})
+    check_header(live.boot, live.seq, live.nonfinite)
+    if len(live.sample) > MAX_FIELDS:
+        raise ContractError(f"sample must have at most {MAX_FIELDS} fields, got {len(live.sample)}")
+    if wire_sample(live.sample)[1]:
+        odd = next(name for name, value in live.sample.items() if wire_column(name, (value,))[1])
         raise ContractError(f"field {odd}: numbers must be finite")
-    t_us = check_time(integer(envelope, T_US), "sample time")
-    sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
-    offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
-    offset_entry(offset_us)
-    next_ms = integer(envelope, "next_ms") if "next_ms" in envelope else None
-    _next_entry(next_ms)
-    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us, next_ms)
+    check_time(live.t_us, "sample time")
+    check_time(live.sent_us, "sent_us")
+    offset_entry(live.offset_us)
+    _next_entry(live.next_ms)
+    return live
 
 
 def silent_s(next_ms: int | None) -> float:
@@ -183,16 +180,15 @@ class Pong(NamedTuple):
 
     id: int
     sent_us: int
-    received_ms: int | None
+    received_ms: int | None = None
 
 
 def decode_pong(message: bytes | str) -> Pong:
     """Decode a pong, or a ping that came straight back; raises `ContractError` otherwise."""
-    envelope = json_object(message, "pong")
-    received = integer(envelope, RECEIVED_MS) if RECEIVED_MS in envelope else None
-    if received is not None:
-        check_time(received * 1000, RECEIVED_MS)
-    return Pong(integer(envelope, "id"), integer(envelope, "sent_us"), received)
+    pong = read(Pong, json_object(message, "pong"))
+    if pong.received_ms is not None:
+        check_time(pong.received_ms * 1000, RECEIVED_MS)
+    return pong
 
 
 # The longest lease: what a viewer costs that ends without a word.

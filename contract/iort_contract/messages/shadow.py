@@ -5,13 +5,16 @@ The operator, the cloud and the robot write it, so a reader ignores what has ano
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Iterator, Mapping, NamedTuple, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Sequence, TypeVar
 
 from iort_contract.checks import check_field, shown
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
 from iort_contract.messages.commands import DriveLimits, decode_limits, encode_limits
-from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
+from iort_contract.messages.envelope import read
+from iort_contract.tables import AGENT_VERSION, OVER_SHARE
 from iort_contract.topics import COMMANDS, check_stream
+
+M = TypeVar("M")
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 # When the live lane sends at its full rate.
@@ -120,7 +123,7 @@ class Rejection(NamedTuple):
     """A desired value that the agent rejects, and the reason for a human."""
 
     value: Any
-    reason: str
+    reason: str = ""
 
 
 class Outcome(NamedTuple):
@@ -184,14 +187,11 @@ class Reported:
 def decode_desired(document: Any) -> Desired:
     """The desired part of a shadow."""
     sections = dict(_mapping(document))
-    notice = _mapping(sections.pop(OVER_SHARE, None))
-    counts = [notice.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
-    valid = [count for count in counts if type(count) is int and 0 <= count < _MOST]
     notes = _mapping(sections.pop(STOPS, None))
     return Desired(
-        dict(_flat(sections)),
-        OverShare(*valid) if len(valid) == len(counts) else None,
-        StopNotes(*(_pressed(notes.get(name)) for name in StopNotes._fields)),
+        over_share=_counted(OverShare, sections.pop(OVER_SHARE, None)),
+        stops=StopNotes(*(_counted(Pressed, notes.get(name)) for name in StopNotes._fields)),
+        settings=dict(_flat(sections)),
     )
 
 
@@ -223,18 +223,8 @@ def decode_reported(document: Any) -> Reported:
     moves = sections.pop(MOVES, None)
     return Reported(
         dict(sorted(_flat(sections))),
-        {
-            name: Rejection(rejection.get("value"), str(rejection.get("reason", "")))
-            for name, rejection in sorted(rejected.items())
-            if isinstance(rejection, dict)
-        },
-        {
-            name: Outcome(outcome["session"], outcome["seq"], str(outcome.get("outcome")))
-            for name, outcome in commands.items()
-            if isinstance(outcome, dict)
-            and isinstance(outcome.get("session"), str)
-            and type(outcome.get("seq")) is int
-        },
+        _each_valid(Rejection, dict(sorted(rejected.items()))),
+        _each_valid(Outcome, commands),
         version if isinstance(version, str) else "",
         drive,
         moves if isinstance(moves, bool) else None,
@@ -266,10 +256,23 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     return document
 
 
-def _pressed(note: Any) -> Pressed | None:
-    entry = _mapping(note)
-    by, t_ms = entry.get("by"), entry.get("t_ms")
-    return Pressed(by, t_ms) if isinstance(by, str) and type(t_ms) is int and 0 <= t_ms < _MOST else None
+def _valid(kind: type[M], content: Any) -> M | None:
+    """The message in an entry; None if it has another form."""
+    try:
+        return read(kind, content)
+    except ContractError:
+        return None
+
+
+def _counted(kind: type[M], content: Any) -> M | None:
+    """The message in an entry; None too if one of its counts or times is none."""
+    counts = [value for value in _mapping(content).values() if type(value) is int]
+    return _valid(kind, content) if all(0 <= count < _MOST for count in counts) else None
+
+
+def _each_valid(kind: type[M], contents: Mapping[str, Any]) -> dict[str, M]:
+    valid = {name: _valid(kind, content) for name, content in contents.items()}
+    return {name: message for name, message in valid.items() if message is not None}
 
 
 def _flat(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import uuid
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import urlsplit
@@ -239,10 +240,10 @@ def test_an_address_accepts_one_content_under_one_key_once(robot, put, bucket):
     assert other != address.url
     assert put(address, CONTENT[::-1]) == (400, "BadDigest")
     for changed, body in (
-        (address._replace(headers=more), CONTENT + b"x"),
-        (address._replace(headers=unconditional), CONTENT),
-        (address._replace(url=other), CONTENT),
-        (address._replace(url=address.url.replace("notes.txt", "other.txt")), CONTENT),
+        (replace(address, headers=more), CONTENT + b"x"),
+        (replace(address, headers=unconditional), CONTENT),
+        (replace(address, url=other), CONTENT),
+        (replace(address, url=address.url.replace("notes.txt", "other.txt")), CONTENT),
     ):
         assert put(changed, body) == (403, "SignatureDoesNotMatch")
     assert bucket.keys(robot.name) == bucket.keys("another") == []
@@ -259,7 +260,7 @@ def test_a_part_address_accepts_only_its_content(robot, put):
     rest = hashlib.sha256(b"rest").hexdigest()
     (address,) = robot.ask(FileRequest(uuid.uuid4().hex, file, {2: rest})).addresses
     assert put(address, b"evil") == (400, "BadDigest")
-    elsewhere = address._replace(url=address.url.replace("partNumber=2", "partNumber=1"))
+    elsewhere = replace(address, url=address.url.replace("partNumber=2", "partNumber=1"))
     assert put(elsewhere, b"rest") == (403, "SignatureDoesNotMatch")
     assert put(address, b"rest") == (200, "")
     assert robot.ask(FileRequest(uuid.uuid4().hex, file, {2: rest})).have == ((2, 2),)

@@ -220,7 +220,7 @@ def test_a_robot_over_its_share_logs_it_once_and_does_not_reject_it(
 
 @pytest.mark.parametrize(
     "said",
-    [5, [], {"batches": 3}, {"since_ms": 1, "last_ms": 1e3, "batches": 1}]
+    [5, [], {"batches": 3}]
     + [{"since_ms": 1, "last_ms": last_ms, "batches": 1} for last_ms in (-1, 10**15, True)],
 )
 def test_malformed_reports_about_its_share_are_ignored(said: Any) -> None:
