@@ -28,12 +28,11 @@ from iort_contract.cloud import IOT
 from iort_station import kept
 from iort_station.cloud import EMBEDDED_VARIABLE, Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import registry
 from iort_station.output import write_private
 from iort_station.page import answers as control
 from iort_station.page.answers import actions, answers
 from iort_station.page.history import downloads
-from iort_station.page.motion import prompt, reaching
+from iort_station.page.motion import reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.servers import Listen, is_ipv6
@@ -105,8 +104,6 @@ def shown(cloud: Cloud) -> dict[str, Any]:
     return {
         "namespace": cloud.namespace,
         **reaching(cloud, IOT),
-        # Robots come while it runs.
-        "vehicles": lambda: registry.vehicles(prompt(cloud)),
         "answers": answers(cloud),
         "downloads": downloads(cloud),
         "open_actions": actions(cloud),

@@ -11,20 +11,21 @@ from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.commands import NO_MOTION
 from iort_station.errors import StationError
-from iort_station.page.server import PageServer
-from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY
+from tests.web.cars import GAIN, SAMPLE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from iort_contract.messages.insights import (
         DeltaAnswer,
         DriveEntry,
         EstimateEntry,
+        Extent,
         FindingEntry,
         InsightsAnswer,
         LapsAnswer,
     )
+    from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
 
 _DAY_US = 86_400_000_000
 _NEWEST_US = round(time.time() - 3600) * 1_000_000
@@ -132,14 +133,6 @@ def delta(asked: Mapping[str, str]) -> DeltaAnswer:
         "one_mps": [4 + 2 * math.cos(12 * share) for share in shares],
         "other_mps": [4 + 1.9 * math.cos(12 * share + 0.1) for share in shares],
     }
-
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from iort_contract.messages.insights import Extent
-    from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
-    from local.pubnub import PubNubStandIn
 
 
 class View(NamedTuple):
@@ -296,16 +289,13 @@ class Lab:
                 car[:] = [told, told if self.confirms else car[1]]
         return self.motion(asked)
 
-    def server(self, pubnub: PubNubStandIn) -> PageServer:
-        return PageServer(
-            namespace="iort",
-            subscribe_key=SUBSCRIBE_KEY,
-            origin=pubnub.origin,
-            tls=False,
-            vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
-            answers=self.answers(),
-            open_actions={"acknowledge": self.acknowledge},
-            actions={
+    def served(self) -> dict[str, Any]:
+        """What its server answers and does."""
+        return {
+            "vehicles": {"car-1": {"speed_to_erpm_gain": GAIN}},
+            "answers": self.answers(),
+            "open_actions": {"acknowledge": self.acknowledge},
+            "actions": {
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
                 "analyse": lambda _: {"run": "iort-1"},
                 "note": self.write,
@@ -314,7 +304,7 @@ class Lab:
                 "drive": self.drive,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
             },
-        )
+        }
 
     def answers(self) -> dict[str, Any]:
         presence = {"online": False, "since_ms": round(NOW_S - 3600) * 1000}
@@ -394,8 +384,15 @@ def history(asked: Mapping[str, str]) -> HistoryAnswer:
     start_s, end_s = int(asked["from_us"]) / 1e6, int(asked["to_us"]) / 1e6
     times = [start_s + (end_s - start_s) * i / 200 for i in range(200)]
     fields = {
-        name: {"mean": [value * math.sin(i / 9) for i in range(200)]}
+        name: [value * math.sin(i / 9) for i in range(200)]
         for name, value in {**SAMPLE, _LONG: 1.5}.items()
         if isinstance(value, (int, float))
     }
-    return {"times_s": times, "fields": fields, "samples": 200, "ros2": False, "archive": None, "row_s": 2}  # type: ignore[typeddict-item]  # means alone
+    return past(times, fields, row_s=2)
+
+
+def past(times_s: Sequence[float], fields: Mapping[str, Sequence[Any]], row_s: float = 0) -> HistoryAnswer:
+    """The answer of columns of means."""
+    columns = {name: {"mean": list(values)} for name, values in fields.items()}
+    answer: Any = {"times_s": times_s, "fields": columns, "samples": len(times_s), "row_s": row_s}
+    return {**answer, "ros2": False, "archive": None, "refused": 0, "reason": ""}

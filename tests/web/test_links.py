@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import threading
-from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,17 +12,20 @@ from aiohttp import web
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import VIEW_LEASE_MS, VIEW_RENEW_S
 from iort_station.page.background import BackgroundServer
-from iort_station.page.server import PageServer
 from local.network.certificates import Authority
 from local.network.servers import Relay
 from testkit.waiting import GUARD_S, until
 from tests.browser import show
-from tests.web.cars import SUBSCRIBE_KEY, Car
+from tests.web.cars import Car
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
 
     from playwright.sync_api import Page
+
+    from iort_station.page.server import PageServer
+    from local.pubnub import PubNubStandIn
 
 # Of one request to subscribe.
 MOST_FILTERS = 8
@@ -71,24 +72,21 @@ def packets(sent: bytes) -> Iterator[tuple[int, bytes]]:
         sent = sent[ends + 1 + length :]
 
 
-def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(open_page: Callable[..., Page]) -> None:
+def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(
+    open_page: Callable[..., Page], serve: Callable[..., PageServer]
+) -> None:
     with Broker() as broker:
         socket = f"ws://127.0.0.1:{broker.port}"
-        with PageServer(
-            namespace="iort",
-            live="iot",
-            broker=socket,
-            identity={
-                "pool": "eu-west-1:1",
-                "region": "eu-west-1",
-                "endpoint": f"http://127.0.0.1:{broker.port}",
-                "socket": f"{socket}/mqtt",
-                "client_prefix": "iort-viewer-",
-                "robots": [f"car{i}" for i in range(MOST_FILTERS + 1)],
-            },
-        ) as site:
-            page = open_page(site.url)
-            until(lambda: page.inner_text("#link") == "Connected", "the page to connect", 15)
+        identity = {
+            "pool": "eu-west-1:1",
+            "region": "eu-west-1",
+            "endpoint": f"http://127.0.0.1:{broker.port}",
+            "socket": f"{socket}/mqtt",
+            "client_prefix": "iort-viewer-",
+            "robots": [f"car{i}" for i in range(MOST_FILTERS + 1)],
+        }
+        page = open_page(serve(live="iot", broker=socket, identity=identity).url)
+        until(lambda: page.inner_text("#link") == "Connected", "the page to connect", 15)
     assert broker.asked == [MOST_FILTERS, 1]
 
 
@@ -125,13 +123,6 @@ def test_only_a_page_of_this_machine_gets_through(relay: Relay, origin: str | No
         assert connection.getresponse().status == status
         connection.close()
 
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from playwright.sync_api import Page
-
-    from local.pubnub import PubNubStandIn
 
 HIDE = """(hidden) => {
   Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
@@ -185,16 +176,14 @@ def leases() -> Leases:
 
 
 @pytest.fixture
-def served(pubnub: PubNubStandIn, leases: Leases) -> Iterator[str]:
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+def served(serve: Callable[..., PageServer], leases: Leases) -> str:
     presence = {"online": True, "since_ms": 0}
     answers = {
         "robots": lambda _: {"robots": {"car-99": presence, "car-98": {**presence, "online": False}}},
         "tags": lambda _: {"tags": {}},
         "vehicles": lambda _: {"vehicles": {}},
     }
-    with PageServer(namespace="iort", answers=answers, open_actions={"view": leases.view}, **told) as server:
-        yield server.url
+    return serve(answers=answers, open_actions={"view": leases.view}).url
 
 
 def test_the_page_holds_what_is_on_the_screen_and_nothing_while_hidden_or_closed(

@@ -29,7 +29,7 @@ from iort_station.page.places import (
 )
 from iort_station.page.server import PageServer
 
-TOLD: dict[str, Any] = {
+SETTINGS: dict[str, Any] = {
     "namespace": "iort",
     "subscribe_key": "sub-c-1",
     "origin": "127.0.0.1:9",
@@ -81,7 +81,7 @@ def page(tmp_path: Path, held: Held) -> Iterator[PageServer]:
     (tmp_path / "index.html").write_text("<!doctype html><title>page</title>")
     quick = {name: lambda _asked: {"done": True} for name in ("motion", "socket")}
     with PageServer(
-        **TOLD,
+        **SETTINGS,
         built=tmp_path,
         answers={**{name: held.answer(name) for name in READ}, **quick},
         actions={
@@ -233,7 +233,7 @@ def test_places_are_free_again_although_their_viewers_left(page: PageServer, hel
 def test_a_body_that_never_comes_ends_the_request(tmp_path: Path) -> None:
     (tmp_path / "index.html").touch()
     keyed: Any = {"act": lambda _: {}}
-    with PageServer(**TOLD, built=tmp_path, actions=keyed, body_s=0.01) as page, ExitStack() as stack:
+    with PageServer(**SETTINGS, built=tmp_path, actions=keyed, body_s=0.01) as page, ExitStack() as stack:
         answer = Client(page, stack).begin("/act.json", {"a": "b"}, body=False).getresponse()
         assert (answer.status, answer.headers["Connection"]) == (408, "close")
         # The body of a GET is not waited for.
@@ -241,28 +241,6 @@ def test_a_body_that_never_comes_ends_the_request(tmp_path: Path) -> None:
             sender.settimeout(60)
             sender.sendall(b"GET /config.json HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n")
             assert sender.recv(12) == b"HTTP/1.1 200"
-
-
-def test_a_page_begins_although_the_cloud_does_not_tell_the_vehicles(tmp_path: Path) -> None:
-    (tmp_path / "index.html").touch()
-    go_on, asked = threading.Event(), threading.Semaphore(0)
-    go_on.set()
-
-    def vehicles() -> dict[str, dict[str, float]]:
-        asked.release()
-        go_on.wait()
-        return {"car1": {"speed_to_erpm_gain": 1.0}}
-
-    with PageServer(**TOLD, built=tmp_path, vehicles=vehicles) as page, ExitStack() as stack:
-        client = Client(page, stack)
-        first = client.ask("/config.json")
-        assert first[1]["vehicles"] == vehicles()
-        go_on.clear()
-        waiting = [client.begin("/config.json") for _ in range(5)]
-        assert [json.loads(one.getresponse().read()) for one in waiting] == [first[1]] * 5
-        go_on.set()
-    # One for the first request, one for all that came while the second was read, and the test's own.
-    assert [asked.acquire(blocking=False) for _ in range(4)] == [True, True, True, False]
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,10 @@ _ANSWER_S = 10.0
 
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer, by its name."""
+
+    def minutes(request: Mapping[str, str]) -> int:
+        return whole(request, "minutes", 1, 14 * 24 * 60)
+
     return {
         "robots": lambda _request: {"robots": registry.presence(cloud)},
         "tags": lambda _request: {"tags": robots.tags(cloud)},
@@ -42,13 +46,10 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "history": lambda request: history.history(cloud, request),
         "dashboards": lambda _request: {"dashboards": cloudwatch.dashboards(cloud)},
         "dashboard": lambda request: cloudwatch.dashboard(
-            cloud, text(request, "name"), minutes=whole(request, "minutes", 1, 14 * 24 * 60)
+            cloud, text(request, "name"), minutes=minutes(request)
         ),
         "log": lambda request: cloudwatch.rows(
-            cloud,
-            text(request, "name"),
-            whole(request, "widget", 0, 500),
-            minutes=whole(request, "minutes", 1, 14 * 24 * 60),
+            cloud, text(request, "name"), whole(request, "widget", 0, 500), minutes=minutes(request)
         ),
         "alarms": lambda _request: {"alarms": alarms.alarms(cloud), "user": alarms.user()},
         "rejected": lambda _request: alarms.rejected(cloud),
@@ -97,11 +98,8 @@ def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, Send
         raise StationError("the message must be a JSON object with the fields of the ROS message")
     lease_ms = whole(request, "lease_ms", 1, MAX_LEASE_MS) if request.get("lease_ms") else None
     began = time.monotonic()
-    robot, name, takeover = (
-        text(request, "robot"),
-        text(request, "command"),
-        request.get("takeover") == "true",
-    )
+    robot, name = text(request, "robot"), text(request, "command")
+    takeover = request.get("takeover") == "true"
     sent = yield from control.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
@@ -124,14 +122,14 @@ def change(cloud: Cloud, request: Mapping[str, str]) -> SettingsAnswer:
         raise StationError("the emergency stop has a button of its own")
     value = control.parse_setting(name, request["value"]) if "value" in request else None
     changed = control.change_settings(cloud, robot, {name: value}, _ANSWER_S)
-    reasons = {rejected: one.reason for rejected, one in changed.rejected.items()}
+    reasons = {rejected: change.reason for rejected, change in changed.rejected.items()}
     return {"settings": _entries(changed.state, reasons), "online": changed.online}
 
 
 def _entries(state: State, reasons: Mapping[str, str]) -> list[SettingEntry]:
     in_force, desired, pending = state.reported.settings, state.desired.settings, state.pending()
     selections = sorted(name for name in {*in_force, *desired} if name.startswith(f"{FIELDS}."))
-    rejected = {name: one.reason for name, one in state.rejected().items()}
+    rejected = {name: change.reason for name, change in state.rejected().items()}
     return [
         {
             **_kind(SETTINGS.get(name)),

@@ -84,19 +84,16 @@ class BackgroundServer:
         first: list[socket.socket] = [listening]
 
         def serve() -> None:
-            with first.pop() if first else self._listen() as door:
-                asyncio.run(self._serve(door, started))
-
-        def begin() -> None:
             try:
-                serve()
+                with first.pop() if first else self._listen() as door:
+                    asyncio.run(self._serve(door, started))
             except Exception as error:
                 if started.done():
                     raise
                 # Whoever starts it gets this one.
                 started.set_exception(error)
 
-        keep(type(self).__name__, begin, self._ended)
+        keep(type(self).__name__, serve, self._ended)
 
     def stop(self) -> None:
         """Drop every connection and end the thread. A second call has no effect."""

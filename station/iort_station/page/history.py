@@ -126,19 +126,14 @@ def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
 def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> PageColumn:
     mean, least, most = of
     if mean.dtype.kind != "f":
-        ends = _last_known(mean, starts)
-        return {"mean": mean[ends].tolist()}
+        return {"mean": mean[_last_known(mean, starts)].tolist()}
     if not several or n == 0:
         return {"mean": values(mean)}
     known = ~np.isnan(mean)
     number = np.add.reduceat(known.astype(float), starts)
     number[number == 0] = np.nan
-    valued = np.where(known, mean, 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
-        average = np.add.reduceat(valued, starts) / number
-        # The sum of large numbers may overflow where their mean does not.
-        parts = valued / np.repeat(number, np.diff(np.append(starts, n)))
-        average = np.where(np.isinf(average), np.add.reduceat(parts, starts), average)
+        average = np.add.reduceat(np.where(known, mean, 0.0), starts) / number
     return {
         "mean": values(average),
         "least": values(np.fmin.reduceat(least, starts)),
@@ -174,11 +169,11 @@ def downloads(cloud: Cloud) -> dict[str, Download]:
 
 
 def _table(cloud: Cloud, suffix: str, request: Mapping[str, str], folder: Path) -> Path:
-    asked = _selection(request)
-    result = data.query(cloud, asked.robot, asked.stream, asked.start_us, asked.end_us, most=MOST_VALUES)
+    chosen = _selection(request)
+    result = data.query(cloud, chosen.robot, chosen.stream, chosen.start_us, chosen.end_us, most=MOST_VALUES)
     if not len(result):
         raise StationError("no samples in this range")
-    path = folder / _name(asked, suffix, result.refused)
+    path = folder / _name(chosen, suffix, result.refused)
     if suffix == ".csv":
         with path.open("w", encoding="utf-8", newline="") as file:
             tabular.to_csv(result, file)

@@ -46,9 +46,11 @@ def insights(cloud: Cloud, request: Mapping[str, str]) -> messages.InsightsAnswe
 
     with ThreadPoolExecutor(_READERS) as pool:
         entries = list(pool.map(of, robots))
-    newest = [finding for some, _ in entries for finding in some]
+    newest = sorted(
+        (finding for some, _ in entries for finding in some), key=lambda finding: -finding.from_us
+    )
     return {
-        "findings": [_finding(finding) for finding in _newest(newest)],
+        "findings": [_finding(finding) for finding in newest],
         "drives": sorted(
             [*_failed(newest), *(_drive(drive) for _, some in entries for drive in some)],
             key=lambda drive: -drive["from_us"],
@@ -78,10 +80,6 @@ def progress(cloud: Cloud, request: Mapping[str, str]) -> messages.AnalysisAnswe
 def estimate(of: Estimate) -> messages.EstimateEntry:
     """An estimate as the page has it."""
     return {"value": of.value, "low": of.low, "high": of.high, "unit": of.unit}
-
-
-def _newest(findings: Iterable[Finding]) -> list[Finding]:
-    return sorted(findings, key=lambda finding: -finding.from_us)
 
 
 def _finding(finding: Finding) -> messages.FindingEntry:

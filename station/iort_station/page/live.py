@@ -23,7 +23,7 @@ _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
 
 
 class Heard(NamedTuple):
-    """One update: its delay from the car to this machine, its sample's time in microseconds, and the hops."""
+    """An update: its delay from the car to this machine, its sample's time in microseconds, and the hops."""
 
     robot: str
     stream: str
@@ -150,16 +150,13 @@ class FleetWatch:
 
     def table(self, now_us: int, width: int) -> Table:
         """A table of ``width`` characters."""
-        wide, narrow = width >= 90, width < 56
+        narrow = width < 56
         table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
-        columns = [
-            "car",
-            "state",
-            "speed",
-            "V",
-            *([] if narrow else ["°C", "delay"]),
-            *(["age"] if wide else []),
-        ]
+        columns = ["car", "state", "speed", "V"]
+        if not narrow:
+            columns += ["°C", "delay"]
+        if width >= 90:
+            columns.append("age")
         for name in columns:
             left = name in {"car", "state"}
             longest = 16 if narrow and name == "car" else None

@@ -10,11 +10,11 @@ import json
 import math
 import re
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from botocore.exceptions import ClientError
 
@@ -28,7 +28,8 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from types_boto3_s3 import S3Client
+    from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
 
 BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
@@ -96,12 +97,8 @@ def config(
     if not _ORIGIN.fullmatch(origin):
         raise StationError(f"the page's origin must be a host, or host:port, got {origin!r}")
     for robot, car in known.items():
-        gain = car.get("speed_to_erpm_gain")
-        if gain is not None and (not math.isfinite(gain) or gain == 0):
-            raise StationError(f"speed_to_erpm_gain of {robot} must be a number other than 0, got {gain}")
-        offset = car.get("speed_to_erpm_offset", 0)
-        if not math.isfinite(offset):
-            raise StationError(f"speed_to_erpm_offset of {robot} must be a number, got {offset}")
+        if not all(map(math.isfinite, car.values())) or car.get("speed_to_erpm_gain") == 0:
+            raise StationError(f"{robot} must have numbers, and a speed_to_erpm_gain other than 0, got {car}")
     return {
         "namespace": namespace,
         "live": live,
@@ -116,7 +113,7 @@ def config(
         "actions": sorted(actions),
         "keyed": sorted(keyed),
         "invite": invite,
-        "track": None if track is None else _track_map(track),
+        "track": None if track is None else cast("TrackMap", asdict(track)),
     }
 
 
@@ -140,11 +137,11 @@ def typed_keys(publish_key: str, subscribe_key: str) -> PubNubKeys:
 
     Raises `StationError` for any other text, without repeating it: it may be the secret key.
     """
-    typed_keys = {"publish": publish_key.strip(), "subscribe": subscribe_key.strip()}
-    for kind, key in typed_keys.items():
+    keys = {"publish": publish_key.strip(), "subscribe": subscribe_key.strip()}
+    for kind, key in keys.items():
         if not key.startswith(f"{kind[:3]}-c-"):
             raise StationError(f"the {kind} key must be {kind[:3]}-c-..., as PubNub's admin portal shows it")
-    return PubNubKeys(publish_key=typed_keys["publish"], subscribe_key=typed_keys["subscribe"])
+    return PubNubKeys(publish_key=keys["publish"], subscribe_key=keys["subscribe"])
 
 
 def store_keys(cloud: Cloud, keys: PubNubKeys) -> None:
@@ -176,33 +173,13 @@ def load_track(file: Path) -> Track:
         raise StationError(f"{file}: {error}") from error
 
 
-def _track_map(track: Track) -> TrackMap:
-    return {
-        "x_m": list(track.x_m),
-        "y_m": list(track.y_m),
-        "w_right_m": list(track.w_right_m),
-        "w_left_m": list(track.w_left_m),
-    }
-
-
-if TYPE_CHECKING:
-    from types_boto3_s3 import S3Client
-    from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
-
 # Names do not change with their content, so a browser must ask each time if a file is still the same.
 _CACHE = "no-cache"
-_MANY = 1_000
 
 
-def site_files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
-    """Every file of the static page by its key; ``told`` is `iort_station.page.page.config`'s.
-
-    Raises `StationError` if the page is not built.
-    """
-    tables = {"config.json": told}
-    return built_files(built) | {
-        name: json.dumps(value, allow_nan=False).encode() for name, value in tables.items()
-    }
+def site_files(settings: Config, built: Path = BUILT) -> dict[str, bytes]:
+    """Every file of the static page by its key. Raises `StationError` if the page is not built."""
+    return built_files(built) | {"config.json": json.dumps(settings, allow_nan=False).encode()}
 
 
 def upload(s3: S3Client, bucket: str, content: Mapping[str, bytes]) -> list[str]:
@@ -213,22 +190,23 @@ def upload(s3: S3Client, bucket: str, content: Mapping[str, bytes]) -> list[str]
     for key in sorted(content, key=lambda key: key == "index.html"):
         kind = TYPES[Path(key).suffix]
         s3.put_object(Bucket=bucket, Key=key, Body=content[key], ContentType=kind, CacheControl=_CACHE)
-    pages = s3.get_paginator("list_objects_v2").paginate(Bucket=bucket)
-    old = [
-        entry["Key"] for page in pages for entry in page.get("Contents", []) if entry["Key"] not in content
-    ]
-    for at in range(0, len(old), _MANY):
-        gone: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in old[at : at + _MANY]]
-        s3.delete_objects(Bucket=bucket, Delete={"Objects": gone, "Quiet": True})
-    return old
+    deleted = []
+    # A page has as many keys as one request may delete.
+    for page in s3.get_paginator("list_objects_v2").paginate(Bucket=bucket):
+        old = [entry["Key"] for entry in page.get("Contents", []) if entry["Key"] not in content]
+        keys: list[ObjectIdentifierTypeDef] = [{"Key": key} for key in old]
+        if keys:
+            s3.delete_objects(Bucket=bucket, Delete={"Objects": keys, "Quiet": True})
+        deleted += old
+    return deleted
 
 
-def publish(cloud: Cloud, told: Mapping[str, Any]) -> str:
+def publish(cloud: Cloud, settings: Config) -> str:
     """Upload the page, renew CloudFront's copies, and return the page's address.
 
     Raises `StationError` if the stack is not deployed.
     """
-    content = site_files(told)
+    content = site_files(settings)
     bucket, distribution = cloud.output("site", "PageBucket"), cloud.output("site", "PageDistribution")
     try:
         upload(cloud.client("s3"), bucket, content)

@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 _CONNECT_S = 15.0
 
 
-class Listener(Listening):
+class Listener(Listening, SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
     """Subscribes at PubNub.
 
     ``robot=None`` listens to the whole fleet; ``token`` is PubNub's access token, if Access Manager is on.
@@ -51,21 +51,33 @@ class Listener(Listening):
         config.disable_config_locking = False
         config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
         self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
-        self._callback = _Callback(self)
+        self._connected = threading.Event()
         self._client = PubNub(config, custom_request_handler=_Requests)
         if token:
             self._client.set_token(token)
-        self._client.add_listener(self._callback)
+        self._client.add_listener(self)
 
     def __enter__(self) -> Self:
         self._client.subscribe().channels(self._channel).execute()
-        if not self._callback.connected.wait(_CONNECT_S):
+        if not self._connected.wait(_CONNECT_S):
             self._client.stop()
             raise StationError(f"PubNub did not accept the subscription within {_CONNECT_S:.0f} s")
         return self
 
     def __exit__(self, *_error: object) -> None:
         self._client.stop()
+
+    def status(self, _pubnub: Any, status: Any) -> None:
+        """Called by the SDK."""
+        if status.category == PNStatusCategory.PNConnectedCategory:
+            self._connected.set()
+
+    def message(self, _pubnub: Any, message: Any) -> None:
+        """Called by the SDK, whose thread must go on, whatever the update's taker does."""
+        try:
+            self.take(message.message, int(message.timetoken) // 10)
+        except Exception:  # noqa: BLE001 - a thread that ends in silence is worse
+            _log.exception("a live message could not be taken")
 
 
 class _Requests(HttpxRequestHandler):  # type: ignore[misc]  # the SDK's class has no types
@@ -84,23 +96,3 @@ class _Requests(HttpxRequestHandler):  # type: ignore[misc]  # the SDK's class h
         if self._ended:
             session.close()
         return session
-
-
-class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
-    def __init__(self, listening: Listening) -> None:
-        self._listening = listening
-        self.connected = threading.Event()
-
-    def status(self, _pubnub: Any, status: Any) -> None:
-        if status.category == PNStatusCategory.PNConnectedCategory:
-            self.connected.set()
-
-    def presence(self, _pubnub: Any, _presence: Any) -> None:
-        pass
-
-    def message(self, _pubnub: Any, message: Any) -> None:
-        # The SDK's thread must go on, whatever the update's taker does.
-        try:
-            self._listening.take(message.message, int(message.timetoken) // 10)
-        except Exception:  # noqa: BLE001 - a thread that ends in silence is worse
-            _log.exception("a live message could not be taken")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import functools
 import ipaddress
 import json
 import logging
@@ -18,7 +19,7 @@ import secrets
 import ssl
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,32 +30,29 @@ from typing_extensions import Self
 
 from iort_contract import page
 from iort_contract.cloud import PUBNUB
-from iort_contract.messages.page import Admitted, Config
+from iort_contract.messages.page import Admitted
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
 from iort_station.page.invitations import COMMAND, answer, listening
 from iort_station.page.page import BUILT, DRIVE, TYPES, built_files, config
-from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of, off_the_loop
+from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of
 from iort_station.page.requests import Body, Handler, answered, as_json, packed, stepped, takes_gzip, tried
 
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
-Vehicles = Mapping[str, Mapping[str, float]]
 _log = logging.getLogger("iort")
 
 # A connection without a request is closed after this time.
 IDLE_S = 30.0
 # Where a browser gets the key.
 ADMISSION = "/key.json"
-CONFIG, DRIVEN = "/config.json", f"/{DRIVE}.json"
+CONFIG = "/config.json"
 _CHUNK_BYTES = 256 * 1024
 # A body must be here within this time, and who downloads must take a part within the other.
 BODY_S, PART_S = 10.0, 60.0
 # They stop and drive robots, or a page cannot begin without them. Each has a lane of its own, so that it
 # waits for nothing but its like.
-FIRST = frozenset({"/stop.json", DRIVEN, "/view.json", "/motion.json", "/socket.json", CONFIG, ADMISSION})
-# A page that begins has the vehicles as they were, if the cloud does not tell them in this time.
-_FRESH_S = 1.0
+FIRST = frozenset({"/stop.json", f"/{DRIVE}.json", "/view.json", "/motion.json", "/socket.json", ADMISSION})
 # Invitations that nobody has used yet; a further one ends the oldest.
 _MOST_TOKENS = 64
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
@@ -66,19 +64,18 @@ class PageServer(BackgroundServer):
     It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
     from the parameters of the request. ``open_actions`` change something that everybody who reaches the page
     may change; they need a POST with the page's own origin. ``actions`` need the server's key, too: a browser
-    gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``vehicles`` may be
-    a function, for a server during which robots come. ``downloads`` maps a name to the function that writes
-    the file ``/<name>``. ``broker`` is the broker's address for WebSockets, without a path. The server
-    accepts a Host that is localhost, an address or one of ``names``, and no other. In the folder
-    ``invitations`` it gives its own user an `invitation` when asked. A body must come within ``body_s``.
-    With a ``context`` it speaks HTTPS. The other arguments are those of `config`. Raises `StationError` if
-    the page is not built, if the port is in use, and for a configuration that it must not serve.
+    gets it once for each `invitation`, and ``admitted`` is then called with the next one. ``downloads`` maps
+    a name to the function that writes the file ``/<name>``. ``broker`` is the broker's address for
+    WebSockets, without a path. The server accepts a Host that is localhost, an address or one of ``names``,
+    and no other. In the folder ``invitations`` it gives its own user an `invitation` when asked. A body must
+    come within ``body_s``. With a ``context`` it speaks HTTPS. The other arguments are those of `config`.
+    Raises `StationError` if the page is not built, if the port is in use, and for a configuration that it
+    must not serve.
     """
 
     def __init__(
         self,
         *,
-        vehicles: Vehicles | Callable[[], Vehicles] | None = None,
         broker: str = "",
         answers: Mapping[str, Handler] | None = None,
         actions: Mapping[str, Handler] | None = None,
@@ -92,7 +89,7 @@ class PageServer(BackgroundServer):
         invitations: Path | None = None,
         body_s: float = BODY_S,
         context: ssl.SSLContext | None = None,
-        **told: Any,
+        **settings: Any,
     ) -> None:
         super().__init__(host, port, tls=context, idle_s=IDLE_S)
         self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
@@ -107,32 +104,22 @@ class PageServer(BackgroundServer):
         self._body_s = body_s
         self._admitted = admitted
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
-        own: dict[str, Any] = {"answers": bool(answers), "actions": [*free, *keyed], "keyed": keyed}
-        own["invite"] = COMMAND if keyed and invitations else ""
-
-        def configured(vehicles: Vehicles | None) -> Config:
-            return config(**told, **own, vehicles=vehicles)
-
-        known = configured(None if callable(vehicles) else vehicles)
+        known = config(
+            **settings,
+            answers=bool(answers),
+            actions=[*free, *keyed],
+            keyed=keyed,
+            invite=COMMAND if keyed and invitations else "",
+        )
         elsewhere = [broker] if broker else []
         if known["live"] == PUBNUB:
             elsewhere.insert(0, page.pubnub_address(known["origin"], tls=known["tls"]))
         if known["identity"]:
             elsewhere.append(known["identity"]["endpoint"])
         # Only these can be requested: no path reaches the file system.
-        self._files = {
-            f"/{name}": packed(TYPES[Path(name).suffix], content)
-            for name, content in built_files(built).items()
-        }
-        self._files["/"] = self._files["/index.html"]
+        files = _packed_files(built)
+        self._files = {**files, "/": files["/index.html"], CONFIG: as_json(known)}
         self._work: Work
-        self._fresh: asyncio.Future[tuple[int, Body]] | None
-        self._known: Body | None = None
-        self._read_config: Callable[[], Body] = lambda: as_json(known)
-        if callable(vehicles):
-            self._read_config = lambda: as_json(configured(vehicles()))
-        else:
-            self._files[CONFIG] = as_json(known)
         self._headers = {
             **page.HEADERS,
             "Cache-Control": "no-cache",
@@ -172,7 +159,7 @@ class PageServer(BackgroundServer):
     async def beside(self) -> AsyncIterator[None]:
         """Give invitations to who serves the page."""
         # A loop that begins again leaves the places of the last one to its threads.
-        self._work, self._fresh = Work(FIRST), None
+        self._work = Work(FIRST)
         if self._invitations is None:
             yield
             return
@@ -202,8 +189,6 @@ class PageServer(BackgroundServer):
             return await self._act(request, path, self._actions[path], keyed=path in self._keyed)
         if request.method not in {"GET", "HEAD"}:
             return self._response(request, packed(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
-        if path == CONFIG and path not in self._files:
-            return await self._config(request)
         answer = self._answers.get(path)
         if answer is not None:
             return await self._answer(request, path, answer, dict(request.query), READING)
@@ -219,22 +204,6 @@ class PageServer(BackgroundServer):
             response.set_status(304)
             response.body = None
         return response
-
-    async def _config(self, request: web.BaseRequest) -> web.Response:
-        """One reading for all who ask meanwhile; who has waited long enough gets the last one's."""
-        if self._fresh is None or self._fresh.done():
-            read = self._read_config
-            self._fresh = asyncio.ensure_future(off_the_loop(lambda: tried(lambda: (200, read()))))
-        with suppress(asyncio.TimeoutError):
-            status, body = await asyncio.wait_for(
-                asyncio.shield(self._fresh), None if self._known is None else _FRESH_S
-            )
-            if status != 200 and self._known is None:
-                return self._response(request, body, status)
-            if status == 200:
-                self._known = body
-        assert self._known is not None
-        return self._response(request, self._known, 200)
 
     async def _answer(
         self,
@@ -360,6 +329,14 @@ class PageServer(BackgroundServer):
         if takes_gzip(request.headers.get("Accept-Encoding", "")):
             headers, content = {**headers, "Content-Encoding": "gzip"}, body.packed
         return web.Response(body=content, status=status, headers=headers)
+
+
+@functools.cache
+def _packed_files(built: Path) -> Mapping[str, Body]:
+    """The page's files by their paths: a process may serve several pages, and packs them once."""
+    return {
+        f"/{name}": packed(TYPES[Path(name).suffix], content) for name, content in built_files(built).items()
+    }
 
 
 def on_loopback(host: str) -> bool:

@@ -35,8 +35,8 @@ from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.fleet.viewing import Viewer
 from iort_station.page.listening import BrokerListener, update_of
-from iort_station.page.live import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch, Listening, heard_of, problem
-from iort_station.page.pubnub import _Callback
+from iort_station.page.live import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch, heard_of, problem
+from iort_station.page.pubnub import Listener
 
 LIVE = LiveSample("0badcafe", 7, 1_000_000, 2_000_000, {"speed": 1.5, "temp_motor": -1e9}, 0, 5, 100)
 
@@ -76,13 +76,12 @@ def test_a_listener_counts_what_is_malformed_and_hears_the_next_one():
     listener._take("live/iort/car7/vesc", b"{}")
     listener._take("live/iort/car7/vesc", encode_live(LIVE))
     assert (listener.malformed, [one.robot for one in listener.heard]) == (1, ["car7"])
-    pubnub = Listening(None)
-    callback = _Callback(pubnub)
+    pubnub = Listener(subscribe_key="sub-c-1", robot=None)
     for message in (None, {}, {"hops": {}}, {"hops": {"sent_us": "x"}}):
-        callback.message(None, SimpleNamespace(message=message, timetoken="1"))
+        pubnub.message(None, SimpleNamespace(message=message, timetoken="1"))
     good = update_of("live/iort/car7/vesc", encode_live(LIVE))
-    callback.message(None, SimpleNamespace(message=good, timetoken="1"))
-    assert (pubnub.malformed, [one.robot for one in pubnub.heard]) == (4, ["car7"])
+    pubnub.message(None, SimpleNamespace(message=good, timetoken="1"))
+    assert (pubnub.malformed, [update.robot for update in pubnub.heard]) == (4, ["car7"])
 
 
 def test_a_connections_thread_goes_on_after_an_unexpected_exception(caplog):

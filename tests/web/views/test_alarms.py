@@ -3,99 +3,91 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_contract.catalog.metrics import METRICS
 from iort_station.page import insights as laps
-from iort_station.page.server import PageServer
 from testkit.waiting import GUARD_S, until
 from tests.browser import plain, show
 from tests.unit.station.data.test_queries import START
 from tests.unit.station.data.test_runs import driven_cloud
-from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
+from tests.web.cars import SAMPLE, Car
 from tests.web.lab import NOW_S, VIEWS, Lab, insights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from playwright.sync_api import Page
 
-    from local.pubnub import PubNubStandIn
+    from iort_contract.messages.insights import InsightsAnswer
+    from iort_station.page.server import PageServer
 
 
 def test_every_view_counts_the_alarms_and_each_says_what_to_do(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], lab: Lab, server: PageServer
 ) -> None:
-    lab = Lab()
-    with lab.server(pubnub) as server:
-        page = open_page(server.url)
-        badge = page.locator("#alarms")
-        for view, (address, _) in VIEWS.items():
-            page.goto(server.url + address)
-            until(lambda: badge.inner_text() == "3", f"the badge on the view {view}")
-        assert badge.get_attribute("aria-label") == "3 raised, 2 of them not acknowledged"
-        page.locator("#to-alarms").click()
-        faulty = page.locator("[data-alarm=FaultSamples]")
-        until(faulty.count, "the alarm")
-        entry = METRICS["FaultSamples"].alarm
-        assert entry
-        assert entry.advice.replace("`", "") in faulty.inner_text()
-        # The moment in the past of the cars that the alert named, and of a refused message's car.
-        links = faulty.locator("a")
-        assert links.all_inner_texts() == ["car-1", "car-2"]
-        address = links.first.get_attribute("href") or ""
-        assert address.startswith("#/history/car-1?from=20")
-        message = page.locator("[data-alarm=Quarantined] .cases")
-        until(message.count, "the messages in quarantine")
-        assert "column speed must have 10 values" in message.inner_text()
-        assert "iort errors 0a1b2c" in message.inner_text()
-        page.locator("#acknowledge-as").fill("grace")
-        faulty.locator("button").click()
-        until(lambda: "Acknowledged by grace" in faulty.inner_text(), "the acknowledgement")
-        assert lab.asked == [
-            {"alarm": "FaultSamples", "since_ms": str(round((NOW_S - 600) * 1000)), "by": "grace"}
-        ]
-        assert faulty.locator("button").count() == 0
-        # It comes back: it is new again.
-        lab.alarms[0] = {**lab.alarms[0], "since_s": NOW_S, "acknowledged": None}
-        page.reload()
-        until(lambda: faulty.locator("button").count() == 1, "the button")
-        assert page.locator("#acknowledge-as").input_value() == "grace"
+    page = open_page(server.url)
+    badge = page.locator("#alarms")
+    for view, (address, _) in VIEWS.items():
+        page.goto(server.url + address)
+        until(lambda: badge.inner_text() == "3", f"the badge on the view {view}")
+    assert badge.get_attribute("aria-label") == "3 raised, 2 of them not acknowledged"
+    page.locator("#to-alarms").click()
+    faulty = page.locator("[data-alarm=FaultSamples]")
+    until(faulty.count, "the alarm")
+    entry = METRICS["FaultSamples"].alarm
+    assert entry
+    assert entry.advice.replace("`", "") in faulty.inner_text()
+    # The moment in the past of the cars that the alert named, and of a refused message's car.
+    links = faulty.locator("a")
+    assert links.all_inner_texts() == ["car-1", "car-2"]
+    address = links.first.get_attribute("href") or ""
+    assert address.startswith("#/history/car-1?from=20")
+    message = page.locator("[data-alarm=Quarantined] .cases")
+    until(message.count, "the messages in quarantine")
+    assert "column speed must have 10 values" in message.inner_text()
+    assert "iort errors 0a1b2c" in message.inner_text()
+    page.locator("#acknowledge-as").fill("grace")
+    faulty.locator("button").click()
+    until(lambda: "Acknowledged by grace" in faulty.inner_text(), "the acknowledgement")
+    assert lab.asked == [
+        {"alarm": "FaultSamples", "since_ms": str(round((NOW_S - 600) * 1000)), "by": "grace"}
+    ]
+    assert faulty.locator("button").count() == 0
+    # It comes back: it is new again.
+    lab.alarms[0] = {**lab.alarms[0], "since_s": NOW_S, "acknowledged": None}
+    page.reload()
+    until(lambda: faulty.locator("button").count() == 1, "the button")
+    assert page.locator("#acknowledge-as").input_value() == "grace"
 
 
-def test_live_values_raise_the_alarms_of_cars(open_page: Callable[..., Page], pubnub: PubNubStandIn) -> None:
-    lab = Lab()
+def test_live_values_raise_the_alarms_of_cars(
+    open_page: Callable[..., Page], lab: Lab, server: PageServer, car: Car
+) -> None:
     lab.alarms = [{**one, "state": "OK"} for one in lab.alarms]
-    with lab.server(pubnub) as server:
-        page = open_page(f"{server.url}#/alarms")
-        until(lambda: "not raised" in page.inner_text(".quiet"), "the cloud's alarms")
-        assert page.locator("#alarms").is_hidden()
-        # The threshold is the deployment's.
-        bad = {**SAMPLE, "fault_code": 2, "temperature_pcb": 80.5, "voltage_input": 10.6}
-        show(page, Car(pubnub).send(bad))
-        until(lambda: page.inner_text("#alarms") == "2", "the badge")
-        raised = page.locator("[data-alarm]")
-        assert {raised.nth(i).get_attribute("data-alarm") for i in range(2)} == {
-            "FaultSamples",
-            "TemperatureDegC",
-        }
-        words = page.inner_text("[data-alarm=FaultSamples] li").split("\n")
-        assert words[:2] == ["car-1", "under voltage (2)"]
-        # Without an answer nobody knows.
-        lab.refuses = True
-        page.reload()
-        until(lambda: page.inner_text("#alarms") == "?", "the badge without a number")
-        until(lambda: "no such right" in page.inner_text(".history-note"), "the reason")
-        assert page.locator("text=No alarm is raised").is_hidden()
+    page = open_page(f"{server.url}#/alarms")
+    until(lambda: "not raised" in page.inner_text(".quiet"), "the cloud's alarms")
+    assert page.locator("#alarms").is_hidden()
+    # The threshold is the deployment's.
+    bad = {**SAMPLE, "fault_code": 2, "temperature_pcb": 80.5, "voltage_input": 10.6}
+    show(page, car.send(bad))
+    until(lambda: page.inner_text("#alarms") == "2", "the badge")
+    raised = page.locator("[data-alarm]")
+    assert {raised.nth(i).get_attribute("data-alarm") for i in range(2)} == {
+        "FaultSamples",
+        "TemperatureDegC",
+    }
+    words = page.inner_text("[data-alarm=FaultSamples] li").split("\n")
+    assert words[:2] == ["car-1", "under voltage (2)"]
+    # Without an answer nobody knows.
+    lab.refuses = True
+    page.reload()
+    until(lambda: page.inner_text("#alarms") == "?", "the badge without a number")
+    until(lambda: "no such right" in page.inner_text(".history-note"), "the reason")
+    assert page.locator("text=No alarm is raised").is_hidden()
 
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
-
-    from local.pubnub import PubNubStandIn
 
 WIDGET = {
     "number": 3,
@@ -106,9 +98,6 @@ WIDGET = {
     "title": "Warnings",
     "kind": "log",
     "text": "",
-    "period_s": 300,
-    "series": [],
-    "alarms": [],
 }
 
 
@@ -122,22 +111,18 @@ class Logs:
 
     def dashboard(self, asked: Any) -> dict[str, Any]:
         self.dashboards += 1
-        return {"name": asked["name"], "from_s": 0, "to_s": 60 * int(asked["minutes"]), "widgets": [WIDGET]}
+        widget = {**WIDGET, "period_s": 300, "series": [], "alarms": []}
+        return {"name": asked["name"], "from_s": 0, "to_s": 60 * int(asked["minutes"]), "widgets": [widget]}
 
     def log(self, asked: Any) -> dict[str, Any]:
         self.queries.append(dict(asked))
         assert self.done.wait(GUARD_S)
-        return {
-            "columns": ["@message"],
-            "rows": [[f"{asked['minutes']}\n  in details"]],
-            "found": 1,
-            "from_s": 0,
-            "to_s": 60,
-        }
+        rows = [[f"{asked['minutes']}\n  in details"]]
+        return {"columns": ["@message"], "rows": rows, "found": 1, "from_s": 0, "to_s": 60}
 
 
 def test_the_page_waits_for_a_log_query_across_dashboard_updates(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], serve: Callable[..., PageServer]
 ) -> None:
     logs = Logs()
     answers: dict[str, Any] = {
@@ -146,36 +131,26 @@ def test_the_page_waits_for_a_log_query_across_dashboard_updates(
         "log": logs.log,
         "robots": lambda _: {"robots": {}},
     }
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=answers, **told) as server:
-        page = open_page(f"{server.url}#/cloudwatch")
-        until(lambda: len(logs.queries) == 1, "the first query")
-        first = page.locator(".log-widget").element_handle()
-        page.evaluate("document.querySelector('.widgets > *').dataset.old = 'yes'")
-        # The page does so every half minute.
-        page.locator("#dashboard").dispatch_event("change")
-        until(lambda: page.locator(".widgets > :not([data-old])").count() == 1, "the dashboard to be new")
-        assert page.evaluate("(node) => node.isConnected", first)
-        # Another range is another query, and the page no longer waits for the first.
-        page.locator("#minutes").select_option("15")
-        until(lambda: len(logs.queries) == 2, "the second query")
-        logs.done.set()
-        line = page.locator(".log-widget td.words")
-        until(lambda: line.count() == 1, "the matches")
-        # The details of a line wait for a click.
-        assert line.inner_text() == "15"
-        line.locator("summary").click()
-        assert line.inner_text().split("\n") == ["15", "  in details"]
-        assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]
+    page = open_page(f"{serve(answers=answers).url}#/cloudwatch")
+    until(lambda: len(logs.queries) == 1, "the first query")
+    first = page.locator(".log-widget").element_handle()
+    page.evaluate("document.querySelector('.widgets > *').dataset.old = 'yes'")
+    # The page does so every half minute.
+    page.locator("#dashboard").dispatch_event("change")
+    until(lambda: page.locator(".widgets > :not([data-old])").count() == 1, "the dashboard to be new")
+    assert page.evaluate("(node) => node.isConnected", first)
+    # Another range is another query, and the page no longer waits for the first.
+    page.locator("#minutes").select_option("15")
+    until(lambda: len(logs.queries) == 2, "the second query")
+    logs.done.set()
+    line = page.locator(".log-widget td.words")
+    until(lambda: line.count() == 1, "the matches")
+    # The details of a line wait for a click.
+    assert line.inner_text() == "15"
+    line.locator("summary").click()
+    assert line.inner_text().split("\n") == ["15", "  in details"]
+    assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]
 
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from playwright.sync_api import Page
-
-    from iort_contract.messages.insights import InsightsAnswer
-    from local.pubnub import PubNubStandIn
 
 END = START + 90_000_000
 
@@ -219,17 +194,13 @@ class Analysed(Lab):
 
 
 @pytest.fixture
-def lab() -> Analysed:
+def analysed() -> Analysed:
     return Analysed()
 
 
 @pytest.fixture
-def server(pubnub: PubNubStandIn, lab: Analysed) -> Iterator[PageServer]:
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(
-        namespace="iort", answers=lab.answers(), actions={"analyse": lab.analyse}, **told
-    ) as server:
-        yield server
+def analyses(serve: Callable[..., PageServer], analysed: Analysed) -> PageServer:
+    return serve(answers=analysed.answers(), actions={"analyse": analysed.analyse})
 
 
 def laps_found(page: Page) -> None:
@@ -237,9 +208,9 @@ def laps_found(page: Page) -> None:
 
 
 def test_a_finding_has_its_interval_its_advice_and_its_evidence(
-    open_page: Callable[..., Page], server: PageServer
+    open_page: Callable[..., Page], analyses: PageServer
 ) -> None:
-    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
+    page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     finding = page.locator(".finding[data-severity=warning]")
     finding.wait_for()
     interval = finding.locator("[role=img]").get_attribute("aria-label")
@@ -252,9 +223,9 @@ def test_a_finding_has_its_interval_its_advice_and_its_evidence(
 
 
 def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(
-    open_page: Callable[..., Page], server: PageServer
+    open_page: Callable[..., Page], analyses: PageServer
 ) -> None:
-    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
+    page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)
     times = [float(text.split()[0]) for text in page.locator(".laps-table td:nth-child(4)").all_inner_texts()]
     best, second = sorted(range(len(times)), key=times.__getitem__)[:2]
@@ -280,10 +251,10 @@ def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(
 
 
 def test_before_the_first_analysis_the_page_says_so_and_shows_the_laps_of_the_newest_run(
-    open_page: Callable[..., Page], server: PageServer, lab: Analysed
+    open_page: Callable[..., Page], analyses: PageServer, analysed: Analysed
 ) -> None:
-    lab.analysed = False
-    page = open_page(server.invitation("#/insights/car-1"), timezone_id="UTC")
+    analysed.analysed = False
+    page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)
     note = page.locator(".insights-view .history-note").first
     assert "No drive of car-1 has been analysed yet" in note.inner_text()
@@ -291,6 +262,6 @@ def test_before_the_first_analysis_the_page_says_so_and_shows_the_laps_of_the_ne
     page.get_by_label("Drives of the last").select_option("last 7 days")
     page.get_by_role("button", name="Analyse").click()
     until(lambda: "0 of 1 drives are analysed" in note.inner_text(), "the progress")
-    lab.ends = True
+    analysed.ends = True
     page.locator(".finding").first.wait_for()
-    assert lab.asked == [{"robot": "car-1", "last_s": "604800"}]
+    assert analysed.asked == [{"robot": "car-1", "last_s": "604800"}]

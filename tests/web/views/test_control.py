@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_contract.catalog.streams import LOG_STREAM
 from iort_station.errors import StationError
-from iort_station.page.server import PageServer
 from testkit.waiting import until
 from tests.browser import drawn, show
-from tests.web.cars import SUBSCRIBE_KEY, Car
 from tests.web.lab import NOW_S, Lab
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from playwright.sync_api import Page
 
-    from local.pubnub import PubNubStandIn
+    from iort_station.page.server import PageServer
+    from tests.web.cars import Car
+
+
+def setting(name: str, kind: str, value: str, *, desired: bool = False) -> dict[str, Any]:
+    entry = {"name": name, "kind": kind, "value": value, "desired": desired, "pending": None, "reason": ""}
+    return {**entry, "low": 0.1, "high": 10.0, "unit": "Hz" if kind == "number" else "", "names": []}
 
 
 class Robot:
@@ -28,29 +32,28 @@ class Robot:
     def __init__(self) -> None:
         self.sent: list[dict[str, Any]] = []
         self.online = True
-        rate = {"name": "live.rate_hz", "kind": "number", "low": 0.1, "high": 10.0, "unit": "Hz", "names": []}
-        self.told: dict[str, dict[str, Any]] = {
-            "live.rate_hz": {**rate, "value": "10", "desired": False, "pending": None, "reason": ""},
-            "fields.vesc": {**rate, "name": "fields.vesc", "kind": "fields", "unit": "", "value": "speed"}
-            | {"desired": True, "pending": None, "reason": ""},
-        }
+        entries = (
+            setting("live.rate_hz", "number", "10"),
+            setting("fields.vesc", "fields", "speed", desired=True),
+        )
+        self.entries = {entry["name"]: entry for entry in entries}
         self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
 
     def settings(self, _asked: Mapping[str, str]) -> dict[str, Any]:
-        return {"settings": [dict(one) for one in self.told.values()], "online": self.online}
+        return {"settings": [dict(entry) for entry in self.entries.values()], "online": self.online}
 
     def set(self, asked: Mapping[str, str]) -> dict[str, Any]:
         """Take all but rates above 5 Hz."""
         self.sent.append(dict(asked))
-        entry = self.told[asked["name"]]
+        entry = self.entries[asked["name"]]
         if not self.online:
-            entry["pending"], entry["desired"] = asked["value"], True
+            entry |= {"pending": asked["value"], "desired": True}
         elif "value" not in asked:
-            entry["value"], entry["desired"] = "10", False
+            entry |= {"value": "10", "desired": False}
         elif float(asked["value"]) > 5:
             return self.settings({}) | {"settings": [{**entry, "reason": "rate_hz must be at most 5"}]}
         else:
-            entry["value"], entry["desired"] = asked["value"], True
+            entry |= {"value": asked["value"], "desired": True}
         return self.settings({})
 
     def send(self, asked: Mapping[str, str]) -> dict[str, Any]:
@@ -66,12 +69,8 @@ def robot() -> Robot:
 
 
 @pytest.fixture
-def invite(pubnub: PubNubStandIn, robot: Robot) -> Iterator[Callable[[str], str]]:
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(
-        namespace="iort", actions={"send": robot.send, "settings": robot.settings, "set": robot.set}, **told
-    ) as server:
-        yield server.invitation
+def invite(serve: Callable[..., PageServer], robot: Robot) -> Callable[[str], str]:
+    return serve(actions={"send": robot.send, "settings": robot.settings, "set": robot.set}).invitation
 
 
 def test_a_command_is_sent_and_its_answer_shown(
@@ -143,104 +142,75 @@ def test_a_setting_is_checked_changed_and_reset(
 
 
 def test_a_note_is_written_marked_in_the_history_and_deleted(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], lab: Lab, server: PageServer
 ) -> None:
-    lab = Lab()
-    with lab.server(pubnub) as server:
-        page = open_page(server.invitation())
-        page.goto(
-            f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
-            "&to=2026-05-04T10:01:00.000Z&at=2026-05-04T10:00:30.000Z"
-        )
-        chart = page.locator(".history .charts .plot canvas").first
-        chart.wait_for()
-        page.locator(".scrub-at").filter(has_text="10:00:30").wait_for()
-        drawn(page)
-        before = chart.screenshot()
-        page.fill("[name=note]", "<b>hit</b> the wall")
-        page.get_by_role("button", name="Add note").click()
-        # About the cursor's time, and as text.
-        page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
-        assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
-        drawn(page)
-        assert chart.screenshot() != before
-        # A note links to its time.
-        page.goto(f"{server.url}#/insights/car-1")
-        page.locator(".insights-view .notes-list a").last.click()
-        page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
-        page.locator(".history .notes-list li").wait_for()
-        for name in ("Delete the note", "Really delete"):
-            page.locator(".history .notes-list").get_by_role("button").filter(
-                has_text=name.split()[0]
-            ).click()
-        until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
-        assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
+    page = open_page(server.invitation())
+    page.goto(
+        f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
+        "&to=2026-05-04T10:01:00.000Z&at=2026-05-04T10:00:30.000Z"
+    )
+    chart = page.locator(".history .charts .plot canvas").first
+    chart.wait_for()
+    page.locator(".scrub-at").filter(has_text="10:00:30").wait_for()
+    drawn(page)
+    before = chart.screenshot()
+    page.fill("[name=note]", "<b>hit</b> the wall")
+    page.get_by_role("button", name="Add note").click()
+    # About the cursor's time, and as text.
+    page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
+    assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
+    drawn(page)
+    assert chart.screenshot() != before
+    # A note links to its time.
+    page.goto(f"{server.url}#/insights/car-1")
+    page.locator(".insights-view .notes-list a").last.click()
+    page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
+    page.locator(".history .notes-list li").wait_for()
+    for word in ("Delete", "Really"):
+        page.locator(".history .notes-list").get_by_role("button").filter(has_text=word).click()
+    until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
+    assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
 
 
 def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], lab: Lab, server: PageServer
 ) -> None:
-    lab = Lab()
     lab.confirms = False
-    with lab.server(pubnub) as server:
-        page = open_page(server.invitation())
-        words = page.locator(".stop-words")
-        # No car has been heard: it can be stopped all the same.
-        page.goto(f"{server.url}#/car/car-1")
-        page.get_by_role("button", name="Stop car-1").click()
-        page.locator(".stop-moves").get_by_text("NOT standing: car-1 (not confirmed).").wait_for()
-        lab.cars["car-1"][1] = lab.confirms = True
-        stands = "Emergency stop: car-1 stands."
-        until(lambda: words.inner_text().startswith(stands), "the car's confirmation")
-        assert "Stopped by operator@lab, " in words.inner_text()
-        # On every view, and in a browser that comes later and may only look.
-        page.goto(f"{server.url}#/alarms")
-        assert words.inner_text() == f"{stands} Stopped alone: car-1, to be released on the car's page."
-        assert not page.get_by_role("button", name="Release all").is_visible()
-        onlooker = open_page(f"{server.url}#/insights")
-        onlooker.get_by_text("Emergency stop: car-1 stands.").wait_for()
-        assert onlooker.locator(".stop-press, .stop-release:visible").count() == 0
-        page.goto(f"{server.url}#/")
-        page.get_by_role("button", name="Stop all").click()
-        until(
-            lambda: words.inner_text().startswith("Emergency stop: car-1, car-9 stand."), "the fleet to stand"
-        )
-        page.get_by_role("button", name="Release all").click()
-        assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
-        # Only what the fleet's stop has stopped.
-        page.get_by_role("button", name="Really release car-9: it may move").click()
-        until(lambda: words.inner_text().startswith(stands), "the release of car-9")
-        assert lab.asked[-1] == {"stopped": "false", "seen_ms": str(round(NOW_S * 1000))}
-        page.goto(f"{server.url}#/car/car-1")
-        page.get_by_role("button", name="Release car-1").click()
-        page.get_by_role("button", name="Really release car-1").click()
-        until(lambda: not words.is_visible(), "the release")
+    page = open_page(server.invitation())
+    words = page.locator(".stop-words")
+    # No car has been heard: it can be stopped all the same.
+    page.goto(f"{server.url}#/car/car-1")
+    page.get_by_role("button", name="Stop car-1").click()
+    page.locator(".stop-moves").get_by_text("NOT standing: car-1 (not confirmed).").wait_for()
+    lab.cars["car-1"][1] = lab.confirms = True
+    stands = "Emergency stop: car-1 stands."
+    until(lambda: words.inner_text().startswith(stands), "the car's confirmation")
+    assert "Stopped by operator@lab, " in words.inner_text()
+    # On every view, and in a browser that comes later and may only look.
+    page.goto(f"{server.url}#/alarms")
+    assert words.inner_text() == f"{stands} Stopped alone: car-1, to be released on the car's page."
+    assert not page.get_by_role("button", name="Release all").is_visible()
+    onlooker = open_page(f"{server.url}#/insights")
+    onlooker.get_by_text("Emergency stop: car-1 stands.").wait_for()
+    assert onlooker.locator(".stop-press, .stop-release:visible").count() == 0
+    page.goto(f"{server.url}#/")
+    page.get_by_role("button", name="Stop all").click()
+    both = "Emergency stop: car-1, car-9 stand."
+    until(lambda: words.inner_text().startswith(both), "the fleet to stand")
+    page.get_by_role("button", name="Release all").click()
+    assert [asked["stopped"] for asked in lab.asked] == ["true", "true"]
+    # Only what the fleet's stop has stopped.
+    page.get_by_role("button", name="Really release car-9: it may move").click()
+    until(lambda: words.inner_text().startswith(stands), "the release of car-9")
+    assert lab.asked[-1] == {"stopped": "false", "seen_ms": str(round(NOW_S * 1000))}
+    page.goto(f"{server.url}#/car/car-1")
+    page.get_by_role("button", name="Release car-1").click()
+    page.get_by_role("button", name="Really release car-1").click()
+    until(lambda: not words.is_visible(), "the release")
     assert lab.asked[-1] == {"stopped": "false", "robot": "car-1", "seen_ms": str(round(NOW_S * 1000))}
+    server.stop()
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     page.get_by_text("The page's server does not answer: nobody can be stopped here").wait_for()
-
-
-def test_the_log_of_a_car_that_never_warned_is_not_asked_for(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
-) -> None:
-    lab = Lab()
-    with lab.server(pubnub) as server:
-        page = open_page(f"{server.url}#/")
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
-        with page.expect_response(lambda answer: "/streams.json?" in answer.url):
-            page.goto(f"{server.url}#/car/car-1")
-        lab.streams = [*lab.streams, LOG_STREAM]
-        log = f"stream={LOG_STREAM}"
-        with page.expect_request(lambda request: log in request.url):
-            page.goto(f"{server.url}#/car/car-9")
-        assert [url for url in asked if log in url and "robot=car-9" not in url] == []
-
-
-def test_a_page_without_a_server_has_no_commands(page: Page, car: Car) -> None:
-    show(page, car.send())
-    assert page.get_by_role("heading", name="Commands").count() == 0
-    assert page.get_by_role("heading", name="Settings").count() == 0
 
 
 def test_only_a_browser_that_was_invited_may_act(
@@ -273,11 +243,6 @@ def test_only_a_browser_that_was_invited_may_act(
     other = open_page(address)
     assert "Read-only: this address was used before" in other.inner_text(".read-only")
 
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
-
-    from local.pubnub import PubNubStandIn
 
 PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
@@ -332,74 +297,71 @@ def middle(page: Page, selector: str) -> tuple[float, float]:
 
 
 def test_a_finger_that_is_lifted_or_lost_lets_go(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, car: Car
+    open_page: Callable[..., Page], server: PageServer, car: Car
 ) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(server.invitation("#/car/car-1"), **PHONE)
-        at_the_wheel(page, car)
-        fingers, button, stick = Fingers(page), middle(page, ".deadman"), middle(page, ".stick")
-        fingers.put(1, *button)
-        until(lambda: held(page), "the finger on the button")
-        # It leaves the stick at the screen's edge, where the stick follows.
-        fingers.put(2, *stick)
-        fingers.put(2, 0, 0)
-        until(lambda: knob(page) == (-1, 1), "the stick to follow a finger")
-        # A third finger, on the stick and on the button, neither moves the stick nor lets go.
-        for place in (stick, button):
-            fingers.put(3, *place)
-            fingers.lift(3)
-            assert (held(page), knob(page)) == (True, (-1, 1))
-        fingers.lift(1)
-        until(lambda: not held(page), "the button to be let go, and the stick not")
-        assert knob(page) == (-1, 1)
-        fingers.put(1, *button)
-        until(lambda: held(page), "the button to be held again")
-        fingers.lift(2)
-        until(lambda: knob(page) == (0, 0), "the stick to return")
-        assert held(page)
-        fingers.cancel()
-        until(lambda: not held(page), "the touch to be lost")
+    page = open_page(server.invitation("#/car/car-1"), **PHONE)
+    at_the_wheel(page, car)
+    fingers, button, stick = Fingers(page), middle(page, ".deadman"), middle(page, ".stick")
+    fingers.put(1, *button)
+    until(lambda: held(page), "the finger on the button")
+    # It leaves the stick at the screen's edge, where the stick follows.
+    fingers.put(2, *stick)
+    fingers.put(2, 0, 0)
+    until(lambda: knob(page) == (-1, 1), "the stick to follow a finger")
+    # A third finger, on the stick and on the button, neither moves the stick nor lets go.
+    for place in (stick, button):
+        fingers.put(3, *place)
+        fingers.lift(3)
+        assert (held(page), knob(page)) == (True, (-1, 1))
+    fingers.lift(1)
+    until(lambda: not held(page), "the button to be let go, and the stick not")
+    assert knob(page) == (-1, 1)
+    fingers.put(1, *button)
+    until(lambda: held(page), "the button to be held again")
+    fingers.lift(2)
+    until(lambda: knob(page) == (0, 0), "the stick to return")
+    assert held(page)
+    fingers.cancel()
+    until(lambda: not held(page), "the touch to be lost")
 
 
 def test_a_gamepad_that_is_let_go_or_lost_lets_go(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, car: Car
+    open_page: Callable[..., Page], server: PageServer, car: Car
 ) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(server.invitation("#/car/car-1"))
-        page.evaluate("navigator.getGamepads = () => [null, window.gamepad ?? null]")
+    page = open_page(server.invitation("#/car/car-1"))
+    page.evaluate("navigator.getGamepads = () => [null, window.gamepad ?? null]")
 
-        def pad(*axes: str, pressed: bool = False) -> None:
-            buttons = (
-                f"Array.from({{ length: 8 }}, (_, i) => ({{ pressed: {str(pressed).lower()} && i === 5 }}))"
-            )
-            told = f"connected: true, mapping: 'standard', axes: [{', '.join(axes)}], buttons: {buttons}"
-            page.evaluate(f"window.gamepad = {{ {told} }}")
+    def pad(*axes: str, pressed: bool = False) -> None:
+        held = f"{{ pressed: {str(pressed).lower()} && i === 5 }}"
+        buttons = f"Array.from({{ length: 8 }}, (_, i) => ({held}))"
+        told = f"connected: true, mapping: 'standard', axes: [{', '.join(axes)}], buttons: {buttons}"
+        page.evaluate(f"window.gamepad = {{ {told} }}")
 
-        def phase(wanted: str) -> None:
-            """A hold that cannot begin, because there is no broker, is over until it is let go."""
-            page.locator(f".drive[data-phase={wanted}]").wait_for()
+    def phase(wanted: str) -> None:
+        """A hold that cannot begin, because there is no broker, is over until it is let go."""
+        page.locator(f".drive[data-phase={wanted}]").wait_for()
 
-        at_the_wheel(page, car)
-        pad("0", "-1")
-        until(lambda: knob(page) == (0, 1), "the stick to follow the gamepad")
-        pad("0", "-1", pressed=True)
-        phase("over")
-        pad("NaN", "NaN", "Infinity", pressed=True)
-        until(lambda: knob(page) == (1, 0), "values that are no numbers to push nowhere")
-        pad("0", "0")
-        phase("free")
-        pad("0", "-1", pressed=True)
-        phase("over")
-        # It is gone, with its button held, and comes back so.
-        page.evaluate("window.gamepad = undefined")
-        phase("free")
-        assert knob(page) == (0, 0)
-        pad("0", "-1", pressed=True)
-        until(lambda: knob(page) == (0, 1), "the gamepad to be back")
-        phase("free")
-        # A browser that shows no gamepads, as at http:// on another computer.
-        page.evaluate("delete navigator.getGamepads, delete Navigator.prototype.getGamepads")
-        page.keyboard.down("Space")
-        phase("over")
-        page.keyboard.up("Space")
-        phase("free")
+    at_the_wheel(page, car)
+    pad("0", "-1")
+    until(lambda: knob(page) == (0, 1), "the stick to follow the gamepad")
+    pad("0", "-1", pressed=True)
+    phase("over")
+    pad("NaN", "NaN", "Infinity", pressed=True)
+    until(lambda: knob(page) == (1, 0), "values that are no numbers to push nowhere")
+    pad("0", "0")
+    phase("free")
+    pad("0", "-1", pressed=True)
+    phase("over")
+    # It is gone, with its button held, and comes back so.
+    page.evaluate("window.gamepad = undefined")
+    phase("free")
+    assert knob(page) == (0, 0)
+    pad("0", "-1", pressed=True)
+    until(lambda: knob(page) == (0, 1), "the gamepad to be back")
+    phase("free")
+    # A browser that shows no gamepads, as at http:// on another computer.
+    page.evaluate("delete navigator.getGamepads, delete Navigator.prototype.getGamepads")
+    page.keyboard.down("Space")
+    phase("over")
+    page.keyboard.up("Space")
+    phase("free")

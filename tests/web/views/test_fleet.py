@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_agent.sources.sim.driver import HALL
 from iort_contract.catalog.streams import LOG_STREAM, POSE_STREAM
-from iort_station.page.server import PageServer
 from testkit.waiting import until
 from tests.browser import drawn, plain, show, shown
-from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
-from tests.web.lab import Lab
+from tests.web.cars import GAIN, SAMPLE, Car
+from tests.web.lab import past
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from playwright.sync_api import Page
 
+    from iort_contract.messages.page import HistoryAnswer
+    from iort_station.page.server import PageServer
     from local.pubnub import PubNubStandIn
 
 OFF_MS = 1_700_000_000_000
@@ -35,24 +37,15 @@ def vehicles() -> dict[str, Any]:
 
 
 @pytest.fixture
-def served(pubnub: PubNubStandIn, vehicles: dict[str, Any]) -> Iterator[str]:
+def served(serve: Callable[..., PageServer], vehicles: dict[str, Any]) -> str:
     answers: dict[str, Any] = {
         "robots": lambda _: {"robots": REGISTERED},
         "tags": lambda _: {"tags": TAGS},
         "vehicles": lambda _: {"vehicles": vehicles},
         "streams": lambda _: {"streams": []},
-        "history": lambda _: {
-            "times_s": [],
-            "fields": {},
-            "samples": 0,
-            "ros2": False,
-            "archive": None,
-            "row_s": 0,
-        },
+        "history": lambda _: past([], {}),
     }
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=answers, **told) as server:
-        yield server.url
+    return serve(answers=answers).url
 
 
 def test_cars_that_are_not_heard_are_listed_until_they_send(
@@ -74,22 +67,14 @@ def test_cars_that_are_not_heard_are_listed_until_they_send(
     page.get_by_text("Not heard: 2 cars").click()
     absent.get_by_role("link", name="car-2").click()
     until(lambda: page.inner_text(".history .car-name") == "car-2", "the past")
-
-
-def test_an_offline_car_is_told_from_an_unknown_one(open_page: Callable[..., Page], served: str) -> None:
-    page = open_page(f"{served}#/car/car-2", timezone_id="UTC")
+    # A car that is off is told from one that is not known.
+    page.goto(f"{served}#/car/car-2")
     until(lambda: page.inner_text("#empty-title") == "car-2 is offline", "the car's state")
     assert "Offline since Tue 14 Nov 22:13:20 UTC. It appears" in page.inner_text("#empty")
     assert page.get_by_role("link", name="What it did before").is_visible()
     page.goto(f"{served}#/car/car-22")
     until(lambda: page.inner_text("#empty-title") == "There is no car car-22", "the refusal")
     assert "Registered: car-2, car-3, car-10." in page.inner_text("#empty")
-
-
-def test_a_page_without_a_server_lists_no_absent_car(page: Page, url: str) -> None:
-    assert not page.get_by_role("link", name="What it did before").is_visible()
-    page.goto(f"{url}#/")
-    assert not page.locator(".offline").is_visible()
 
 
 def test_a_car_registered_after_the_page_opened_shows_metres_per_second(
@@ -162,11 +147,6 @@ def test_cars_are_found_sorted_and_grouped_and_the_address_says_so(
     until(lambda: again.input_value("[name=group]") == "lab", "the group")
 
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
-
-    from local.pubnub import PubNubStandIn
-
 DEFAULT = ["speed", "battery", "currents", "duty", "speed-current", "g-g", "trajectory", "delay"]
 TITLES = "[...document.querySelectorAll('#car .board .charts > :not([hidden])')].map((e) => e.ariaLabel)"
 
@@ -177,30 +157,14 @@ class Recorded:
     def __init__(self) -> None:
         self.asked_s: list[float] = []
 
-    def history(self, asked: Any) -> dict[str, Any]:
+    def history(self, asked: Any) -> HistoryAnswer:
         first, last = (int(asked[name]) / 1e6 for name in ("from_us", "to_us"))
         if asked["stream"] == LOG_STREAM:
             line = {"level": "warning", "logger": "iort_agent.mqtt", "text": "connection lost", "left_out": 0}
-            fields = {name: {"mean": [value]} for name, value in line.items()}
-            return {
-                "times_s": [last - 60],
-                "fields": fields,
-                "samples": 1,
-                "ros2": False,
-                "archive": None,
-                "row_s": 0,
-            }
+            return past([last - 60], {name: [value] for name, value in line.items()})
         self.asked_s.append(last - first)
         times = [first + i / 10 for i in range(int((last - first) * 10))]
-        fields = {"voltage_input": {"mean": [10.0] * len(times)}, "frame": {"mean": ["map"] * len(times)}}
-        return {
-            "times_s": times,
-            "fields": fields,
-            "samples": len(times),
-            "ros2": False,
-            "archive": None,
-            "row_s": 0.1,
-        }
+        return past(times, {"voltage_input": [10.0] * len(times), "frame": ["map"] * len(times)}, row_s=0.1)
 
 
 @pytest.fixture
@@ -209,16 +173,14 @@ def recorded() -> Recorded:
 
 
 @pytest.fixture
-def board(pubnub: PubNubStandIn, recorded: Recorded) -> Iterator[str]:
+def board(serve: Callable[..., PageServer], recorded: Recorded) -> str:
     answers: dict[str, Any] = {
         "history": recorded.history,
         "vehicles": lambda _: {"vehicles": {}},
         "robots": lambda _: {"robots": {}},
         "streams": lambda _: {"streams": [LOG_STREAM]},
     }
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", answers=answers, track=HALL, **told) as server:
-        yield server.url
+    return serve(answers=answers, track=HALL).url
 
 
 def rows(page: Page) -> int:
@@ -324,19 +286,12 @@ def test_a_chart_is_dragged_to_another_place(page: Page, car: Car) -> None:
 
 
 def test_the_charts_keep_their_height_when_something_opens_beside_them(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], server: PageServer, car: Car
 ) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(server.invitation("#/car/car-1"))
-        show(page, Car(pubnub).send())
-        height = "() => document.querySelector('.board .charts').offsetHeight"
-        before = page.evaluate(height)
-        page.get_by_role("heading", name="Settings").click()
-        page.locator(".setting").first.wait_for()
-        assert page.evaluate(height) == before
-
-
-def test_each_latency_says_which_it_is(page: Page, car: Car) -> None:
+    page = open_page(server.invitation("#/car/car-1"))
     show(page, car.send())
-    named = ("Delay of the newest message", "Delay of each message", "car to page")
-    assert [page.get_by_text(text, exact=True).count() for text in named] == [1, 1, 1]
+    height = "() => document.querySelector('.board .charts').offsetHeight"
+    before = page.evaluate(height)
+    page.get_by_role("heading", name="Settings").click()
+    page.locator(".setting").first.wait_for()
+    assert page.evaluate(height) == before

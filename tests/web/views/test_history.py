@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pyarrow.parquet as pq
@@ -17,19 +17,20 @@ from iort_contract.messages.batch import Batch
 from iort_contract.topics import RECORD, build_topic
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
-from iort_station.page.server import PageServer
 from testkit.dynamodb import TELEMETRY, item_of
 from testkit.waiting import until
 from tests.archived import FakeS3, archive, expire
 from tests.browser import plain
 from tests.unit.station.data.test_queries import START, cloud_of
-from tests.web.cars import GAIN, SUBSCRIBE_KEY
+from tests.web.cars import GAIN
 from tests.web.lab import VIEWS, Lab
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from playwright.sync_api import Locator, Page
 
-    from local.pubnub import PubNubStandIn
+    from iort_station.page.server import PageServer
 
 SECOND = 1_000_000
 FIRST_S, SECOND_S = 60, 30
@@ -89,11 +90,9 @@ def past() -> Past:
 
 
 @pytest.fixture
-def server(pubnub: PubNubStandIn, past: Past) -> Iterator[PageServer]:
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    told["vehicles"] = {"car": {"speed_to_erpm_gain": GAIN}}
-    with PageServer(namespace="iort", answers=past.answers, downloads=past.downloads, **told) as server:
-        yield server
+def server(serve: Callable[..., PageServer], past: Past) -> PageServer:
+    vehicles = {"car": {"speed_to_erpm_gain": GAIN}}
+    return serve(vehicles=vehicles, answers=past.answers, downloads=past.downloads)
 
 
 @pytest.fixture
@@ -175,10 +174,8 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(
     page.get_by_role("button", name="Battery voltage").click()
     link = page.url
     other = open_page(link, timezone_id="UTC")
-    until(
-        lambda: other.locator(".scrub-at").inner_text() == page.locator(".scrub-at").inner_text(),
-        "the cursor",
-    )
+    cursor = page.locator(".scrub-at").inner_text()
+    until(lambda: other.locator(".scrub-at").inner_text() == cursor, "the cursor")
     labels = "[...document.querySelectorAll('.charts .panel')].map((panel) => panel.ariaLabel)"
     assert other.evaluate(labels) == page.evaluate(labels) == ["Speed", "Motor current"]
     assert other.url == link
@@ -213,13 +210,8 @@ def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page: Page
 
 
 def test_two_fingers_pan_and_pinch(open_page: Callable[..., Page], server: PageServer) -> None:
-    page = open_page(
-        f"{server.url}#/history/car?{FIRST}",
-        timezone_id="UTC",
-        has_touch=True,
-        is_mobile=True,
-        viewport={"width": 390, "height": 844},
-    )
+    phone = {"has_touch": True, "is_mobile": True, "viewport": {"width": 390, "height": 844}}
+    page = open_page(f"{server.url}#/history/car?{FIRST}", timezone_id="UTC", **phone)
     loaded(page, "3000 samples")
     over = chart(page, "Speed")
     over.scroll_into_view_if_needed()
@@ -349,46 +341,45 @@ def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer
     until(lambda: "car has no distance in agent" in note.inner_text(), "the reason")
 
 
-def test_times_are_typed_with_24_hours(open_page: Callable[..., Page], pubnub: PubNubStandIn) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(f"{server.url}{VIEWS['history'].address}", timezone_id="UTC", locale="en-US")
-        page.locator(VIEWS["history"].filled).first.wait_for()
-        page.fill("#from", "2026-05-04 14:00:00")
-        page.fill("#to", "3 PM")
-        page.get_by_role("button", name="Load").click()
-        wrong = 'to must be a date and a time like 2026-05-04 14:03:27, got "3 PM".'
-        page.get_by_text(wrong).wait_for()
-        page.fill("#to", "2026-05-04 15:00:00")
-        page.get_by_role("button", name="Load").click()
-        until(lambda: "from=2026-05-04T14:00:00.000Z&to=2026-05-04T15:00:00.000Z" in page.url, "the range")
+@pytest.fixture
+def any_past(serve: Callable[..., PageServer], lab: Lab) -> str:
+    """A lab's page, whose cars have a past."""
+    return serve(**lab.served()).url
 
 
-def test_the_lines_of_a_comparison_have_names(open_page: Callable[..., Page], pubnub: PubNubStandIn) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(f"{server.url}{VIEWS['compare'].address}", timezone_id="UTC")
-        page.locator(VIEWS["compare"].filled).first.wait_for()
-        legend = page.locator(".compare-view .charts .panel").first.locator(".reading .label")
-        assert legend.all_inner_texts() == ["10:00:00 UTC", "11:00:00 UTC"]
+def test_times_are_typed_with_24_hours(open_page: Callable[..., Page], any_past: str) -> None:
+    page = open_page(any_past + VIEWS["history"].address, timezone_id="UTC", locale="en-US")
+    page.locator(VIEWS["history"].filled).first.wait_for()
+    page.fill("#from", "2026-05-04 14:00:00")
+    page.fill("#to", "3 PM")
+    page.get_by_role("button", name="Load").click()
+    page.get_by_text('to must be a date and a time like 2026-05-04 14:03:27, got "3 PM".').wait_for()
+    page.fill("#to", "2026-05-04 15:00:00")
+    page.get_by_role("button", name="Load").click()
+    until(lambda: "from=2026-05-04T14:00:00.000Z&to=2026-05-04T15:00:00.000Z" in page.url, "the range")
 
 
-@pytest.mark.parametrize(
-    ("address", "told"),
-    [
-        ("#/history/car-1?from=yesterday&foo=1", "from must be a time like 2026-05-04T10:00:00.000Z, got"),
-        ("#/history/car-1?from=yesterday&foo=1", "history has no parameter foo"),
-        (
-            "#/history/car-1?from=2026-05-04T10:00:00Z&to=2026-05-04T09:00:00Z",
-            "from and to must be two times in their order",
+def test_the_lines_of_a_comparison_have_names(open_page: Callable[..., Page], any_past: str) -> None:
+    page = open_page(any_past + VIEWS["compare"].address, timezone_id="UTC")
+    page.locator(VIEWS["compare"].filled).first.wait_for()
+    legend = page.locator(".compare-view .charts .panel").first.locator(".reading .label")
+    assert legend.all_inner_texts() == ["10:00:00 UTC", "11:00:00 UTC"]
+
+
+def test_what_an_address_says_in_vain_is_told(open_page: Callable[..., Page], any_past: str) -> None:
+    page = open_page(any_past)
+    wrong = "#/history/car-1?from=2026-05-04T10:00:00Z&to=2026-05-04T09:00:00Z"
+    for address, reasons in {
+        "#/history/car-1?from=yesterday&foo=1": (
+            "from must be a time like 2026-05-04T10:00:00.000Z, got",
+            "history has no parameter foo",
         ),
-        ("#/compare?runs=car1/now", "runs must be at most 6 ranges like car1/"),
-        ("#/hstory/car-1", 'there is no view "hstory/car-1"'),
-    ],
-)
-def test_what_an_address_says_in_vain_is_told(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, address: str, told: str
-) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(f"{server.url}{address}")
-        page.get_by_text(told).wait_for()
-        page.goto(f"{server.url}#/alarms")
-        until(lambda: not page.get_by_text("Ignored in the address").is_visible(), "a good address")
+        wrong: ("from and to must be two times in their order",),
+        "#/compare?runs=car1/now": ("runs must be at most 6 ranges like car1/",),
+        "#/hstory/car-1": ('there is no view "hstory/car-1"',),
+    }.items():
+        page.goto(any_past + address)
+        for reason in reasons:
+            page.get_by_text(reason).wait_for()
+    page.goto(f"{any_past}#/alarms")
+    until(lambda: not page.get_by_text("Ignored in the address").is_visible(), "a good address")

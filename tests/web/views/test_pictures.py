@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_agent.lanes.attachment import thumbnail
 from iort_contract.catalog.streams import LOG_STREAM
-from iort_station.page.server import PageServer
 from testkit.waiting import until
 from tests.browser import drawn, plain, show
 from tests.images import jpeg
-from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
-from tests.web.lab import VIEWS, Lab
+from tests.web.cars import SAMPLE, Car
+from tests.web.lab import VIEWS, past
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from playwright.sync_api import Page
 
-    from local.pubnub import PubNubStandIn
+    from iort_contract.messages.page import HistoryAnswer
+    from iort_station.page.server import PageServer
 
 KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"
@@ -138,53 +139,42 @@ def test_a_field_named_like_an_attachment_is_shown_unchanged(page: Page, car: Ca
 
 
 def test_the_history_shows_the_picture_of_the_selected_time(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], serve: Callable[..., PageServer]
 ) -> None:
     red, green = plain_jpeg((200, 30, 30)), plain_jpeg((20, 160, 40))
     rows = [with_attachment(red), LEFT_OUT, LEFT_OUT, with_attachment(green), LEFT_OUT]
-    fields = {name: {"mean": [row[name] for row in rows]} for name in rows[0]}
+    fields = {name: [row[name] for row in rows] for name in rows[0]}
 
-    def history(asked: Any) -> dict[str, Any]:
-        first = int(asked["from_us"]) / 1e6
-        times = [first + 0.5 * i for i in range(len(rows))]
-        return {
-            "times_s": times,
-            "fields": fields,
-            "samples": len(rows),
-            "ros2": False,
-            "archive": None,
-            "row_s": 0,
-        }
+    def history(asked: Any) -> HistoryAnswer:
+        return past([int(asked["from_us"]) / 1e6 + 0.5 * i for i in range(len(rows))], fields)
 
-    answers = {"streams": lambda _: {"streams": [STREAM]}, "history": history}
-    told = {"namespace": "iort", "subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(**told, answers=answers) as server:
-        page = open_page(f"{server.url}#/history/car-1")
-        tile = page.locator("[data-picture=data]")
-        until(lambda: tile.count() == 1 and tile.locator("canvas").is_visible(), "the last picture")
-        is_drawn(page, (20, 160, 40))
-        assert "0.5 s before" in tile.inner_text()
-        page.locator(".scrub").focus()
-        page.keyboard.press("Home")
-        is_drawn(page, (200, 30, 30))
-        page.keyboard.press("ArrowRight")
-        drawn(page)
-        assert "0.5 s before" in tile.inner_text()
-        is_drawn(page, (200, 30, 30))
-        # The table of values leaves out the attachment's five fields.
-        assert page.locator(".compare tbody th").all_inner_texts() == ["Format"]
+    server = serve(answers={"streams": lambda _: {"streams": [STREAM]}, "history": history})
+    page = open_page(f"{server.url}#/history/car-1")
+    tile = page.locator("[data-picture=data]")
+    until(lambda: tile.count() == 1 and tile.locator("canvas").is_visible(), "the last picture")
+    is_drawn(page, (20, 160, 40))
+    assert "0.5 s before" in tile.inner_text()
+    page.locator(".scrub").focus()
+    page.keyboard.press("Home")
+    is_drawn(page, (200, 30, 30))
+    page.keyboard.press("ArrowRight")
+    drawn(page)
+    assert "0.5 s before" in tile.inner_text()
+    is_drawn(page, (200, 30, 30))
+    # The table of values leaves out the attachment's five fields.
+    assert page.locator(".compare tbody th").all_inner_texts() == ["Format"]
 
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from playwright.sync_api import Page
-
-    from local.pubnub import PubNubStandIn
 
 AXE = Path(__file__).parents[3] / "node_modules" / "axe-core" / "axe.min.js"
 DESKTOP = {"viewport": {"width": 1280, "height": 900}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+FAULTY = {**SAMPLE, "fault_code": 2}
+LOGGED: dict[str, Any] = {
+    "level": "error",
+    "logger": "iort_agent",
+    "text": "failed\nwith details",
+    "left_out": 1,
+}
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 # What a finger can hit, in CSS pixels; links within a text are as high as the text.
 TARGET_PX = 44
@@ -214,53 +204,40 @@ def violations(page: Page) -> list[str]:
 def silent(page: Page, car: Car, state: str) -> int:
     """Whether a car that has sent is stale or gone; on a slow machine a car that is gone sends again."""
     if state == "stale" and page.locator("[data-state=gone]").count():
-        show(page, car.send({**SAMPLE, "fault_code": 2}))
+        show(page, car.send(FAULTY))
     return page.locator(f"[data-state={state}]").count()
 
 
-@pytest.mark.parametrize("theme", ["dark", "light"])
-@pytest.mark.parametrize("device", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize(("device", "theme"), [(DESKTOP, "dark"), (PHONE, "light")], ids=["desktop", "phone"])
 def test_every_view_is_accessible(
-    open_page: Callable[..., Page],
-    pubnub: PubNubStandIn,
-    theme: Literal["dark", "light"],
-    device: dict[str, Any],
+    open_page: Callable[..., Page], server: PageServer, car: Car, device: dict[str, Any], theme: str
 ) -> None:
-    found = {}
-    with Lab().server(pubnub) as server:
-        page = open_page(server.invitation(), color_scheme=theme, reduced_motion="reduce", **device)
-        page.evaluate(AXE.read_text())
-        car = Car(pubnub)
-        show(page, car.send({**SAMPLE, "fault_code": 2}))
-        for view, (address, filled) in VIEWS.items():
-            page.goto(server.url + address)
-            show(page, car.send({**SAMPLE, "fault_code": 2}))
-            page.locator(filled).first.wait_for()
-            if view == "car":
-                line = {
-                    "level": "error",
-                    "logger": "iort_agent",
-                    "text": "failed\nwith details",
-                    "left_out": 1,
-                }
-                show(page, car.send(line, stream=LOG_STREAM))
-                page.get_by_role("heading", name="Settings").click()
-                page.locator(".setting").first.wait_for()
-                page.get_by_role("button", name="Take the wheel").click()
-                page.get_by_text("The role of a driver cannot be assumed").wait_for()
-            found[view] = violations(page)
-            if device is PHONE:
-                found[f"{view}, by thumb"] = page.evaluate(SMALL, TARGET_PX)
-                found[f"{view}, sideways"] = page.evaluate(BEYOND)
-        if device is DESKTOP:
-            # Old values are readable, too.
-            page.goto(server.url + VIEWS["car"].address)
-            show(page, car.send({**SAMPLE, "fault_code": 2}))
-            for view, state in (("car", "stale"), ("fleet", "gone"), ("car", "gone")):
-                page.goto(server.url + VIEWS[view].address)
-                until(lambda state=state: silent(page, car, state), f"{view} to be {state}")
-                found[f"{view}, {state}"] = violations(page)
-    assert {view: faults for view, faults in found.items() if faults} == {}
+    faults = {}
+    page = open_page(server.invitation(), color_scheme=theme, reduced_motion="reduce", **device)
+    page.evaluate(AXE.read_text())
+    for view, (address, filled) in VIEWS.items():
+        page.goto(server.url + address)
+        show(page, car.send(FAULTY))
+        page.locator(filled).first.wait_for()
+        if view == "car":
+            show(page, car.send(LOGGED, stream=LOG_STREAM))
+            page.get_by_role("heading", name="Settings").click()
+            page.locator(".setting").first.wait_for()
+            page.get_by_role("button", name="Take the wheel").click()
+            page.get_by_text("The role of a driver cannot be assumed").wait_for()
+        faults[view] = violations(page)
+        if device is PHONE:
+            faults[f"{view}, by thumb"] = page.evaluate(SMALL, TARGET_PX)
+            faults[f"{view}, sideways"] = page.evaluate(BEYOND)
+    if device is DESKTOP:
+        # Old values are readable, too.
+        page.goto(server.url + VIEWS["car"].address)
+        show(page, car.send(FAULTY))
+        for view, state in (("car", "stale"), ("fleet", "gone"), ("car", "gone")):
+            page.goto(server.url + VIEWS[view].address)
+            until(lambda state=state: silent(page, car, state), f"{view} to be {state}")
+            faults[f"{view}, {state}"] = violations(page)
+    assert {view: found for view, found in faults.items() if found} == {}
 
 
 def test_a_card_outside_the_screen_has_a_name(page: Page, car: Car, url: str) -> None:
@@ -301,16 +278,15 @@ def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page: Page, ca
 
 
 def test_a_chart_of_the_past_is_told_in_words_and_has_a_cursor_for_arrow_keys(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], server: PageServer
 ) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(server.url + VIEWS["history"].address)
-        chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
-        extent = f"minimum -{SAMPLE['voltage_input']} V, maximum {SAMPLE['voltage_input']} V"
-        until(lambda: extent in plain(chart.get_attribute("aria-label") or ""), "the figures")
-        chart.focus()
-        page.keyboard.press("Home")
-        until(lambda: page.inner_text("#spoken").endswith(": 0.00 V"), "the first value")
-        page.keyboard.press("Shift+ArrowRight")
-        until(lambda: page.inner_text("#spoken").endswith(": 1.29 V"), "the second value")
-        assert page.inner_text("[data-reading=voltage_input]") == "1.29"
+    page = open_page(server.url + VIEWS["history"].address)
+    chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
+    extent = f"minimum -{SAMPLE['voltage_input']} V, maximum {SAMPLE['voltage_input']} V"
+    until(lambda: extent in plain(chart.get_attribute("aria-label") or ""), "the figures")
+    chart.focus()
+    page.keyboard.press("Home")
+    until(lambda: page.inner_text("#spoken").endswith(": 0.00 V"), "the first value")
+    page.keyboard.press("Shift+ArrowRight")
+    until(lambda: page.inner_text("#spoken").endswith(": 1.29 V"), "the second value")
+    assert page.inner_text("[data-reading=voltage_input]") == "1.29"

@@ -58,12 +58,6 @@ def lab() -> Iterator[Held]:
     lab.stops.set()
 
 
-@pytest.fixture
-def server(lab: Held, pubnub: PubNubStandIn) -> Iterator[PageServer]:
-    with lab.server(pubnub) as server:
-        yield server
-
-
 @pytest.mark.parametrize("tabs", [1, 3])
 def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(
     open_page: Callable[..., Page], lab: Held, server: PageServer, tabs: int
@@ -85,10 +79,10 @@ def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(
 
 
 def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(
-    open_page: Callable[..., Page], lab: Held, server: PageServer, pubnub: PubNubStandIn
+    open_page: Callable[..., Page], lab: Held, server: PageServer, car: Car
 ) -> None:
     page = open_page(server.invitation("#/car/car-1"))
-    show(page, Car(pubnub).send())
+    show(page, car.send())
     page.get_by_role("button", name="Take the wheel").wait_for()
     lab.stops.clear()
     sent = page.locator(".stop-sent")
@@ -97,10 +91,8 @@ def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(
     press.click()
     assert sent.inner_text() == "Stop sent to car-1 …"
     press.click()
-    until(
-        lambda: sent.inner_text().startswith("No answer after 1.0 s: car-1 may not have"),
-        "the end of a second",
-    )
+    late = "No answer after 1.0 s: car-1 may not have"
+    until(lambda: sent.inner_text().startswith(late), "the end of a second")
     for advice in ("Press again, and use the switch on the car.", "within 0.5 s of the last one"):
         assert advice in sent.inner_text()
     # The second press was within the second; a third is sent.
@@ -113,11 +105,11 @@ def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(
 
 
 def test_a_server_that_is_gone_has_stopped_nothing(
-    open_page: Callable[..., Page], lab: Held, pubnub: PubNubStandIn
+    open_page: Callable[..., Page], server: PageServer
 ) -> None:
-    with lab.server(pubnub) as server:
-        page = open_page(server.invitation())
-        page.locator(".stop-press").wait_for()
+    page = open_page(server.invitation())
+    page.locator(".stop-press").wait_for()
+    server.stop()
     page.get_by_role("button", name="Stop all").click()
     said = page.locator(".stop-sent").filter(
         has_text="NOTHING WAS STOPPED: The page's server does not answer."
@@ -161,13 +153,10 @@ def test_a_car_that_does_not_stand_is_named_before_and_after_a_stop(
 
 @pytest.mark.parametrize("options", [{}, PHONE], ids=["desktop", "phone"])
 def test_the_stop_its_words_and_the_speed_stay_in_sight(
-    open_page: Callable[..., Page],
-    server: PageServer,
-    pubnub: PubNubStandIn,
-    options: dict[str, Any],
+    open_page: Callable[..., Page], server: PageServer, car: Car, options: dict[str, Any]
 ) -> None:
     page = open_page(server.invitation("#/car/car-1"), **options)
-    show(page, Car(pubnub).send())
+    show(page, car.send())
     page.get_by_role("button", name="Stop car-1").click()
     page.locator(".stop-words").filter(has_text="stands").wait_for()
     page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")

@@ -3,63 +3,40 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_station.page.server import PageServer
 from local.deployment import ROOT
 from testkit.waiting import until
 from tests.browser import drawn, plain, show, shown
-from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
-from tests.web.lab import VIEWS, Lab
+from tests.web.cars import GAIN, SAMPLE, Car
+from tests.web.lab import VIEWS, past
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from playwright.sync_api import Page
 
-    from local.pubnub import PubNubStandIn
+    from iort_station.page.server import PageServer
 
 OFFSET_ERPM = 461.4
 VEHICLE = {"speed_to_erpm_gain": GAIN, "speed_to_erpm_offset": OFFSET_ERPM}
 SPEED_ERPM = (9228.0 + OFFSET_ERPM, 4614.0 + OFFSET_ERPM)
-
-
-def history(asked: Any) -> dict[str, Any]:
-    """Return two samples, a second apart."""
-    first = int(asked["from_us"]) / 1e6
-    fields = {"speed": {"mean": list(SPEED_ERPM)}, "voltage_input": {"mean": [12.0, 11.5]}}
-    return {
-        "times_s": [first, first + 1],
-        "fields": fields,
-        "samples": 2,
-        "ros2": False,
-        "archive": None,
-        "row_s": 0,
-    }
-
-
-@contextmanager
-def served(pubnub: PubNubStandIn, vehicles: dict[str, Any]) -> Iterator[PageServer]:
-    answers = {"streams": lambda _: {"streams": [VESC_STREAM]}, "history": history}
-    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
-    with PageServer(namespace="iort", vehicles=vehicles, answers=answers, **told) as server:
-        yield server
-
-
-@pytest.fixture
-def server(pubnub: PubNubStandIn) -> Iterator[PageServer]:
-    with served(pubnub, {"car-1": VEHICLE}) as server:
-        yield server
+ANSWERS: dict[str, Any] = {
+    "streams": lambda _: {"streams": [VESC_STREAM]},
+    "history": lambda asked: past(
+        [int(asked["from_us"]) / 1e6 + second for second in (0, 1)],
+        {"speed": SPEED_ERPM, "voltage_input": [12.0, 11.5]},
+    ),
+}
 
 
 def test_the_speed_uses_the_cars_gain_and_offset(
-    open_page: Callable[..., Page], server: PageServer, car: Car
+    open_page: Callable[..., Page], serve: Callable[..., PageServer], car: Car
 ) -> None:
+    server = serve(vehicles={"car-1": VEHICLE}, answers=ANSWERS)
     page = open_page(f"{server.url}#/car/car-1")
     show(page, car.send({**SAMPLE, "speed": SPEED_ERPM[0]}))
     assert shown(page, "speed_mps") == "2.00"
@@ -77,47 +54,34 @@ def test_the_speed_uses_the_cars_gain_and_offset(
 
 
 def test_an_unknown_car_shows_its_motor_speed(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, car: Car
+    open_page: Callable[..., Page], serve: Callable[..., PageServer], car: Car
 ) -> None:
-    with served(pubnub, {}) as server:
-        page = open_page(f"{server.url}#/history/car-1")
-        row = page.locator("tr[data-field=speed]")
-        until(lambda: "erpm" in row.inner_text(), "the past")
-        assert plain(row.locator("td").first.inner_text()) == f"{SPEED_ERPM[1]:.0f}"
-        page.goto(f"{server.url}#/car/car-1")
-        show(page, car.send())
-        assert page.locator(".gauge", has_text="Speed").locator(".gauge-value .unit").inner_text() == "erpm"
-
-
-@pytest.mark.parametrize(
-    ("timezone", "zone"), [("UTC", "UTC"), ("Asia/Kolkata", "GMT+5:30"), ("America/Phoenix", "GMT-7")]
-)
-def test_each_time_has_a_zone(
-    open_page: Callable[..., Page], server: PageServer, car: Car, timezone: str, zone: str
-) -> None:
-    page = open_page(f"{server.url}#/history/car-1", timezone_id=timezone)
-    until(lambda: page.locator(".scrub-at").is_visible(), "the past")
-    assert page.locator(".scrub-at").inner_text().endswith(f" {zone}")
-    assert page.locator(".zone").inner_text() == zone
+    server = serve(answers=ANSWERS)
+    page = open_page(f"{server.url}#/history/car-1")
+    row = page.locator("tr[data-field=speed]")
+    until(lambda: "erpm" in row.inner_text(), "the past")
+    assert plain(row.locator("td").first.inner_text()) == f"{SPEED_ERPM[1]:.0f}"
     page.goto(f"{server.url}#/car/car-1")
-    show(page, car.send({**SAMPLE, "fault_code": 5}))
-    assert page.locator(".faults th").first.inner_text() == f"Since, {zone}"
+    show(page, car.send())
+    assert page.locator(".gauge", has_text="Speed").locator(".gauge-value .unit").inner_text() == "erpm"
 
 
 def test_every_view_tells_the_zone_of_its_times(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn
+    open_page: Callable[..., Page], server: PageServer, car: Car
 ) -> None:
-    with Lab().server(pubnub) as server:
-        page = open_page(server.invitation(), timezone_id="Asia/Kolkata", locale="de-DE")
-        line = {"level": "error", "logger": "iort_agent", "text": "failed", "left_out": 0}
-        car = Car(pubnub)
-        for view, (address, filled) in VIEWS.items():
-            page.goto(server.url + address)
-            show(page, car.send())
-            show(page, car.send(line, stream=LOG_STREAM))
-            page.locator(filled).first.wait_for()
-            told = page.evaluate("document.body.textContent")
-            assert re.findall(r"\d\d:\d\d:\d\d(?!.{0,24}GMT\+5:30)", told) == [], view
+    page = open_page(server.invitation(), timezone_id="Asia/Kolkata", locale="de-DE")
+    line = {"level": "error", "logger": "iort_agent", "text": "failed", "left_out": 0}
+    for view, (address, filled) in VIEWS.items():
+        page.goto(server.url + address)
+        show(page, car.send())
+        show(page, car.send(line, stream=LOG_STREAM))
+        page.locator(filled).first.wait_for()
+        if view == "car":
+            assert page.locator(".faults th").first.inner_text() == "Since, GMT+5:30"
+        if view == "history":
+            assert page.locator(".zone").inner_text() == "GMT+5:30"
+        told = page.evaluate("document.body.textContent")
+        assert re.findall(r"\d\d:\d\d:\d\d(?!.{0,24}GMT\+5:30)", told) == [], view
 
 
 def test_ros_standard_messages_have_their_units(page: Page, car: Car) -> None:

@@ -11,7 +11,6 @@ from iort_station import kept
 from iort_station.cli.console import tell
 from iort_station.cli.options import AsJson, LiveWay, Token, TrackFile, Yes, agreed, examples, option, say
 from iort_station.errors import StationError
-from iort_station.fleet import registry
 from iort_station.fleet.roles import transport
 from iort_station.page import invitations
 from iort_station.page.motion import everybody
@@ -51,7 +50,6 @@ def dashboard(
     cloud = context.obj.cloud()
     with PageServer(
         namespace=cloud.namespace,
-        vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
         downloads=downloads(cloud),
